@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+# `make` prints help. Every target sets up what it needs: a fresh machine needs Python >= 3.11 and make, no more.
+
+PYTHON ?= python3
+UV ?= uv
+OUT ?= out
+ARGS ?=
+VENV := .venv
+STAMP := $(VENV)/.installed
+VENV_PYTHON := $(VENV)/bin/python
+PIP := $(VENV_PYTHON) -m pip --disable-pip-version-check
+SASGEO := $(VENV)/bin/sasgeo-bench
+SOURCES := sasgeo_bench baselines benchmarks tests
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help install demo list-regions build-region test check bench docs lock clean
+
+help: ## print this list
+	@printf 'sasgeo-bench: make TARGET\n\n'
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@printf '\nVariables: REGION=<id> DATE=<yyyy-mm-dd> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
+
+# Rebuilt when the lock or the packages' own metadata change; otherwise nothing runs, so a second call is quick.
+$(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "$(PYTHON) is missing or older than 3.11: install Python >= 3.11, or name one: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "$(PYTHON) cannot make virtual environments: install its venv module (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install --quiet --require-hashes -r requirements.lock
+	$(PIP) install --quiet --no-deps --no-build-isolation -e . -e baselines
+	@touch $@
+
+install: $(STAMP) ## set up .venv from requirements.lock (the other targets do it too)
+
+demo: $(STAMP) ## build the region of an embedded town, offline, and show what is in it
+	$(SASGEO) build-region town-riverside --out $(OUT) $(ARGS)
+	$(SASGEO) inspect town-riverside --out $(OUT)
+
+list-regions: $(STAMP) ## list the regions that come with the package
+	$(SASGEO) list-regions $(ARGS)
+
+build-region: $(STAMP) ## build one region: REGION=vaduz, and DATE=2021-10-28 for another date
+	@test -n "$(REGION)" || { echo "name the region: make build-region REGION=vaduz (make list-regions shows all)" >&2; exit 2; }
+	$(SASGEO) build-region $(REGION) $(if $(DATE),--date $(DATE)) --out $(OUT) $(ARGS)
+
+test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
+	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(ARGS)
+
+check: $(STAMP) ## ruff and mypy, as CI runs them
+	$(VENV_PYTHON) -m ruff check $(SOURCES)
+	$(VENV_PYTHON) -m ruff format --check $(SOURCES)
+	$(VENV_PYTHON) -m mypy
+
+bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, never a test
+	$(VENV_PYTHON) benchmarks/build_region.py $(ARGS)
+
+docs: $(STAMP) ## run the examples in the docstrings and follow the links between the documents; builds no site
+	$(VENV_PYTHON) -m pytest -q -p no:benchmark sasgeo_bench
+	$(VENV_PYTHON) -m pytest -q -p no:benchmark tests/test_repository.py -k "link or document"
+
+lock: ## resolve requirements.lock anew from pyproject.toml (needs uv: make lock UV=/path/to/uv)
+	$(UV) pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes --no-config \
+	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
+	  --output-file requirements.lock $(ARGS)
+
+clean: ## remove .venv and caches; keeps what was built in $(OUT)
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
+	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The baselines of sasgeo-bench, written as an outsider would write a plugin; holds no matcher yet."""

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program `sasgeo-bench`: parses, calls, prints. Results go to stdout, everything else to stderr."""
+
+import datetime as dt
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from sasgeo_bench.build import BuildPlan, build_region, plan_build
+from sasgeo_bench.doctor import examine
+from sasgeo_bench.errors import ConfigError, SasgeoError
+from sasgeo_bench.region import Manifest
+from sasgeo_bench.store.catalog import find_region_file, list_region_files, read_region_file
+from sasgeo_bench.store.regiondir import differing_files, read_manifest
+
+EXIT_USER: Final = 2
+EXIT_INTERRUPTED: Final = 130
+TOP_DROPS: Final = 12
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)
+errors = Console(stderr=True, soft_wrap=True, highlight=False)
+
+Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
+RegionFolders = Annotated[list[Path] | None, typer.Option("--regions", help="folder with region files of your own")]
+ExtractFolders = Annotated[
+    list[Path] | None,
+    typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
+]
+
+
+@app.command("build-region")
+def build_region_command(  # noqa: PLR0913 - one argument for each flag
+    region: Annotated[list[str], typer.Argument(help="ids from list-regions, or files of your own (*.toml)")],
+    date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of one of the region's extracts; default: newest")] = None,
+    extracts: ExtractFolders = None,
+    regions: RegionFolders = None,
+    out: Out = Path("out"),
+    *,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be read and written, and stop")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="regions built at once")] = 1,
+) -> None:
+    """Build regions from dated extracts: layers, features, graph, manifest and preview in OUT/regions/<id>/."""
+    day = _date(date)
+    plans = [_plan(name, out=out, date=day, extracts=extracts, regions=regions) for name in region]
+    if dry_run:
+        typer.echo("\n".join(plan.to_text() for plan in plans))
+        return
+    if jobs == 1 or len(plans) == 1:
+        for plan in plans:
+            build_region(plan, tell=_tell)
+        return
+    with ProcessPoolExecutor(max_workers=jobs, mp_context=get_context("spawn")) as pool:
+        for _ in pool.map(_build_quietly, plans):
+            pass
+
+
+def _build_quietly(plan: BuildPlan) -> None:
+    """Build in a process of its own; only there because a process pool needs a function it can name."""
+    build_region(plan, tell=_tell)
+
+
+def _plan(
+    name: str, *, out: Path, date: dt.date | None, extracts: list[Path] | None, regions: list[Path] | None
+) -> BuildPlan:
+    spec = read_region_file(find_region_file(name, folders=regions or ()))
+    return plan_build(spec, out=out, date=date, extract_folders=extracts or ())
+
+
+def _date(text: str | None) -> dt.date | None:
+    try:
+        return dt.date.fromisoformat(text) if text else None
+    except ValueError as error:
+        message = f"--date must be a date as in 2021-10-28, got {text!r}"
+        raise ConfigError(message) from error
+
+
+def _tell(line: str) -> None:
+    errors.print(line, markup=False)
+
+
+@app.command("list-regions")
+def list_regions_command(regions: RegionFolders = None) -> None:
+    """List the regions that come with the package, and your own."""
+    table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
+    for name, path in sorted(list_region_files(folders=regions or ()).items()):
+        spec = read_region_file(path)
+        grid = spec.grid()
+        area_km2 = grid.rows * grid.cols * grid.cell_size_m**2 / 1e6
+        dates = [extract.date.isoformat() for extract in spec.extract]
+        shown = dates[0] if len(dates) == 1 else f"{dates[0]} .. {dates[-1]} ({len(dates)})"
+        table.add_row(name, spec.title, f"{area_km2:.1f}", f"{grid.cell_size_m:g} m", shown, ", ".join(spec.scenes))
+    _print(table)
+
+
+@app.command("inspect")
+def inspect_command(
+    region: Annotated[str, typer.Argument(help="id of a built region, or its folder")], out: Out = Path("out")
+) -> None:
+    """Say what is in a built region: provenance, coverage, classes, graph, what was dropped, files."""
+    folder = Path(region) if Path(region).is_dir() else out / "regions" / region
+    manifest = read_manifest(folder)
+    _print(_summary(manifest, folder))
+    _print(_class_table(manifest))
+    _print(_reasons(manifest))
+
+
+def _summary(manifest: Manifest, folder: Path) -> Table:
+    extract, coverage = manifest.extract, manifest.coverage
+    graph = ", ".join(f"{name} {count}" for name, count in manifest.graph_counts.items())
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row("region", f"{manifest.id}: {manifest.title}")
+    table.add_row("folder", str(folder))
+    table.add_row("scenes", ", ".join(manifest.scenes))
+    table.add_row("extract", f"{extract.file}, as of {extract.date}, SHA-256 {extract.sha256}")
+    table.add_row("grid", f"{manifest.rows} x {manifest.cols} cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}")
+    table.add_row("mapped", f"{coverage.share:.1%} of the grid ({coverage.source}); the rest is unknown, not absent")
+    table.add_row("graph", graph)
+    table.add_row("preview", str(folder / "preview.png"))
+    table.add_row("licence", f"{manifest.licence}, {manifest.attribution}")
+    return table
+
+
+def _class_table(manifest: Manifest) -> Table:
+    table = Table("class", "objects", box=None, pad_edge=False)
+    for name, count in manifest.counts.items():
+        table.add_row(name, str(count))
+    return table
+
+
+def _reasons(manifest: Manifest) -> Table:
+    table = Table("in the whole extract", "objects", box=None, pad_edge=False)
+    for title, reasons in (("not visible", manifest.hidden), ("dropped", manifest.drops), ("mended", manifest.notes)):
+        listed = list(reasons.items())
+        for reason, count in listed[:TOP_DROPS]:
+            table.add_row(f"{title}: {reason}", str(count))
+        if len(listed) > TOP_DROPS:
+            rest = sum(count for _, count in listed[TOP_DROPS:])
+            table.add_row(f"{title}: {len(listed) - TOP_DROPS} more reasons (region.json)", str(rest))
+    for warning in manifest.warnings:
+        table.add_row(f"warning: {warning}", "")
+    return table
+
+
+@app.command("verify")
+def verify_command(folder: Annotated[Path, typer.Argument(help="a built region's folder")]) -> None:
+    """Hash every file of a region again and name each one that differs from the manifest."""
+    differing = differing_files(folder)
+    for line in differing:
+        typer.echo(line)
+    if differing:
+        raise typer.Exit(EXIT_USER)
+    typer.echo(f"{folder}: all files are as the manifest says")
+
+
+@app.command("doctor")
+def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:
+    """Say which versions, folders and extracts are found, and what is missing."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, finding in examine(extracts or (), out=out):
+        table.add_row(name, finding)
+    _print(table)
+
+
+def _print(table: Table) -> None:
+    """Print to stdout: as wide as the terminal there, unwrapped into a file or pipe."""
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 200, markup=False)
+    console.print(table)
+    console.print()
+
+
+def main() -> None:
+    """Run the program: 0 done, 2 the user's mistake on one line, 1 our bug with a traceback."""
+    try:
+        app()
+    except SasgeoError as error:
+        errors.print(f"sasgeo-bench: {error}", markup=False)
+        sys.exit(EXIT_USER)
+    except KeyboardInterrupt:
+        errors.print("sasgeo-bench: interrupted; what was there before is as it was")
+        sys.exit(EXIT_INTERRUPTED)

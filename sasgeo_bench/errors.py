@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The errors users meet: every one is a `SasgeoError` and fits on one line that names the fault and the mend."""
+
+
+class SasgeoError(Exception):
+    """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
+
+    Examples
+    --------
+    >>> issubclass(GridError, (SasgeoError, ValueError))
+    True
+    """
+
+
+class GridError(SasgeoError, ValueError):
+    """A grid, bounds or cell size that cannot be used."""
+
+
+class ShapeError(SasgeoError, ValueError):
+    """Arrays or tables whose shapes, columns or types do not fit together."""
+
+
+class PoseError(SasgeoError, ValueError):
+    """A pose, prior or increment with a value outside its range."""
+
+
+class ConfigError(SasgeoError, ValueError):
+    """A TOML file with an unknown key, a wrong type or a value out of range."""
+
+
+class ExtractError(SasgeoError, OSError):
+    """An OpenStreetMap file that is missing, damaged or not what its hash says."""
+
+
+class CoverageError(SasgeoError, ValueError):
+    """Bounds that the extract does not cover, or that hold nothing."""
+
+
+class StoreError(SasgeoError, OSError):
+    """A folder or file of ours that cannot be written, or is not what its manifest says."""

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding a dated extract: by file name and SHA-256 in the folders named, then by download."""
+
+import datetime as dt
+import hashlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Final, Literal, Self
+
+import pooch
+from pydantic import Field, StringConstraints, field_validator, model_validator
+
+from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.tomlfile import Document
+
+FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
+
+Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Morphology = Literal["grid", "old_town", "suburb", "industrial", "riverside", "agricultural"]
+
+
+class TownEntry(Document):
+    """An embedded town instead of a file: made by `write_town`, never downloaded."""
+
+    morphology: Morphology
+    seed: Annotated[int, Field(ge=0)]
+    size_m: Annotated[float, Field(gt=0, le=10_000)] = 1024.0
+
+
+class Extract(Document):
+    """One `[[extract]]` of a region file.
+
+    `date` is the day the extract speaks of; of a full history, the day it is cut at. Several hashes are several
+    accepted forms of one file, such as with and without user names.
+
+    Examples
+    --------
+    >>> Extract(file="town.osm.pbf", date=dt.date(2020, 1, 1), town=TownEntry(morphology="grid", seed=1)).urls
+    ()
+    """
+
+    file: Annotated[str, StringConstraints(min_length=1)]
+    date: dt.date
+    sha256: Annotated[tuple[Sha256, ...], Field(strict=False)] = ()
+    urls: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    town: TownEntry | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _is_plain(cls, file: str) -> str:
+        if Path(file).name != file:
+            message = f"file must be a plain file name without folders, got {file!r}"
+            raise ValueError(message)
+        return file
+
+    @model_validator(mode="after")
+    def _has_source(self) -> Self:
+        if bool(self.sha256) == (self.town is not None):
+            message = f"extract {self.file!r} needs either sha256 = [...] or town = {{...}}"
+            raise ValueError(message)
+        return self
+
+
+def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
+    """Folders searched for extracts, in order: those given, SASGEO_EXTRACTS, the user's cache.
+
+    Examples
+    --------
+    >>> extract_folders([Path("mine")])[0].name
+    'mine'
+    """
+    named = [Path(folder) for folder in os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep) if folder]
+    return (*given, *named, cache_folder())
+
+
+def cache_folder() -> Path:
+    """Where downloaded extracts are kept.
+
+    Examples
+    --------
+    >>> cache_folder().name
+    'sasgeo-bench'
+    """
+    return Path(pooch.os_cache("sasgeo-bench"))
+
+
+def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
+    """Find the file of an extract, or download it into the user's cache.
+
+    Parameters
+    ----------
+    extract : Extract
+        Name, accepted hashes and addresses.
+    folders : sequence of Path
+        Searched first.
+
+    Returns
+    -------
+    Path
+        A file whose SHA-256 is one of those accepted.
+
+    Raises
+    ------
+    ExtractError
+        If no folder holds the file and it cannot be downloaded; the line names the file, its SHA-256 and where to put it.
+
+    Examples
+    --------
+    >>> wanted = Extract(file="nowhere.osm.pbf", date=dt.date(2020, 1, 1), sha256=("0" * 64,))
+    >>> find_extract(wanted)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ExtractError: nowhere.osm.pbf (SHA-256 0000...) was not found: put it into ...
+    """
+    if not extract.sha256:
+        message = f"{extract.file} is an embedded town: it is made by the build, there is no file to find"
+        raise ExtractError(message)
+    wrong: list[str] = []
+    for folder in extract_folders(folders):
+        path = folder / extract.file
+        if path.is_file():
+            found = _sha256(path)
+            if found in extract.sha256:
+                return path
+            wrong.append(f"{path} has SHA-256 {found}, which is none of those accepted")
+    failures: list[str] = []
+    for url in extract.urls:
+        try:
+            return _download(extract, url)
+        except ExtractError as error:
+            failures.append(str(error))
+    raise ExtractError(_not_found(extract, folders, wrong + failures))
+
+
+def _not_found(extract: Extract, folders: Sequence[Path], reasons: Sequence[str]) -> str:
+    hashes = " or ".join(extract.sha256)
+    places = ", ".join(str(folder) for folder in extract_folders(folders))
+    because = f" ({'; '.join(reasons)})" if reasons else ""
+    return (
+        f"{extract.file} (SHA-256 {hashes}) was not found{because}: "
+        f"put it into {places}, or name its folder with --extracts or {FOLDERS_VARIABLE}"
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as source:
+        return hashlib.file_digest(source, "sha256").hexdigest()
+
+
+def _download(extract: Extract, url: str) -> Path:
+    """Download into the cache; the file gets its name only when its hash is one of those accepted."""
+    cache = cache_folder()
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=cache, prefix=".download-") as scratch:
+            # pooch checks one hash, and several may be accepted here: so it is told none, and we check.
+            got = Path(
+                pooch.retrieve(
+                    url, known_hash=None, fname=extract.file, path=scratch, progressbar=sys.stderr.isatty()
+                )
+            )
+            found = _sha256(got)
+            if found not in extract.sha256:
+                message = f"{url} has SHA-256 {found}, which is none of those accepted"
+                raise ExtractError(message)
+            return got.replace(cache / extract.file)
+    except ExtractError:
+        raise
+    except (OSError, ValueError) as error:  # requests' errors are OSErrors; an unknown protocol is a ValueError
+        text = " ".join(str(error).split())[:120]
+        message = f"{url} could not be downloaded: {text}"
+        raise ExtractError(message) from error

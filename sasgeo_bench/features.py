@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Schema of classified geometry: a GeoDataFrame with one row per OSM object and semantic class."""
+
+import hashlib
+from typing import Final
+
+import geopandas as gpd
+import pandas as pd
+import shapely
+
+from sasgeo_bench.errors import ShapeError
+
+# Column -> pandas dtype; `geometry` comes last. `width_m` is the drawn width of a line, NaN for an area.
+# `is_visible` is False for what lies under ground or in a tunnel: it keeps its place in the graph, never in a layer.
+DTYPES: Final = {
+    "osm_type": "str",
+    "osm_id": "int64",
+    "version": "int32",
+    "timestamp": "datetime64[ms, UTC]",
+    "class": "str",
+    "level": "int16",
+    "is_bridge": "bool",
+    "is_tunnel": "bool",
+    "is_visible": "bool",
+    "width_m": "float32",
+}
+
+
+def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
+    """Build a feature table with the right column order and types.
+
+    Parameters
+    ----------
+    columns : dict
+        One array of shape (N,) for each column of `DTYPES`, and `geometry`.
+    epsg : int
+        The projected CRS of the geometry, metres.
+
+    Returns
+    -------
+    geopandas.GeoDataFrame
+        The table, checked.
+
+    Raises
+    ------
+    ShapeError
+        If a column is missing or more than is known.
+
+    Examples
+    --------
+    >>> len(make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632))
+    0
+    """
+    missing = [name for name in (*DTYPES, "geometry") if name not in columns]
+    if missing:
+        message = f"a feature table needs the columns {missing!r} too"
+        raise ShapeError(message)
+    times = pd.to_datetime(pd.Series(columns["timestamp"], dtype="datetime64[ms]"), utc=True)
+    plain = {name: pd.Series(columns[name]) if name != "timestamp" else times for name in DTYPES}
+    table = pd.DataFrame({name: plain[name].astype(kind) for name, kind in DTYPES.items()})
+    return check_features(gpd.GeoDataFrame(table, geometry=gpd.GeoSeries(columns["geometry"], crs=epsg)))
+
+
+def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Return the table unchanged if it is a feature table.
+
+    Raises
+    ------
+    ShapeError
+        If columns are missing, types differ, or the CRS is not a projected one in metres.
+
+    Examples
+    --------
+    >>> table = make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632)
+    >>> check_features(table) is table
+    True
+    """
+    wanted = [*DTYPES, "geometry"]
+    if list(features.columns) != wanted:
+        message = f"a feature table has the columns {wanted!r}, got {list(features.columns)!r}: build it with make_features"
+        raise ShapeError(message)
+    wrong = {name: str(features[name].dtype) for name, kind in DTYPES.items() if str(features[name].dtype) != kind}
+    if wrong:
+        message = f"columns of another type than the schema says: {wrong!r}; build the table with make_features"
+        raise ShapeError(message)
+    if features.crs is None or not features.crs.is_projected:
+        message = f"features must lie in a projected CRS in metres, got {features.crs!r}"
+        raise ShapeError(message)
+    return features
+
+
+def fingerprint(features: gpd.GeoDataFrame) -> str:
+    """Hash what a table holds, whatever the order of its rows: SHA-256 over sorted (type, id, version, class, coordinates).
+
+    Coordinates are rounded to a millimetre, so another version of PROJ does not change the fingerprint.
+
+    Examples
+    --------
+    >>> fingerprint(make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632))[:8]
+    'e3b0c442'
+    """
+    centres = shapely.get_coordinates(shapely.centroid(features.geometry.array)).round(3) + 0.0
+    columns = [features[name].to_numpy().tolist() for name in ("osm_type", "osm_id", "version", "class")]
+    rows = sorted(zip(*columns, centres[:, 0].tolist(), centres[:, 1].tolist(), strict=True))
+    return hashlib.sha256("\n".join(map(repr, rows)).encode() if rows else b"").hexdigest()

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Region: grid + layers + graph + features + coverage + provenance; immutable."""
+
+import datetime as dt
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from sasgeo_bench.graph import MapGraph
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.tomlfile import Document
+
+SCHEMA_VERSION: Final = 1  # of region.json and the tables beside it
+DATA_VERSION: Final = 1  # of what a build makes of an extract: raised whenever the same input gives another region
+ATTRIBUTION: Final = "(c) OpenStreetMap contributors, ODbL"
+LICENCE: Final = "ODbL-1.0"
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class _Record(Document):
+    """JSON knows no tuples and no dates, so the records are read with ordinary conversion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class FileRecord(_Record):
+    """Size and SHA-256 of one file of a region."""
+
+    sha256: str
+    bytes: Count
+
+
+class ExtractRecord(_Record):
+    """The extract a region was built from."""
+
+    file: str
+    sha256: str
+    bytes: Count
+    date: dt.date
+    osm_timestamp: dt.datetime | None
+
+
+class CoverageRecord(_Record):
+    """The mapped area: where it is known from, its share of the grid, and its outline as WKT in the region's CRS."""
+
+    source: str
+    share: Annotated[float, Field(ge=0, le=1)]
+    wkt: str
+
+
+class Manifest(_Record):
+    """`region.json`: what a region is, where it comes from, and the hashes of its files.
+
+    `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects of the whole extract by
+    reason: not visible from above, not used, mended.
+    """
+
+    schema_version: int
+    data_version: int
+    package_version: str
+    id: str
+    title: str
+    scenes: tuple[str, ...]
+    epsg: int
+    bounds_m: tuple[float, float, float, float]
+    bounds_lonlat: tuple[float, float, float, float]
+    cell_size_m: float
+    rows: int
+    cols: int
+    classes: tuple[str, ...]
+    extract: ExtractRecord
+    coverage: CoverageRecord
+    counts: dict[str, Count]
+    graph_counts: dict[str, Count]
+    hidden: dict[str, Count]
+    drops: dict[str, Count]
+    notes: dict[str, Count]
+    warnings: tuple[str, ...]
+    fingerprint: str
+    inputs_sha256: str
+    files: dict[str, FileRecord]
+    licence: str
+    attribution: str
+
+    @property
+    def grid(self) -> Grid:
+        """The region's lattice."""
+        return Grid(
+            epsg=self.epsg,
+            west_m=self.bounds_m[0],
+            north_m=self.bounds_m[3],
+            cell_size_m=self.cell_size_m,
+            rows=self.rows,
+            cols=self.cols,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Region:
+    """One mapped place.
+
+    `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
+    `coverage` is the mapped area in the region's CRS.
+    """
+
+    manifest: Manifest
+    layers: NDArray[np.uint8]
+    features: gpd.GeoDataFrame
+    graph: MapGraph
+    coverage: shapely.Geometry
+
+    @property
+    def grid(self) -> Grid:
+        """The region's lattice."""
+        return self.manifest.grid
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names in band order."""
+        return self.manifest.classes
+
+    def layer(self, class_name: str) -> NDArray[np.uint8]:
+        """The raster of one class, shape (rows, cols)."""
+        return np.asarray(self.layers[self.classes.index(class_name)])

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A region on disk: `region.json` and the files it names; written whole or not at all."""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import geopandas as gpd
+import pandas as pd
+import shapely
+from filelock import FileLock, Timeout
+from pydantic import ValidationError
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.features import check_features
+from sasgeo_bench.graph import MapGraph
+from sasgeo_bench.region import SCHEMA_VERSION, FileRecord, Manifest, Region
+from sasgeo_bench.store.layerfile import read_layers
+
+MANIFEST: Final = "region.json"
+LAYERS: Final = "layers.tif"
+FEATURES: Final = "features.parquet"
+NODES: Final = "nodes.parquet"
+EDGES: Final = "edges.parquet"
+PREVIEW: Final = "preview.png"
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal, read in pieces.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / "empty").write_bytes(b"")
+    ...     sha256_of(Path(folder) / "empty")[:8]
+    'e3b0c442'
+    """
+    with path.open("rb") as source:
+        return hashlib.file_digest(source, "sha256").hexdigest()
+
+
+def file_record(path: Path) -> FileRecord:
+    """Size and hash of a file."""
+    return FileRecord(sha256=sha256_of(path), bytes=path.stat().st_size)
+
+
+def write_tables(folder: Path, features: gpd.GeoDataFrame, graph: MapGraph) -> None:
+    """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder."""
+    features.to_parquet(folder / FEATURES, compression="zstd", schema_version="1.1.0", write_covering_bbox=True)
+    graph.nodes.to_parquet(folder / NODES, compression="zstd", schema_version="1.1.0")
+    graph.edges.to_parquet(folder / EDGES, compression="zstd", index=False)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write `region.json`, the last file of a region: without it the folder is no region."""
+    text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read `region.json`.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no region, one of another schema, or a damaged manifest.
+
+    Examples
+    --------
+    >>> read_manifest(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        message = f"{folder} holds no {MANIFEST}: build the region first"
+        raise StoreError(message)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found = content.get("schema_version") if isinstance(content, dict) else None
+        if found != SCHEMA_VERSION:
+            message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: build the region again"
+            raise StoreError(message)
+        return Manifest.model_validate(content)
+    except (json.JSONDecodeError, UnicodeDecodeError, ValidationError) as error:
+        text = " ".join(str(error).split())[:200]
+        message = f"{path} is damaged ({text}): build the region again"
+        raise StoreError(message) from error
+    except PermissionError as error:
+        message = f"{path} cannot be read: give yourself the right to"
+        raise StoreError(message) from error
+
+
+def read_region(folder: Path) -> Region:
+    """Read a region whole.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing or cannot be read.
+    """
+    manifest = read_manifest(folder)
+    try:
+        features = gpd.read_parquet(folder / FEATURES)
+        graph = MapGraph(nodes=gpd.read_parquet(folder / NODES), edges=pd.read_parquet(folder / EDGES))
+    except (OSError, ValueError) as error:
+        message = f"{folder} is damaged ({' '.join(str(error).split())[:200]}): build the region again"
+        raise StoreError(message) from error
+    return Region(
+        manifest=manifest,
+        layers=read_layers(folder / LAYERS),
+        features=check_features(features),
+        graph=graph,
+        coverage=shapely.from_wkt(manifest.coverage.wkt),
+    )
+
+
+def differing_files(folder: Path) -> list[str]:
+    """Compare every file of a region with its manifest; a line for each that is missing, changed or unknown."""
+    manifest = read_manifest(folder)
+    found = []
+    for name, record in manifest.files.items():
+        path = folder / name
+        if not path.is_file():
+            found.append(f"{name}: missing")
+        elif path.stat().st_size != record.bytes:
+            found.append(f"{name}: {path.stat().st_size} bytes, the manifest says {record.bytes}")
+        elif sha256_of(path) != record.sha256:
+            found.append(f"{name}: SHA-256 is {sha256_of(path)}, the manifest says {record.sha256}")
+    known = {MANIFEST, *manifest.files}
+    found += [f"{path.name}: not in the manifest" for path in sorted(folder.iterdir()) if path.name not in known]
+    return found
+
+
+@contextmanager
+def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
+    """Hold a region's lock; a second build of the same region says so and waits."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder.parent / f".{folder.name}.lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        tell(f"{folder.name}: another build of this region is under way, waiting for it")
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def fresh_folder(target: Path) -> Iterator[Path]:
+    """Yield an empty folder beside `target` that takes its place when the block ends well, and goes when it does not.
+
+    Call it under `locked`: leftovers of a build that was killed are cleared first.
+    """
+    scratch = target.parent / f".{target.name}.partial"
+    replaced = target.parent / f".{target.name}.replaced"
+    if replaced.exists() and not target.exists():
+        replaced.rename(target)  # killed between the two renames below: the old region is still whole
+    for leftover in (scratch, replaced):
+        shutil.rmtree(leftover, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    try:
+        yield scratch
+        for path in scratch.iterdir():
+            _flush(path)
+        if target.exists():
+            target.rename(replaced)
+        scratch.rename(target)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
+
+
+def _flush(path: Path) -> None:
+    """Force a file to the disk before the folder gets its name."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

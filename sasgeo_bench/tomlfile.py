@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""TOML text into a frozen pydantic model, with every fault told in one line."""
+
+import difflib
+import tomllib
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from sasgeo_bench.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Document(BaseModel):
+    """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion.
+
+    Examples
+    --------
+    >>> class Town(Document):
+    ...     seed: int
+    >>> parse_toml("seed = 3", Town, source="town.toml")
+    Town(seed=3)
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
+    """Parse and validate one TOML document.
+
+    Parameters
+    ----------
+    text : str
+        The TOML text.
+    model : type
+        A `Document`.
+    source : str
+        What to call the file in an error.
+
+    Returns
+    -------
+    Model
+        The validated document.
+
+    Raises
+    ------
+    ConfigError
+        If the text is no TOML, a key is unknown, a type is wrong or a value out of range; all faults on one line.
+
+    Examples
+    --------
+    >>> class Town(Document):
+    ...     seed: int
+    >>> parse_toml("sead = 3", Town, source="town.toml")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: town.toml: unknown key 'sead', did you mean 'seed'?; 'seed' is missing
+    """
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        message = f"{source}: not valid TOML: {error}"
+        raise ConfigError(message) from error
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        faults = sorted((_fault(item, model) for item in error.errors()), key=lambda fault: "is missing" in fault)
+        message = f"{source}: " + "; ".join(dict.fromkeys(faults))
+        raise ConfigError(message) from error
+
+
+def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic's own error record
+    """One pydantic error as a clause; unknown keys get the nearest known one."""
+    where = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        known = _keys_beside(item["loc"], model)
+        near = difflib.get_close_matches(str(item["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+        return f"unknown key {where!r}, {hint}"
+    if item["type"] == "missing":
+        return f"{where!r} is missing"
+    text = item["msg"].removeprefix("Value error, ")
+    return f"{where!r}: {text}, got {item['input']!r}" if where and "got " not in text else text
+
+
+def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
+    """The keys a model knows at the level where an unknown key was met."""
+    current: Any = model
+    for part in location[:-1]:
+        if isinstance(part, int):
+            continue
+        field = current.model_fields.get(part) or next(
+            (known for known in current.model_fields.values() if known.alias == part), None
+        )
+        if field is None:
+            return []
+        current = _model_inside(field.annotation)
+        if current is None:
+            return []
+    return [field.alias or name for name, field in current.model_fields.items()]
+
+
+def _model_inside(annotation: Any) -> type[BaseModel] | None:  # noqa: ANN401 - any type annotation
+    """The model within `list[M]`, `M | None` or `M` itself."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    inner = (_model_inside(part) for part in getattr(annotation, "__args__", ()))
+    return next((part for part in inner if part is not None), None)

@@ -149,7 +149,7 @@ def _is_current(folder: Path, inputs_sha256: str) -> bool:
     return sizes_hold and manifest.inputs_sha256 == inputs_sha256
 
 
-def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
+def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> Manifest:
     """Build the region of a plan, or leave it as it is where it is up to date.
 
     Parameters
@@ -158,6 +158,8 @@ def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
         What `plan_build` found.
     tell : callable
         Gets one line for every step.
+    with_preview : bool
+        Whether to draw `preview.png` too.
 
     Returns
     -------
@@ -178,7 +180,7 @@ def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
                 tell(f"{name}: up to date, nothing to do")
                 return regiondir.read_manifest(plan.folder)
             with regiondir.fresh_folder(plan.folder) as scratch:
-                manifest = _build_into(scratch, plan, tell)
+                manifest = _build_into(scratch, plan, tell, with_preview=with_preview)
     except SasgeoError:
         raise
     except OSError as error:
@@ -188,7 +190,7 @@ def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
     return manifest
 
 
-def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
+def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: bool) -> Manifest:
     taxonomy, name = load_taxonomy(), plan.folder.name
     with _source(plan) as source:
         tell(f"{name}: reading {source.name}")
@@ -218,8 +220,9 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
         regiondir.write_tables(scratch, reading.features, graph)
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
-    overview = read_overview(scratch / regiondir.LAYERS, longest_cells=PREVIEW_CELLS)
-    write_preview(scratch / regiondir.PREVIEW, manifest=manifest, overview=overview)
+    if with_preview:
+        overview = read_overview(scratch / regiondir.LAYERS, longest_cells=PREVIEW_CELLS)
+        write_preview(scratch / regiondir.PREVIEW, manifest=manifest, overview=overview)
     files = {path.name: regiondir.file_record(path) for path in sorted(scratch.iterdir())}
     manifest = manifest.model_copy(update={"files": files})
     regiondir.write_manifest(scratch, manifest)

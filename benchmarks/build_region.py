@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long a region takes and how much memory, at five sizes: layers, features, graph and manifest, without the preview.
+
+Each size is built several times in a process of its own, after the imports; the table gives the median time and the
+largest resident memory of that process, imports included. Run it with `make bench`; it needs the 2025 extract of
+Liechtenstein in a folder that SASGEO_EXTRACTS or --extracts names.
+"""
+
+import argparse
+import json
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from sasgeo_bench.build import build_region, plan_build
+from sasgeo_bench.store.catalog import find_region_file, read_region_file
+
+SIDES_KM = (1, 2, 4, 8, 12)
+CENTER_LONLAT = (9.522, 47.15)
+
+
+def measure(side_km: int, runs: int, extracts: list[Path]) -> dict[str, float]:
+    """Build one size several times; median seconds, CPU seconds and peak MB of this process."""
+    spec = read_region_file(find_region_file("vaduz")).model_copy(
+        update={"center_lonlat": CENTER_LONLAT, "size_m": (side_km * 1000.0, side_km * 1000.0)}
+    )
+    wall, cpu = [], []
+    for _ in range(runs):
+        out = Path(tempfile.mkdtemp(prefix="sasgeo-bench-"))
+        try:
+            start, start_cpu = time.perf_counter(), time.process_time()
+            build_region(plan_build(spec, out=out, extract_folders=extracts), tell=lambda _: None, with_preview=False)
+            wall.append(time.perf_counter() - start)
+            cpu.append(time.process_time() - start_cpu)
+        finally:
+            shutil.rmtree(out)
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    return {"seconds": statistics.median(wall), "cpu_s": statistics.median(cpu), "peak_mb": peak_mb}
+
+
+def main() -> None:
+    """Print one row for each size."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--extracts", type=Path, action="append", default=[])
+    parser.add_argument("--side-km", type=int, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.side_km:
+        print(json.dumps(measure(given.side_km, given.runs, given.extracts)))
+        return
+    print(f"median of {given.runs} runs; Liechtenstein 2025-09-19, 1 m cells, 13 classes")
+    print(f"{'km2':>5} {'s':>7} {'CPU s':>7} {'km2/s':>7} {'peak MB':>8}")
+    folders = [word for folder in given.extracts for word in ("--extracts", str(folder))]
+    for side_km in SIDES_KM:
+        command = [sys.executable, __file__, "--runs", str(given.runs), "--side-km", str(side_km), *folders]
+        row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)  # noqa: S603
+        area_km2 = side_km**2
+        rate = area_km2 / row["seconds"]
+        print(f"{area_km2:5d} {row['seconds']:7.2f} {row['cpu_s']:7.2f} {rate:7.1f} {row['peak_mb']:8.0f}")
+
+
+if __name__ == "__main__":
+    main()

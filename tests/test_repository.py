@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The repository around the code: licences, the lock file, the Makefile, the documents and what a wheel holds."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CODE = ("sasgeo_bench", "baselines", "benchmarks", "tests")
+SHIPPED = ("regions", "splits", "pipelines")
+# Made by commands, not by hand (.gitignore names them too).
+GENERATED = {
+    ".git",
+    ".venv",
+    "out",
+    "dist",
+    "__pycache__",
+    ".benchmarks",
+    ".hypothesis",
+    ".mypy_cache",
+    ".pytest_cache",
+    ".ruff_cache",
+}
+MAX_FILE_BYTES = 500_000
+
+# Declared, though no file of ours imports them: another library needs them for what we ask of it.
+INDIRECT = {"pyarrow": "GeoParquet through geopandas", "tqdm": "the progress bar of pooch"}
+
+
+def repository_files() -> list[Path]:
+    """Every file of the repository; needs no git, so an unpacked archive is checked the same way."""
+    found = []
+    for folder, folders, names in os.walk(ROOT):
+        folders[:] = [name for name in folders if name not in GENERATED]
+        found += [Path(folder, name) for name in names]
+    return sorted(found)
+
+
+def python_files() -> list[Path]:
+    return [path for path in repository_files() if path.suffix == ".py" and path.relative_to(ROOT).parts[0] in CODE]
+
+
+def read(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def project(name: str = "pyproject.toml") -> dict:
+    return tomllib.loads(read(name))["project"]
+
+
+def version_in_code() -> str:
+    return re.search(r'^__version__ = "([^"]+)"$', read("sasgeo_bench/__init__.py"), flags=re.MULTILINE)[1]
+
+
+def requirement_names(requirements: list[str]) -> set[str]:
+    """`rasterio>=1.4` -> `rasterio`."""
+    return {re.match(r"[\w.-]+", requirement)[0].lower() for requirement in requirements}
+
+
+def locked_blocks() -> list[str]:
+    """One text for each pinned requirement of the lock file, with its hashes."""
+    body = re.sub(r"^#.*\n", "", read("requirements.lock"), flags=re.MULTILINE)
+    return re.sub(r"\\\n\s*", "", body).strip().splitlines()
+
+
+def markdown_links() -> Iterator[tuple[Path, str]]:
+    """Every link of a document to another file of the repository."""
+    for path in repository_files():
+        if path.suffix == ".md":
+            for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
+                if "://" not in target and not target.startswith("mailto:"):
+                    yield path, target
+
+
+# Licences
+
+
+def test_every_python_file_begins_with_its_licence_and_a_docstring() -> None:
+    wrong = []
+    for path in python_files():
+        text = path.read_text(encoding="utf-8")
+        is_licensed = text.startswith("# SPDX-License-Identifier: Apache-2.0\n")
+        if not is_licensed or not ast.get_docstring(ast.parse(text)):
+            wrong.append(str(path.relative_to(ROOT)))
+    assert wrong == []
+    assert len(python_files()) > 5
+
+
+def test_the_licence_is_apache_and_the_data_licence_names_its_duties() -> None:
+    assert "Apache License" in read("LICENSE")
+    assert "END OF TERMS AND CONDITIONS" in read("LICENSE")
+    for word in ("© OpenStreetMap contributors", "ODbL", "Share alike"):
+        assert word in read("DATA-LICENSE.md")
+
+
+def test_no_file_is_larger_than_half_a_megabyte() -> None:
+    large = [str(path.relative_to(ROOT)) for path in repository_files() if path.stat().st_size > MAX_FILE_BYTES]
+    assert large == []
+
+
+# What is installed
+
+
+def test_the_lock_pins_every_requirement_with_hashes() -> None:
+    blocks = locked_blocks()
+    assert len(blocks) > 30
+    for block in blocks:
+        assert re.match(r"[\w.-]+==[\w.+!]+ ", block), block
+        assert re.search(r"--hash=sha256:[0-9a-f]{64}", block), block
+
+
+def test_the_lock_names_no_address_and_no_folder() -> None:
+    for word in ("://", "--index", "--extra-index", "--find-links", "--trusted-host", " @ ", "file:", "-e "):
+        assert word not in read("requirements.lock"), word
+
+
+def test_the_lock_holds_every_declared_requirement() -> None:
+    declared = project()["dependencies"] + project()["optional-dependencies"]["dev"]
+    missing = requirement_names(declared) - requirement_names(locked_blocks())
+    assert missing == set(), "run `make lock`"
+
+
+def test_the_declared_requirements_are_what_the_code_imports() -> None:
+    imported = set()
+    for path in (ROOT / "sasgeo_bench").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add(str(node.module).split(".")[0])
+    imported -= {*sys.stdlib_module_names, "sasgeo_bench"}
+    assert requirement_names(project()["dependencies"]) - set(INDIRECT) == imported
+
+
+def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: Path) -> None:
+    if find_spec("hatchling") is None:
+        pytest.skip("hatchling, the build backend, is not installed (make install brings it)")
+    from hatchling.builders.wheel import WheelBuilder  # noqa: PLC0415 - only where it is installed
+
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    names = set(zipfile.ZipFile(wheel).namelist())
+    expected = {"sasgeo_bench/py.typed", "sasgeo_bench/taxonomy.toml", "sasgeo_bench/cli.py"}
+    for folder in SHIPPED:
+        expected |= {f"sasgeo_bench/shipped/{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
+    assert expected - names == set()
+    assert [name for name in names if name.startswith(("tests/", "baselines/", "regions/"))] == []
+
+
+# Commands
+
+
+def test_make_alone_prints_every_target_with_its_line() -> None:
+    shown = subprocess.run(["make"], cwd=ROOT, capture_output=True, text=True, check=True).stdout  # noqa: S607 - make of PATH
+    phony = re.search(r"^\.PHONY: (.*)$", read("Makefile"), flags=re.MULTILINE)[1].split()
+    assert set(re.findall(r"^  ([a-z-]+) +\S", shown, flags=re.MULTILINE)) == set(phony)
+
+
+def test_ci_runs_the_commands_of_the_readme() -> None:
+    commands = re.findall(r"^(?:\s*)(make [a-z-]+)", read(".ci/run"), flags=re.MULTILINE)
+    assert commands == ["make check", "make test"]
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+    blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", read("README.md"), flags=re.DOTALL))
+    for command in (*commands, "make demo"):
+        assert re.search(rf"^{command}\b", blocks, flags=re.MULTILINE), command
+
+
+def test_every_make_command_in_a_document_exists() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", read("Makefile"), flags=re.MULTILINE))
+    for path in repository_files():
+        if path.suffix == ".md":
+            named = set(re.findall(r"(?:`|^)make ([a-z-]+)", path.read_text(encoding="utf-8"), flags=re.MULTILINE))
+            assert named <= targets, path
+
+
+# Documents and data
+
+
+def test_every_link_between_documents_leads_somewhere() -> None:
+    broken = [
+        f"{path.relative_to(ROOT)} -> {target}"
+        for path, target in markdown_links()
+        if not (path.parent / target).exists()
+    ]
+    assert broken == []
+
+
+def test_every_decision_record_is_listed_in_the_documents() -> None:
+    for path in (ROOT / "docs" / "decisions").glob("*.md"):
+        assert f"decisions/{path.name}" in read("docs/README.md")
+
+
+def test_the_changelog_document_begins_with_the_version_of_the_package() -> None:
+    newest = re.search(r"^## \[?([\w.]+)", read("CHANGELOG.md"), flags=re.MULTILINE)[1]
+    assert newest == project()["version"]
+
+
+def test_the_package_says_the_version_it_is_released_under() -> None:
+    assert version_in_code() == project()["version"]
+
+
+def test_the_baselines_ask_for_the_package_by_its_name() -> None:
+    assert requirement_names(project("baselines/pyproject.toml")["dependencies"]) == {project()["name"]}
+
+
+@pytest.mark.parametrize("folder", SHIPPED)
+def test_every_shipped_file_is_toml_or_the_readme(folder: str) -> None:
+    for path in (ROOT / folder).iterdir():
+        assert path.suffix == ".toml" or path.name == "README.md"
+        if path.suffix == ".toml":
+            tomllib.loads(path.read_text(encoding="utf-8"))

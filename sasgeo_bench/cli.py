@@ -134,7 +134,7 @@ def _class_table(manifest: Manifest) -> Table:
 
 
 def _reasons(manifest: Manifest) -> Table:
-    table = Table("in the whole extract", "objects", box=None, pad_edge=False)
+    table = Table("in and around the grid", "objects", box=None, pad_edge=False)
     for title, reasons in (("not visible", manifest.hidden), ("dropped", manifest.drops), ("mended", manifest.notes)):
         listed = list(reasons.items())
         for reason, count in listed[:TOP_DROPS]:

@@ -57,7 +57,7 @@ class CoverageRecord(_Record):
 class Manifest(_Record):
     """`region.json`: what a region is, where it comes from, and the hashes of its files.
 
-    `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects of the whole extract by
+    `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by
     reason: not visible from above, not used, mended.
     """
 

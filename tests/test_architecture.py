@@ -22,7 +22,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "grid": None,
     "taxonomy": None,
     "features": None,
-    "extract": ("locate", "snapshot", "coverage", "scan", "read", "history", "town"),
+    "extract": ("locate", "snapshot", "coverage", "scan", "read", "history", "sketch", "morphology", "town"),
     "regionfile": None,
     "layers": None,
     "evidence": None,

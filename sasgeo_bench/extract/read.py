@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import CoverageError
 from sasgeo_bench.extract.coverage import Source, choose_coverage
-from sasgeo_bench.extract.scan import DEFAULT_BRIDGE_WIDTH_M, Scan, ScanRow, Traits, scan_file
+from sasgeo_bench.extract.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
 from sasgeo_bench.extract.snapshot import open_snapshot
 from sasgeo_bench.features import make_features
 from sasgeo_bench.grid import Grid
@@ -26,15 +26,13 @@ _EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projec
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium says 1970-01-01 where a file carries no timestamps
 _DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
 
-Box = tuple[float, float, float, float]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
     """What one extract says about one grid.
 
-    `coverage` lies in the grid's CRS and is cut to the grid; `drops`, `hidden` and `notes` count objects of the whole
-    extract by reason; `osm_timestamp` is the newest moment the extract speaks of, None where it carries no times.
+    `coverage` lies in the grid's CRS and is cut to the grid; `drops`, `hidden` and `notes` count objects around the
+    grid by reason; `osm_timestamp` is the newest moment the extract speaks of, None where it carries no times.
     """
 
     features: gpd.GeoDataFrame
@@ -91,12 +89,13 @@ def read_extract(
     sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
     taxonomy = taxonomy or load_taxonomy()
-    with open_snapshot(path, at=at) as snapshot:
-        scan = scan_file(snapshot.path, taxonomy)
-    geometry = shapely.from_wkb(np.array([row.wkb for row in scan.rows], dtype=object))
-    lonlat = shapely.get_coordinates(geometry)
-    coverage, source = choose_coverage(lonlat, stated=stated_coverage, header_box=snapshot.box_lonlat)
     grid_lonlat = lonlat_box(grid)
+    with open_snapshot(path, at=at) as snapshot:
+        scan = scan_file(snapshot.path, taxonomy, box=grid_lonlat)
+    geometry = shapely.from_wkb(np.array([row.wkb for row in scan.rows], dtype=object))
+    beyond = shapely.from_wkb(np.array(scan.far, dtype=object))
+    lonlat = shapely.get_coordinates(np.concatenate((geometry, beyond)))
+    coverage, source = choose_coverage(lonlat, stated=stated_coverage, header_box=snapshot.box_lonlat)
     _check_covered(path, grid_lonlat, coverage)
     near = _meets(shapely.bounds(geometry), grid_lonlat)
     features = _table(scan, np.flatnonzero(near), geometry[near], grid, taxonomy)

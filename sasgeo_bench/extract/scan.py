@@ -2,6 +2,7 @@
 """One pass over an OSM file: ways and areas with a key of the taxonomy, and what the rules make of their tags."""
 
 import datetime as dt
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -23,7 +24,14 @@ _NO: Final = (None, "no", "false", "0")
 _AREA_MODIFIERS: Final = ("tunnel", "layer", "location", "parking")
 _LINE_MODIFIERS: Final = ("tunnel", "layer", "location", "width", "lanes")
 
+# Where the first point lies in the WKB of a line and of a multipolygon's first ring, and readers of N points.
+_FIRST_POINT: Final = {2: 9, 6: 22}
+_POINT_BYTES: Final = 16
+_POINTS: Final = tuple(struct.Struct(f"<{2 * count}d") for count in range(40))
+
 Get = Callable[[str], str | None]
+Box = tuple[float, float, float, float]
+WORLD: Final[Box] = (-180.0, -90.0, 180.0, 90.0)
 _FACTORY: Final = osmium.geom.WKBFactory()
 
 
@@ -62,9 +70,13 @@ class ScanRow(NamedTuple):
 
 @dataclass(slots=True)
 class Scan:
-    """What one pass found: a row for each object, the distinct traits they share, and what was not used."""
+    """What one pass found: a row for each object, the distinct traits they share, and what was not used.
+
+    `far` holds the geometry of what lies beyond the box asked for, or has no class: it still tells what is mapped.
+    """
 
     rows: list[ScanRow] = field(default_factory=list)
+    far: list[bytes] = field(default_factory=list)
     traits: list[Traits] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
 
@@ -170,8 +182,31 @@ def tagged_width_m(width: str | None, lanes: str | None) -> float | None:
     return None
 
 
-def scan_file(path: Path, taxonomy: Taxonomy) -> Scan:
-    """Read every way and area that carries a key of the taxonomy.
+def reaches(wkb: bytes, box: Box) -> bool:
+    """Whether a geometry may reach into a box: exact for short lines and polygons of one ring, True for all others.
+
+    Most objects of an extract lie far from the region and are short: told apart here, their tags need not be read.
+
+    Examples
+    --------
+    >>> line = bytes(shapely.to_wkb(shapely.linestrings([(9.0, 47.0), (9.1, 47.1)])))
+    >>> reaches(line, (9.05, 47.0, 9.2, 47.2)), reaches(line, (9.2, 47.0, 9.3, 47.2))
+    (True, False)
+    """
+    start = _FIRST_POINT.get(wkb[1])
+    count, rest = divmod(len(wkb) - (start or 0), _POINT_BYTES)
+    if start is None or rest or not 0 < count < len(_POINTS):
+        return True  # long, or with the headers of further rings between the points
+    values = _POINTS[count].unpack_from(wkb, start)
+    west, south, east, north = box
+    longitudes, latitudes = values[0::2], values[1::2]
+    return (
+        max(longitudes) >= west and min(longitudes) <= east and max(latitudes) >= south and min(latitudes) <= north
+    )
+
+
+def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box = WORLD) -> Scan:
+    """Read every way and area that carries a key of the taxonomy and may reach into a box.
 
     Parameters
     ----------
@@ -179,11 +214,13 @@ def scan_file(path: Path, taxonomy: Taxonomy) -> Scan:
         A sorted OSM file with one state of the world (`open_snapshot`).
     taxonomy : Taxonomy
         The classes.
+    box : tuple of float
+        West, south, east, north, degrees. What certainly lies outside is neither classified nor counted.
 
     Returns
     -------
     Scan
-        One entry for each object and geometry that belongs to a class; `tally` counts all others by reason.
+        A row for each object and geometry that belongs to a class; `tally` counts all others by reason.
 
     Raises
     ------
@@ -192,57 +229,81 @@ def scan_file(path: Path, taxonomy: Taxonomy) -> Scan:
     """
     scan = Scan()
     classifier = Classifier(taxonomy, scan)
-    relations = _area_relations(path, classifier)
-    closed: set[int] = set()
+    expected = _survey(path, taxonomy, classifier, scan.tally)
     assembled: set[int] = set()
-    closed_ways = _ClosedWays(taxonomy.keys_of("area"), closed, scan.tally)
-    for item in _ways_and_areas(path, taxonomy, closed_ways):
-        if item.is_area():
-            if not _scan_area(item, scan, classifier):
-                continue  # assembled without a ring: stays among the lost
+    for item in _ways_and_areas(path, taxonomy):
+        if not item.is_area():
+            _scan_way(item, scan, classifier, expected.ways, box)
+        elif _scan_area(item, scan, classifier, box):  # else assembled without a ring: stays among the lost
             if item.from_way():
                 assembled.add(item.orig_id())
             else:
-                relations.pop(item.orig_id(), None)
-        else:
-            _scan_way(item, scan, classifier, closed)
-    lost = closed - assembled
-    if lost or relations:
-        _scan_lost(path, lost, relations, scan, classifier)
+                expected.relations.pop(item.orig_id(), None)
+    lost = expected.ways - assembled
+    if lost or expected.relations:
+        _scan_lost(path, lost, expected.relations, scan, classifier)
     return scan
 
 
-class _ClosedWays:
-    """Sees the ways that no line rule can want: osmium assembles the closed ones to areas, the open ones are dropped."""
-
-    def __init__(self, area_keys: tuple[str, ...], closed: set[int], tally: Tally) -> None:
-        self._area_keys = area_keys
-        self._closed = closed
-        self._tally = tally
-
-    def way(self, way: Any) -> None:  # noqa: ANN401
-        """Remember a closed way with an area key; count an open one."""
-        tags = way.tags
-        for key in self._area_keys:
-            if key in tags:
-                if way.is_closed():
-                    self._closed.add(way.id)
-                else:
-                    self._tally.drops[f"open way with the area key {key!r}"] += 1
-                return
-
-
-def _ways_and_areas(path: Path, taxonomy: Taxonomy, closed_ways: _ClosedWays) -> Iterator[Any]:
-    """Both in one pass; the filters and the assembly of areas run in C++."""
+def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
+    """Ways with a key of lines and all areas, in one pass; the filters and the assembly of areas run in C++."""
     with_key = osmium.filter.KeyFilter(*taxonomy.keys)
     processor = osmium.FileProcessor(str(path)).with_locations().with_areas(with_key)
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
     lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line")).enable_for(osmium.osm.WAY)
-    return iter(processor.with_filter(kinds).with_filter(with_key).with_filter(lines).handler_for_filtered(closed_ways))
+    return iter(processor.with_filter(kinds).with_filter(with_key).with_filter(lines))
 
 
-def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int]) -> None:  # noqa: ANN401
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Relation:
+    """An area relation before it is assembled: its tags' meaning and its member ways by role."""
+
+    labels: tuple[Label, ...]
+    tags: dict[str, str]
+    version: int
+    timestamp: Any
+    outer: tuple[int, ...]
+    inner: tuple[int, ...]
+    is_building: bool
+
+
+@dataclass(slots=True)
+class _Expected:
+    """Closed ways and relations that carry an area class; what osmium assembles is taken out again."""
+
+    ways: set[int] = field(default_factory=set)
+    relations: dict[int, _Relation] = field(default_factory=dict)
+
+
+def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally) -> _Expected:
+    """List what should become an area: the main pass sees only what did."""
+    line_keys = taxonomy.keys_of("line")
+    area_keys = tuple(key for key in taxonomy.keys_of("area") if key not in line_keys)
+    wanted = osmium.filter.KeyFilter(*area_keys).enable_for(osmium.osm.WAY)
+    typed = osmium.filter.KeyFilter("type").enable_for(osmium.osm.RELATION)
+    expected = _Expected()
+    elements = osmium.FileProcessor(str(path), osmium.osm.WAY | osmium.osm.RELATION)
+    for item in elements.with_filter(wanted).with_filter(typed):
+        if item.is_relation():
+            relation = _area_relation(item, classifier)
+            if relation is not None:
+                expected.relations[item.id] = relation
+        elif item.is_closed():
+            expected.ways.add(item.id)
+        elif not any(key in item.tags for key in line_keys):
+            key = next(key for key in area_keys if key in item.tags)
+            tally.drops[f"open way with the area key {key!r}, anywhere in the extract"] += 1
+    return expected
+
+
+def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int], box: Box) -> None:  # noqa: ANN401
     """Take a way as a line where a line rule holds; remember it where an area of it must follow."""
+    wkb = line_wkb(way, scan.tally)
+    if wkb is None:
+        return
+    if not reaches(wkb, box):
+        scan.far.append(wkb)
+        return
     get = way.tags.get
     found = classifier.as_line(get)
     if way.is_closed():
@@ -256,25 +317,30 @@ def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int]) ->
         reasons = [f"no rule for {text}" for text in found.unknown] or ["open way with an area class"]
         scan.tally.drops.update(reasons)
     if found.line:
-        wkb = line_wkb(way, scan.tally)
-        if wkb is not None:
-            kind = classifier.kind(get, found.line, is_area=False)
-            scan.rows.append(ScanRow(wkb, kind, way.id, False, way.version, way.timestamp))  # noqa: FBT003
+        kind = classifier.kind(get, found.line, is_area=False)
+        scan.rows.append(ScanRow(wkb, kind, way.id, False, way.version, way.timestamp))  # noqa: FBT003
+    else:
+        scan.far.append(wkb)
 
 
-def _scan_area(area: Any, scan: Scan, classifier: Classifier) -> bool:  # noqa: ANN401
+def _scan_area(area: Any, scan: Scan, classifier: Classifier, box: Box) -> bool:  # noqa: ANN401
     """Take an assembled area; False where osmium hands one over that has no ring."""
+    try:
+        wkb = bytes.fromhex(_FACTORY.create_multipolygon(area))
+    except RuntimeError:  # osmium's geometry_error: the rings were too broken to assemble
+        return False
+    if not reaches(wkb, box):
+        scan.far.append(wkb)
+        return True
     get = area.tags.get
     is_relation = not area.from_way()
     labels = classifier.area_labels(get, is_relation=is_relation)
     if labels:
-        try:
-            wkb = bytes.fromhex(_FACTORY.create_multipolygon(area))
-        except RuntimeError:  # osmium's geometry_error: the rings were too broken to assemble
-            return False
         kind = classifier.kind(get, labels, is_area=True)
         scan.rows.append(ScanRow(wkb, kind, area.orig_id(), is_relation, area.version, area.timestamp))
-    elif not classifier.as_line(get).line:
+        return True
+    scan.far.append(wkb)
+    if not classifier.as_line(get).line:
         scan.tally.drops.update(f"no rule for {text}" for text in classifier.as_area(get).unknown)
     return True
 
@@ -302,40 +368,27 @@ def _pieces(way: Any) -> list[list[tuple[float, float]]]:  # noqa: ANN401
     return [[node for node in run if node is not None] for run in runs if len(set(run)) > 1]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Relation:
-    """An area relation before it is assembled: its tags' meaning and its member ways by role."""
-
-    labels: tuple[Label, ...]
-    tags: dict[str, str]
-    version: int
-    timestamp: Any
-    outer: tuple[int, ...]
-    inner: tuple[int, ...]
-    is_building: bool
-
-
-def _area_relations(path: Path, classifier: Classifier) -> dict[int, _Relation]:
-    """Relations that should become an area: multipolygons of a class, and type=building, which osmium leaves alone."""
-    found: dict[int, _Relation] = {}
-    for item in osmium.FileProcessor(str(path), osmium.osm.RELATION).with_filter(osmium.filter.KeyFilter("type")):
-        kind = item.tags.get("type")
-        if kind not in ("multipolygon", "building"):
-            continue
-        tags = dict(item.tags) | ({"building": item.tags.get("building") or "yes"} if kind == "building" else {})
-        labels = classifier.area_labels(tags.get, is_relation=True)
-        if labels:
-            ways = [(member.role, member.ref) for member in item.members if member.type == "w"]
-            found[item.id] = _Relation(
-                labels=labels,
-                tags=tags,
-                version=item.version,
-                timestamp=item.timestamp,
-                outer=tuple(ref for role, ref in ways if role in ("outer", "outline", "")),
-                inner=tuple(ref for role, ref in ways if role == "inner"),
-                is_building=kind == "building",
-            )
-    return found
+def _area_relation(item: Any, classifier: Classifier) -> _Relation | None:  # noqa: ANN401
+    """A relation that should become an area: a multipolygon of a class, or type=building, which osmium leaves alone."""
+    kind = item.tags.get("type")
+    if kind not in ("multipolygon", "building"):
+        return None
+    tags = dict(item.tags)
+    if kind == "building":
+        tags.setdefault("building", "yes")
+    labels = classifier.area_labels(tags.get, is_relation=True)
+    if not labels:
+        return None
+    ways = [(member.role, member.ref) for member in item.members if member.type == "w"]
+    return _Relation(
+        labels=labels,
+        tags=tags,
+        version=item.version,
+        timestamp=item.timestamp,
+        outer=tuple(ref for role, ref in ways if role in ("outer", "outline", "")),
+        inner=tuple(ref for role, ref in ways if role == "inner"),
+        is_building=kind == "building",
+    )
 
 
 def _scan_lost(

@@ -77,23 +77,24 @@ def _city_block(sketch: Sketch, block: shapely.Polygon, rng: np.random.Generator
 def _old_town(sketch: Sketch) -> None:
     """Crooked lanes within a wall, perimeter blocks with courtyards, a market square and a church."""
     half, rng = sketch.half_m, sketch.rng
-    rings = [0.16 * half, 0.36 * half, 0.58 * half, 0.84 * half]
-    angles = np.linspace(0, 2 * np.pi, 13)[:-1] + rng.uniform(-0.12, 0.12, 12)
+    spokes = 16
+    rings = [share * half for share in (0.14, 0.28, 0.42, 0.56, 0.7, 0.86)]
+    angles = np.linspace(0, 2 * np.pi, spokes + 1)[:-1] + rng.uniform(-0.1, 0.1, spokes)
     spots = [
-        [(r * np.cos(a), r * np.sin(a)) for a, r in zip(angles, radius * rng.uniform(0.88, 1.12, 12), strict=True)]
+        [(r * np.cos(a), r * np.sin(a)) for a, r in zip(angles, radius * rng.uniform(0.92, 1.08, spokes), strict=True)]
         for radius in rings
     ]
-    for ring, tags in zip(spots, ("pedestrian", "living_street", "residential", "secondary"), strict=True):
+    for ring, tags in zip(spots, ("pedestrian", "living_street", "residential", "residential", "residential", "secondary"), strict=True):
         sketch.street(_ring_road(ring), highway=tags)
-    for spoke in range(12):
-        inner = [ring[spoke] for ring in spots[spoke % 2 :]]
+    for spoke in range(spokes):
+        inner = [ring[spoke] for ring in spots[2 * (spoke % 2) :]]
         outwards = (1.19 * half * np.cos(angles[spoke]), 1.19 * half * np.sin(angles[spoke]))
         clipped = (float(np.clip(outwards[0], -half, half)), float(np.clip(outwards[1], -half, half)))
-        tags = {"highway": "tertiary"} if spoke % 3 == 0 else {"highway": "residential"}
+        tags = {"highway": "tertiary"} if spoke % 4 == 0 else {"highway": "residential"}
         sketch.street(wobble(curve([*inner, clipped], step_m=25.0), 2.5, rng), **tags)
-    wall = affinity.scale(shapely.Point(0, 0).buffer(0.7 * half), 1.0, 1.0)
+    wall = affinity.scale(shapely.Point(0, 0).buffer(0.78 * half), 1.0, 1.0)
     sketch.line(shapely.get_coordinates(wall.exterior)[:52], barrier="city_wall")
-    _market_square(sketch, 0.16 * half)
+    _market_square(sketch, 0.14 * half)
     streets = shapely.union_all([shapely.linestrings(way.line) for way in sketch.ways if "highway" in way.tags])
     faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.node(streets)).tolist()))
     for face in sorted(faces, key=lambda face: (round(face.centroid.x, 1), round(face.centroid.y, 1))):

@@ -43,20 +43,32 @@ class Sketch:
     areas: list[Area] = field(default_factory=list)
     taken: list[shapely.Geometry] = field(default_factory=list)
 
+    @property
+    def square(self) -> shapely.Polygon:
+        """The town's ground."""
+        return shapely.box(-self.half_m, -self.half_m, self.half_m, self.half_m)
+
     def street(self, line: Sequence[Sequence[float]] | Line, **tags: str) -> None:
         """Draw a street and keep its ground free of houses."""
-        points = np.asarray(line, dtype=np.float64)
-        self.ways.append(Way(line=points, tags=tags))
+        self.line(line, **tags)
         if tags.get("tunnel") is None:
             half_m = _STREET_HALF_M.get(tags.get("highway", ""), 4.0)
-            self.taken.append(shapely.buffer(shapely.linestrings(points), half_m))
+            self.taken.append(shapely.buffer(shapely.linestrings(np.asarray(line, dtype=np.float64)), half_m))
 
     def line(self, line: Sequence[Sequence[float]] | Line, **tags: str) -> None:
-        """Draw a line that takes no ground: a hedge, a wall, a stream."""
-        self.ways.append(Way(line=np.asarray(line, dtype=np.float64), tags=tags))
+        """Draw a line that takes no ground: a hedge, a wall, a stream. What lies beyond the town is cut off."""
+        points = np.asarray(line, dtype=np.float64)
+        if np.abs(points).max() <= self.half_m:
+            self.ways.append(Way(line=points, tags=tags))
+            return
+        for part in shapely.get_parts(shapely.intersection(shapely.linestrings(points), self.square)):
+            if part.geom_type == "LineString" and part.length > 1.0:
+                self.ways.append(Way(line=shapely.get_coordinates(part), tags=tags))
 
     def ground(self, polygon: shapely.Geometry, *, is_free: bool = True, **tags: str) -> bool:
         """Draw an area, as a closed way or with holes as a multipolygon; False where the ground is taken or too small."""
+        if polygon.geom_type == "Polygon" and not self.square.contains(polygon):
+            polygon = shapely.intersection(polygon, self.square)
         if polygon.geom_type != "Polygon" or polygon.area < 4.0:  # noqa: PLR2004 - m2
             return False
         if is_free and self.is_taken(polygon):
@@ -79,8 +91,7 @@ class Sketch:
 
     def build(self, polygon: shapely.Geometry, **tags: str) -> bool:
         """Build a house where the ground is free and within the town."""
-        within = shapely.box(-self.half_m, -self.half_m, self.half_m, self.half_m)
-        if not within.contains(polygon) or not self.ground(polygon, **tags):
+        if not self.square.contains(polygon) or not self.ground(polygon, **tags):
             return False
         self.taken.append(shapely.buffer(polygon, 1.0))
         return True

@@ -23,7 +23,6 @@ from sasgeo_bench.extract.sketch import Line, Sketch, Tags, join_streets
 FIRST_DATE: Final = dt.date(2012, 1, 1)
 LAST_DATE: Final = dt.date(2026, 1, 1)
 BULK_REDRAW: Final = dt.date(2021, 7, 1)  # many buildings get new ids and nodes; the ground stays as it is
-MARGIN: Final = 1.02  # what is drawn may reach a little beyond the box that the header states
 
 _BORN_BEFORE: Final = {"highway": 0.93, "building": 0.75, "waterway": 0.97, "natural": 0.95, "railway": 0.99}
 _DIES: Final = 0.06
@@ -144,26 +143,7 @@ def _things(plan: TownPlan) -> list[_Thing]:
     draw(plan.morphology, sketch)
     drawn = [((way.line,), way.tags, None) for way in join_streets(sketch.ways)]
     drawn += [((area.outer, *area.inner), area.tags, area.kind) for area in sketch.areas]
-    things = []
-    for number, (rings, tags, relation) in enumerate(drawn):
-        within = np.abs(np.vstack(rings)).max() <= MARGIN * sketch.half_m
-        if within or _is_long(tags):
-            clipped = rings if within else tuple(_clipped(ring, MARGIN * sketch.half_m) for ring in rings)
-            if all(len(ring) > 1 for ring in clipped):
-                things.append(_lived(plan, number, clipped, tags, relation))
-    return things
-
-
-def _is_long(tags: Tags) -> bool:
-    """Rivers and the like run on beyond the town; everything else ends within it."""
-    return any(key in tags for key in ("waterway", "natural", "highway", "railway", "barrier"))
-
-
-def _clipped(ring: Line, half_m: float) -> Line:
-    """Move what lies beyond the town onto its edge, so that rings stay closed; drop doubled points."""
-    moved = np.clip(ring, -half_m, half_m)
-    keep = np.concatenate(([True], (np.diff(moved, axis=0) != 0).any(axis=1)))
-    return moved[keep]
+    return [_lived(plan, number, *shape) for number, shape in enumerate(drawn)]
 
 
 def _lived(plan: TownPlan, number: int, rings: tuple[Line, ...], tags: Tags, relation: str | None) -> _Thing:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a region takes and how much memory, at five sizes: layers, features, graph and manifest, without the preview.
+"""Time and memory of a region at five sizes: layers, features, graph and manifest, without the preview.
 
 Each size is built several times in a process of its own, after the imports; the table gives the median time and the
 largest resident memory of that process, imports included. Run it with `make bench`; it needs the 2025 extract of

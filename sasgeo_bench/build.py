@@ -39,7 +39,7 @@ from sasgeo_bench.store.layerfile import PaintWindow, read_overview, write_layer
 from sasgeo_bench.store.preview import write_preview
 from sasgeo_bench.taxonomy import Taxonomy, load_taxonomy
 
-PREVIEW_CELLS: Final = 1100
+PREVIEW_CELLS: Final = 2048
 
 Tell = Callable[[str], None]
 
@@ -62,14 +62,15 @@ class BuildPlan:
         grid = self.grid
         west, south, east, north = lonlat_box(grid)
         cells = grid.rows * grid.cols
+        area_km2 = cells * grid.cell_size_m**2 / 1e6
         reads = f"{self.source} ({self.source.stat().st_size / 1e6:.1f} MB)" if self.source else "an embedded town"
         return "\n".join(
             (
                 f"{self.spec.id}: {self.spec.title}",
                 f"  reads   {reads}, as of {self.extract.date}",
                 f"  bounds  {west:.5f}, {south:.5f}, {east:.5f}, {north:.5f} (west, south, east, north)",
-                f"  grid    {grid.rows} x {grid.cols} cells of {grid.cell_size_m:g} m, EPSG:{grid.epsg},"
-                f" {cells * grid.cell_size_m**2 / 1e6:.2f} km2",
+                f"  grid    {grid.rows} x {grid.cols} cells of {grid.cell_size_m:g} m, EPSG:{grid.epsg}",
+                f"  area    {area_km2:.2f} km2",
                 f"  layers  {classes} classes, {classes * cells / 1e6:.0f} MB before compression",
                 f"  writes  {self.folder}" + (" (up to date, nothing to do)" if self.is_current else ""),
             )
@@ -184,7 +185,9 @@ def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> M
     except SasgeoError:
         raise
     except OSError as error:
-        message = f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights there"
+        message = (
+            f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights there"
+        )
         raise StoreError(message) from error
     tell(f"{name}: built {plan.folder}")
     return manifest

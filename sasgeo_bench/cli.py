@@ -22,6 +22,7 @@ from sasgeo_bench.store.regiondir import differing_files, read_manifest
 EXIT_USER: Final = 2
 EXIT_INTERRUPTED: Final = 130
 TOP_DROPS: Final = 12
+PIPE_WIDTH: Final = 200
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)
 errors = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -35,9 +36,11 @@ ExtractFolders = Annotated[
 
 
 @app.command("build-region")
-def build_region_command(  # noqa: PLR0913 - one argument for each flag
+def build_region_command(
     region: Annotated[list[str], typer.Argument(help="ids from list-regions, or files of your own (*.toml)")],
-    date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of one of the region's extracts; default: newest")] = None,
+    date: Annotated[
+        str | None, typer.Option(help="YYYY-MM-DD of one of the region's extracts; default: newest")
+    ] = None,
     extracts: ExtractFolders = None,
     regions: RegionFolders = None,
     out: Out = Path("out"),
@@ -118,7 +121,9 @@ def _summary(manifest: Manifest, folder: Path) -> Table:
     table.add_row("folder", str(folder))
     table.add_row("scenes", ", ".join(manifest.scenes))
     table.add_row("extract", f"{extract.file}, as of {extract.date}, SHA-256 {extract.sha256}")
-    table.add_row("grid", f"{manifest.rows} x {manifest.cols} cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}")
+    table.add_row(
+        "grid", f"{manifest.rows} x {manifest.cols} cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}"
+    )
     table.add_row("mapped", f"{coverage.share:.1%} of the grid ({coverage.source}); the rest is unknown, not absent")
     table.add_row("graph", graph)
     table.add_row("preview", str(folder / "preview.png"))
@@ -169,9 +174,10 @@ def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> N
 
 def _print(table: Table) -> None:
     """Print to stdout: as wide as the terminal there, unwrapped into a file or pipe."""
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 200, markup=False)
-    console.print(table)
-    console.print()
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH, markup=False)
+    with console.capture() as captured:
+        console.print(table)
+    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()) + "\n")
 
 
 def main() -> None:
@@ -181,6 +187,7 @@ def main() -> None:
     except SasgeoError as error:
         errors.print(f"sasgeo-bench: {error}", markup=False)
         sys.exit(EXIT_USER)
-    except KeyboardInterrupt:
-        errors.print("sasgeo-bench: interrupted; what was there before is as it was")
-        sys.exit(EXIT_INTERRUPTED)
+    except SystemExit as leaving:
+        if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word
+            errors.print("sasgeo-bench: interrupted; what was there before is as it was")
+        raise

@@ -56,8 +56,8 @@ def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
         message = f"a feature table needs the columns {missing!r} too"
         raise ShapeError(message)
     times = pd.to_datetime(pd.Series(columns["timestamp"], dtype="datetime64[ms]"), utc=True)
-    plain = {name: pd.Series(columns[name]) if name != "timestamp" else times for name in DTYPES}
-    table = pd.DataFrame({name: plain[name].astype(kind) for name, kind in DTYPES.items()})
+    table = pd.DataFrame({name: columns[name] if name != "timestamp" else times for name in DTYPES})
+    table = table.astype(dict(DTYPES))
     return check_features(gpd.GeoDataFrame(table, geometry=gpd.GeoSeries(columns["geometry"], crs=epsg)))
 
 
@@ -77,7 +77,9 @@ def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     """
     wanted = [*DTYPES, "geometry"]
     if list(features.columns) != wanted:
-        message = f"a feature table has the columns {wanted!r}, got {list(features.columns)!r}: build it with make_features"
+        message = (
+            f"a feature table has the columns {wanted!r}, got {list(features.columns)!r}: build it with make_features"
+        )
         raise ShapeError(message)
     wrong = {name: str(features[name].dtype) for name, kind in DTYPES.items() if str(features[name].dtype) != kind}
     if wrong:
@@ -90,7 +92,7 @@ def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 def fingerprint(features: gpd.GeoDataFrame) -> str:
-    """Hash what a table holds, whatever the order of its rows: SHA-256 over sorted (type, id, version, class, coordinates).
+    """Hash what a table holds, whatever the order of its rows: types, ids, versions, classes and centroids.
 
     Coordinates are rounded to a millimetre, so another version of PROJ does not change the fingerprint.
 

@@ -86,7 +86,9 @@ class Grid:
             message = f"cell_size_m must be positive and finite, got {cell_size_m!r}"
             raise GridError(message)
         if not (west_m < east_m and south_m < north_m):
-            message = f"bounds must grow from west to east and south to north, got {(west_m, south_m, east_m, north_m)!r}"
+            message = (
+                f"bounds must grow from west to east and south to north, got {(west_m, south_m, east_m, north_m)!r}"
+            )
             raise GridError(message)
         left, top = math.floor(west_m / cell_size_m + _SNAP), math.ceil(north_m / cell_size_m - _SNAP)
         right, bottom = math.ceil(east_m / cell_size_m - _SNAP), math.floor(south_m / cell_size_m + _SNAP)
@@ -145,7 +147,7 @@ class Grid:
 
     def to_centres_m(self, cells: NDArray[np.int64]) -> Points:
         """(row, col), shape (N, 2) -> easting/northing of the cells' centres, shape (N, 2), metres."""
-        return self.to_en_m(cells[:, ::-1] + 0.5)
+        return self.to_en_m(cells[:, ::-1].astype(np.float64) + 0.5)
 
     def window(self, row: int, col: int, rows: int, cols: int) -> Self:
         """Part of the grid that begins at a cell; it may reach beyond."""

@@ -19,6 +19,7 @@ MAX_CELLS: Final = 4e9
 _EDGE_POINTS: Final = 21
 
 Scene = Literal["urban", "suburban", "industrial", "riverside", "agricultural", "alpine", "coastal", "forest"]
+Corner = Annotated[tuple[float, float], Field(strict=False)]
 Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
 
 
@@ -52,7 +53,7 @@ class RegionFile(Document):
     bounds_lonlat: tuple[float, float, float, float] | None = Field(default=None, strict=False)
     cell_size_m: float
     epsg: int | None = None
-    coverage_lonlat: list[tuple[float, float]] | None = Field(default=None, strict=False)
+    coverage_lonlat: list[Corner] | None = None
     extract: Annotated[list[Extract], Field(min_length=1)]
 
     @field_validator("cell_size_m")
@@ -81,7 +82,7 @@ class RegionFile(Document):
 
     @field_validator("coverage_lonlat")
     @classmethod
-    def _coverage_is_a_ring(cls, ring: list[tuple[float, float]] | None) -> list[tuple[float, float]] | None:
+    def _coverage_is_a_ring(cls, ring: list[Corner] | None) -> list[Corner] | None:
         least = 3
         if ring is not None and len(set(ring)) < least:
             message = f"coverage_lonlat needs at least {least} different corners [lon, lat], got {len(set(ring))}"
@@ -146,7 +147,9 @@ class RegionFile(Document):
             bounds_m = to_grid.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS, errcheck=True)
             return Grid.from_bounds(*bounds_m, cell_size_m=self.cell_size_m, epsg=epsg)
         except (pyproj.exceptions.ProjError, GridError) as error:
-            message = f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or mend the place"
+            message = (
+                f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or mend the place"
+            )
             raise ConfigError(message) from error
 
     def pick(self, date: dt.date | None) -> Extract:
@@ -175,7 +178,9 @@ def _check_lonlat(box: tuple[float, float, float, float]) -> None:
         message = f"longitudes lie within -180..180 and latitudes within -90..90, got {written!r}"
         raise ValueError(message)
     if max(abs(south), abs(north)) > MAX_LATITUDE_DEG:
-        message = f"UTM ends at {MAX_LATITUDE_DEG:g} degrees of latitude, got {written!r}: choose a place nearer the equator"
+        message = (
+            f"UTM ends at {MAX_LATITUDE_DEG:g} degrees of latitude, got {written!r}: choose a place nearer the equator"
+        )
         raise ValueError(message)
     if west > east:
         message = (

@@ -107,7 +107,7 @@ class Taxonomy(Document):
 
     def __getitem__(self, name: str) -> SemanticClass:
         """Return the class of that name; `KeyError` if there is none."""
-        return self.classes[self.names.index(name)] if name in self.names else {}[name]
+        return {item.name: item for item in self.classes}[name]
 
     @cached_property
     def keys(self) -> tuple[str, ...]:

@@ -105,7 +105,7 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     Raises
     ------
     ExtractError
-        If no folder holds the file and it cannot be downloaded; the line names the file, its SHA-256 and where to put it.
+        If no folder holds the file and it cannot be downloaded; the line names the file, its SHA-256 and its place.
 
     Examples
     --------
@@ -150,6 +150,13 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(source, "sha256").hexdigest()
 
 
+def _check_hash(path: Path, extract: Extract, source: str) -> None:
+    found = _sha256(path)
+    if found not in extract.sha256:
+        message = f"{source} has SHA-256 {found}, which is none of those accepted"
+        raise ExtractError(message)
+
+
 def _download(extract: Extract, url: str) -> Path:
     """Download into the cache; the file gets its name only when its hash is one of those accepted."""
     cache = cache_folder()
@@ -158,14 +165,9 @@ def _download(extract: Extract, url: str) -> Path:
         with TemporaryDirectory(dir=cache, prefix=".download-") as scratch:
             # pooch checks one hash, and several may be accepted here: so it is told none, and we check.
             got = Path(
-                pooch.retrieve(
-                    url, known_hash=None, fname=extract.file, path=scratch, progressbar=sys.stderr.isatty()
-                )
+                pooch.retrieve(url, known_hash=None, fname=extract.file, path=scratch, progressbar=sys.stderr.isatty())
             )
-            found = _sha256(got)
-            if found not in extract.sha256:
-                message = f"{url} has SHA-256 {found}, which is none of those accepted"
-                raise ExtractError(message)
+            _check_hash(got, extract, url)
             return got.replace(cache / extract.file)
     except ExtractError:
         raise

@@ -43,9 +43,13 @@ def _grid(sketch: Sketch) -> None:
             sketch.street([(x, -half), (x, rail_y - 14)], **tags)
             sketch.street([(x, rail_y + 14), (x, half)], **tags)
     for number, y in enumerate(ys):
-        if abs(y - rail_y) > 20:  # noqa: PLR2004 - m
+        if abs(y - rail_y) > 20:
             sketch.street([(-half, y), (half, y)], highway="secondary" if number % 3 == 0 else "residential")
-    park = shapely.box(xs[6] + 8, ys[5] + 8, xs[7] - 8, ys[6] - 8) if len(xs) > 7 and len(ys) > 6 else shapely.box(9, 9, 70, 80)  # noqa: E501, PLR2004
+    park = (
+        shapely.box(xs[6] + 8, ys[5] + 8, xs[7] - 8, ys[6] - 8)
+        if len(xs) > 7 and len(ys) > 6
+        else shapely.box(9, 9, 70, 80)
+    )
     pond = affinity.scale(park.centroid.buffer(14), 1.4, 0.8)
     sketch.ground(park.difference(pond), leisure="park")
     sketch.ground(pond, is_free=False, natural="water")
@@ -58,19 +62,22 @@ def _grid(sketch: Sketch) -> None:
 def _city_block(sketch: Sketch, block: shapely.Polygon, rng: np.random.Generator) -> None:
     """A block of a grid city: one perimeter building with a court, a row of lots, or a car park."""
     kind = rng.random()
-    if kind < 0.3:  # noqa: PLR2004 - share
+    if kind < 0.3:
         sketch.build(block.difference(block.buffer(-15, join_style="mitre")), building="apartments")
         return
-    if kind < 0.4:  # noqa: PLR2004 - share
+    if kind < 0.4:
         if sketch.ground(block, amenity="parking"):
             sketch.keep_free(block)
         return
     west, south, east, north = block.bounds
     for x in np.arange(west, east - 10, 20.0):
         for y0, y1 in ((south, south + 24), (north - 24, north)):
-            width = 18.5 if rng.random() < 0.7 else 14.0  # noqa: PLR2004 - share
+            width = 18.5 if rng.random() < 0.7 else 14.0
             depth = rng.uniform(0, 6)
-            sketch.build(shapely.box(x, y0 + (depth if y0 > south else 0), x + width, y1 - (depth if y0 == south else 0)), building="commercial")  # noqa: E501
+            sketch.build(
+                shapely.box(x, y0 + (depth if y0 > south else 0), x + width, y1 - (depth if y0 == south else 0)),
+                building="commercial",
+            )
     sketch.ground(shapely.box(west + 10, south + 32, east - 10, north - 32), amenity="parking", parking="underground")
 
 
@@ -84,8 +91,10 @@ def _old_town(sketch: Sketch) -> None:
         [(r * np.cos(a), r * np.sin(a)) for a, r in zip(angles, radius * rng.uniform(0.92, 1.08, spokes), strict=True)]
         for radius in rings
     ]
-    for ring, tags in zip(spots, ("pedestrian", "living_street", "residential", "residential", "residential", "secondary"), strict=True):
-        sketch.street(_ring_road(ring), highway=tags)
+    for ring, kind in zip(
+        spots, ("pedestrian", "living_street", "residential", "residential", "residential", "secondary"), strict=True
+    ):
+        sketch.street(_ring_road(ring), highway=kind)
     for spoke in range(spokes):
         inner = [ring[spoke] for ring in spots[2 * (spoke % 2) :]]
         outwards = (1.19 * half * np.cos(angles[spoke]), 1.19 * half * np.sin(angles[spoke]))
@@ -100,19 +109,24 @@ def _old_town(sketch: Sketch) -> None:
     for face in sorted(faces, key=lambda face: (round(face.centroid.x, 1), round(face.centroid.y, 1))):
         _perimeter_block(sketch, face.buffer(-6.5, join_style="mitre"))
     _park_ring(sketch, 0.93 * half)
-    _stream(sketch, curve([(-half, -0.93 * half), (-0.3 * half, -0.9 * half), (0.4 * half, -0.96 * half), (half, -0.9 * half)]))
+    _stream(
+        sketch,
+        curve([(-half, -0.93 * half), (-0.3 * half, -0.9 * half), (0.4 * half, -0.96 * half), (half, -0.9 * half)]),
+    )
 
 
 def _ring_road(corners: list[tuple[float, float]]) -> Line:
     """A closed smooth line through corners: one turn out of a longer curve, so that it has no kink where it closes."""
     line = curve([*corners[-2:], *corners, *corners[:3]])
-    start, end = np.flatnonzero(np.hypot(*(line - corners[0]).T) < 0.02)[[0, -1]]  # noqa: PLR2004 - rounding
+    start, end = np.flatnonzero(np.hypot(*(line - corners[0]).T) < 0.02)[[0, -1]]
     return np.vstack((line[start:end], line[start : start + 1]))
 
 
 def _market_square(sketch: Sketch, radius_m: float) -> None:
     nave = affinity.rotate(shapely.box(-0.3 * radius_m, -0.14 * radius_m, 0.3 * radius_m, 0.14 * radius_m), 20)
-    choir = affinity.translate(shapely.Point(0, 0).buffer(0.14 * radius_m, quad_segs=4), 0.28 * radius_m, 0.1 * radius_m)
+    choir = affinity.translate(
+        shapely.Point(0, 0).buffer(0.14 * radius_m, quad_segs=4), 0.28 * radius_m, 0.1 * radius_m
+    )
     sketch.ground(nave.union(choir), is_free=False, building="church")
     square = shapely.Point(0, 0).buffer(0.7 * radius_m, quad_segs=5)
     sketch.ground(square, is_free=False, highway="pedestrian", area="yes")
@@ -122,14 +136,14 @@ def _market_square(sketch: Sketch, radius_m: float) -> None:
 def _perimeter_block(sketch: Sketch, block: shapely.Geometry) -> None:
     """Houses wall to wall around a court, or one closed block with a court inside."""
     rng = sketch.rng
-    if block.geom_type != "Polygon" or block.area < 150:  # noqa: PLR2004 - m2
+    if block.geom_type != "Polygon" or block.area < 150:
         return
     court = block.buffer(-rng.uniform(11, 14), join_style="mitre")
-    if court.geom_type != "Polygon" or court.area < 60:  # noqa: PLR2004 - m2
+    if court.geom_type != "Polygon" or court.area < 60:
         sketch.build(block, building="yes")
         return
     ring = block.difference(court)
-    if rng.random() < 0.35:  # noqa: PLR2004 - share
+    if rng.random() < 0.35:
         sketch.build(ring, building="apartments")
     else:
         _terrace(sketch, block, ring)
@@ -142,11 +156,17 @@ def _terrace(sketch: Sketch, block: shapely.Polygon, ring: shapely.Polygon) -> N
     cuts = []
     for along_m in np.arange(0, edge.length - 8, 16.0):
         point = edge.interpolate(along_m)
-        cuts.append(shapely.LineString([centre, affinity.scale(shapely.LineString([centre, point]), 2, 2, origin=centre).coords[1]]))  # noqa: E501
-    pieces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.node(shapely.union_all([*cuts, ring.boundary]))).tolist()))  # noqa: E501
-    inside = [piece for piece in pieces if ring.contains(piece.representative_point()) and piece.area > 25]  # noqa: PLR2004 - m2
+        cuts.append(
+            shapely.LineString(
+                [centre, affinity.scale(shapely.LineString([centre, point]), 2, 2, origin=centre).coords[1]]
+            )
+        )
+    pieces = shapely.get_parts(
+        shapely.polygonize(shapely.get_parts(shapely.node(shapely.union_all([*cuts, ring.boundary]))).tolist())
+    )
+    inside = [piece for piece in pieces if ring.contains(piece.representative_point()) and piece.area > 25]
     for piece in sorted(inside, key=lambda piece: (round(piece.centroid.x, 1), round(piece.centroid.y, 1))):
-        if sketch.rng.random() < 0.92 and not sketch.is_taken(piece):  # noqa: PLR2004 - share
+        if sketch.rng.random() < 0.92 and not sketch.is_taken(piece):
             sketch.ground(piece, building="house")
 
 
@@ -176,9 +196,16 @@ def _suburb(sketch: Sketch) -> None:
             start = through.interpolate(float(share + rng.uniform(-0.02, 0.02)), normalized=True)
             reach = rng.uniform(0.55, 0.85) * half * side
             bend = rng.uniform(-0.1, 0.1) * half
-            ends = [(start.x, start.y), (start.x + bend, start.y + 0.35 * reach), (start.x - bend, start.y + 0.7 * reach), (start.x + bend / 2, start.y + reach)]  # noqa: E501
+            ends = [
+                (start.x, start.y),
+                (start.x + bend, start.y + 0.35 * reach),
+                (start.x - bend, start.y + 0.7 * reach),
+                (start.x + bend / 2, start.y + reach),
+            ]
             line = curve([(float(np.clip(x, -half, half)), float(np.clip(y, -half, half))) for x, y in ends])
-            if shapely.linestrings(line).intersects(park.buffer(8)) or shapely.linestrings(line).intersects(pitch.buffer(8)):  # noqa: E501
+            if shapely.linestrings(line).intersects(park.buffer(8)) or shapely.linestrings(line).intersects(
+                pitch.buffer(8)
+            ):
                 continue
             sketch.street(line, highway="residential")
             streets.append(line)
@@ -229,23 +256,37 @@ def _industrial(sketch: Sketch) -> None:
     rail = [(-half, -0.08 * half), (half, 0.02 * half)]
     _railway(sketch, rail, tunnel_from_m=None)
     for offset in (12.0, 24.0):
-        sketch.line(curve([(-0.7 * half, -0.05 * half), (-0.55 * half, -0.05 * half + offset), (0.5 * half, offset), (0.8 * half, 0.012 * half)], step_m=30), railway="rail", service="siding")  # noqa: E501
+        sketch.line(
+            curve(
+                [
+                    (-0.7 * half, -0.05 * half),
+                    (-0.55 * half, -0.05 * half + offset),
+                    (0.5 * half, offset),
+                    (0.8 * half, 0.012 * half),
+                ],
+                step_m=30,
+            ),
+            railway="rail",
+            service="siding",
+        )
     sketch.keep_free(shapely.linestrings(rail).buffer(34))
     for number, x in enumerate(np.linspace(-0.85, 0.85, 6) * half):
         line = np.array([(x, -half), (x + 20, half)])
         if number % 2 == 0:
-            along = float(shapely.linestrings(line).project(shapely.linestrings(line).intersection(shapely.linestrings(canal))))  # noqa: E501
+            along = float(
+                shapely.linestrings(line).project(shapely.linestrings(line).intersection(shapely.linestrings(canal)))
+            )
             _bridged(sketch, line, along_m=along, span_m=36.0, highway="secondary", lanes="2")
         else:
             sketch.street([(x, -half), (x + 16, 0.62 * half)], highway="service", width="6")
     for y in (-0.75, -0.42, 0.32, 0.58):
-        sketch.street([(-half, y * half), (half, y * half + 10)], highway="tertiary" if y == -0.42 else "unclassified")  # noqa: PLR2004
+        sketch.street([(-half, y * half), (half, y * half + 10)], highway="tertiary" if y == -0.42 else "unclassified")
     for _ in range(260):
         centre = (float(rng.uniform(-half, half)), float(rng.uniform(-half, half)))
         width, depth = rng.uniform(24, 90), rng.uniform(18, 60)
         hall = affinity.rotate(shapely.box(-width / 2, -depth / 2, width / 2, depth / 2), float(rng.choice([0.0, 1.5])))
         hall = affinity.translate(hall, *centre)
-        if rng.random() < 0.22:  # noqa: PLR2004 - share
+        if rng.random() < 0.22:
             if not sketch.is_taken(hall) and sketch.ground(hall, amenity="parking"):
                 sketch.keep_free(hall.buffer(4))
         elif not sketch.is_taken(hall.buffer(6)) and sketch.build(hall, building="industrial"):
@@ -258,11 +299,21 @@ def _industrial(sketch: Sketch) -> None:
 
 
 def _riverside(sketch: Sketch) -> None:
-    """A meandering river with an island, bridges, embankments, terraces of streets on both banks, a tunnel and a weir."""
+    """A meandering river with an island, bridges and embankments, streets on both banks, a railway into a tunnel."""
     half, rng = sketch.half_m, sketch.rng
-    river = curve([(-1.3 * half, -0.35 * half), (-0.75 * half, 0.1 * half), (-0.1 * half, -0.12 * half), (0.45 * half, 0.18 * half), (1.3 * half, -0.1 * half)])  # noqa: E501
+    river = curve(
+        [
+            (-1.3 * half, -0.35 * half),
+            (-0.75 * half, 0.1 * half),
+            (-0.1 * half, -0.12 * half),
+            (0.45 * half, 0.18 * half),
+            (1.3 * half, -0.1 * half),
+        ]
+    )
     bed = shapely.linestrings(river).buffer(0.085 * half, cap_style="flat")
-    island = affinity.rotate(affinity.scale(shapely.Point(-0.42 * half, 0.012 * half).buffer(0.032 * half), 2.6, 0.9), -14)
+    island = affinity.rotate(
+        affinity.scale(shapely.Point(-0.42 * half, 0.012 * half).buffer(0.032 * half), 2.6, 0.9), -14
+    )
     sketch.line(river, waterway="river", name="Town river")
     sketch.ground(bed.difference(island), is_free=False, natural="water", water="river")
     sketch.ground(island, is_free=False, natural="wood")
@@ -277,7 +328,7 @@ def _riverside(sketch: Sketch) -> None:
         line = wobble(np.array([(x, y) for y in np.linspace(-half, half, 9)]), 5.0, rng).round(2)
         across = shapely.linestrings(line).intersection(bed)
         middle = float(shapely.linestrings(line).project(across.centroid))
-        tags = {"highway": "primary" if number == 4 else "residential"}  # noqa: PLR2004 - the middle one of nine
+        tags = {"highway": "primary" if number == 4 else "residential"}
         if number in (1, 4, 7):
             _bridged(sketch, line, along_m=middle, span_m=across.length + 16.0, **tags)
         else:
@@ -286,21 +337,25 @@ def _riverside(sketch: Sketch) -> None:
             sketch.street(before, **tags)
             sketch.street(after, **tags)
     for y in (-0.92, -0.7, -0.5, 0.45, 0.66, 0.88):
-        line = curve([(-half, y * half), (-0.3 * half, (y + 0.03) * half), (0.3 * half, (y - 0.03) * half), (half, y * half)])
-        sketch.street(line, highway="residential" if abs(y) < 0.8 else "tertiary")  # noqa: PLR2004
+        line = curve(
+            [(-half, y * half), (-0.3 * half, (y + 0.03) * half), (0.3 * half, (y - 0.03) * half), (half, y * half)]
+        )
+        sketch.street(line, highway="residential" if abs(y) < 0.8 else "tertiary")
         sketch.houses_along(line, spacing_m=21.0, setback_m=8.0, size_m=(14.0, 11.0), kind="residential")
-    for way in [way for way in sketch.ways if way.tags.get("highway") == "residential" and len(way.line) < 9]:  # noqa: PLR2004
+    for way in [way for way in sketch.ways if way.tags.get("highway") == "residential" and len(way.line) < 9]:
         sketch.houses_along(way.line, spacing_m=24.0, setback_m=8.0, size_m=(13.0, 11.0))
     _railway(sketch, [(-half, 0.56 * half), (0.2 * half, 0.57 * half), (half, 0.55 * half)], tunnel_from_m=1.45 * half)
     sketch.line(shapely.get_coordinates(shapely.linestrings(river).offset_curve(0.1 * half)), barrier="retaining_wall")
 
 
 def _agricultural(sketch: Sketch) -> None:
-    """Parcels that share their borders, hedges, tracks, a stream, a wood with a clearing, farmsteads and a village road."""
+    """Parcels that share their borders, hedges, tracks, a stream, a wood with a clearing, farmsteads, a road."""
     half, rng = sketch.half_m, sketch.rng
     road = curve([(-half, -0.3 * half), (-0.2 * half, -0.2 * half), (0.3 * half, -0.34 * half), (half, -0.22 * half)])
     sketch.street(road, highway="tertiary")
-    sketch.street(curve([(0.1 * half, -0.28 * half), (0.16 * half, 0.2 * half), (0.05 * half, half)]), highway="unclassified")
+    sketch.street(
+        curve([(0.1 * half, -0.28 * half), (0.16 * half, 0.2 * half), (0.05 * half, half)]), highway="unclassified"
+    )
     stream = curve([(-0.7 * half, half), (-0.5 * half, 0.4 * half), (-0.62 * half, 0.0), (-0.4 * half, -half)])
     stream = wobble(stream, 1.5, rng)
     _stream(sketch, stream)
@@ -308,15 +363,28 @@ def _agricultural(sketch: Sketch) -> None:
     clearing = shapely.Point(0.58 * half, 0.5 * half).buffer(0.07 * half, quad_segs=4)
     sketch.ground(wood.difference(clearing), is_free=False, landuse="forest")
     sketch.ground(clearing, is_free=False, landuse="meadow")
-    for centre in ((-0.15 * half, -0.12 * half), (0.4 * half, -0.2 * half), (-0.75 * half, -0.42 * half), (0.2 * half, 0.6 * half)):
+    for centre in (
+        (-0.15 * half, -0.12 * half),
+        (0.4 * half, -0.2 * half),
+        (-0.75 * half, -0.42 * half),
+        (0.2 * half, 0.6 * half),
+    ):
         _farmstead(sketch, centre)
     cuts = [shapely.linestrings(way.line) for way in sketch.ways if "highway" in way.tags or "waterway" in way.tags]
-    across = [shapely.linestrings(wobble(np.array([(x, t) for t in np.linspace(-half, half, 6)]) + (0, 0), 14.0, rng)) for x in np.linspace(-0.8, 0.8, 6) * half]  # noqa: E501
-    along = [shapely.linestrings(wobble(np.array([(t, y) for t in np.linspace(-half, half, 6)]) + (0, 0), 14.0, rng)) for y in np.linspace(-0.85, 0.85, 7) * half]  # noqa: E501
+    across = [
+        shapely.linestrings(wobble(np.array([(x, t) for t in np.linspace(-half, half, 6)]), 14.0, rng))
+        for x in np.linspace(-0.8, 0.8, 6) * half
+    ]
+    along = [
+        shapely.linestrings(wobble(np.array([(t, y) for t in np.linspace(-half, half, 6)]), 14.0, rng))
+        for y in np.linspace(-0.85, 0.85, 7) * half
+    ]
     frame = shapely.box(-half, -half, half, half)
     lines = shapely.node(shapely.union_all([*cuts, *across, *along, frame.boundary, wood.boundary]))
-    fields = [field for field in shapely.get_parts(shapely.polygonize(shapely.get_parts(lines).tolist())) if field.area > 900]  # noqa: E501, PLR2004 - m2
-    farms = shapely.union_all([shape for shape in sketch.taken if shape.area > 2500])  # noqa: PLR2004 - m2
+    fields = [
+        field for field in shapely.get_parts(shapely.polygonize(shapely.get_parts(lines).tolist())) if field.area > 900
+    ]
+    farms = shapely.union_all([shape for shape in sketch.taken if shape.area > 2500])
     for field in sorted(fields, key=lambda field: (round(field.centroid.x, 1), round(field.centroid.y, 1))):
         if not wood.contains(field.representative_point()) and not farms.intersects(field.representative_point()):
             kind = str(rng.choice(["farmland", "farmland", "meadow", "orchard", "vineyard"]))
@@ -336,7 +404,12 @@ def _farmstead(sketch: Sketch, centre: tuple[float, float]) -> None:
     turn = float(sketch.rng.uniform(0, np.pi))
     yard = affinity.rotate(shapely.box(x - 30, y - 26, x + 30, y + 26), turn, use_radians=True)
     for dx, dy, width, depth, kind in ((-18, 12, 16, 12, "farm"), (14, 10, 30, 14, "barn"), (-8, -16, 34, 12, "barn")):
-        barn = affinity.rotate(shapely.box(x + dx - width / 2, y + dy - depth / 2, x + dx + width / 2, y + dy + depth / 2), turn, origin=centre, use_radians=True)  # noqa: E501
+        barn = affinity.rotate(
+            shapely.box(x + dx - width / 2, y + dy - depth / 2, x + dx + width / 2, y + dy + depth / 2),
+            turn,
+            origin=centre,
+            use_radians=True,
+        )
         sketch.build(barn, building=kind)
     sketch.line(shapely.get_coordinates(yard.exterior)[:4], barrier="wall")
     sketch.keep_free(yard)
@@ -350,7 +423,7 @@ def _stream(sketch: Sketch, line: Line) -> None:
     rest, offset = line, 0.0
     for spot in spots:
         here = spot - offset
-        if here < 12 or here + 12 > shapely.linestrings(rest).length:  # noqa: PLR2004 - m
+        if here < 12 or here + 12 > shapely.linestrings(rest).length:
             continue
         before, culvert, rest = split_at(rest, here - 6, here + 6)
         sketch.line(before, waterway="stream")

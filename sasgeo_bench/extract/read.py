@@ -100,7 +100,9 @@ def read_extract(
     near = _meets(shapely.bounds(geometry), grid_lonlat)
     features = _table(scan, np.flatnonzero(near), geometry[near], grid, taxonomy)
     if len(features) == 0:
-        message = f"{path.name} holds no element of any class within {_written(grid_lonlat)}: move or enlarge the bounds"
+        message = (
+            f"{path.name} holds no element of any class within {_written(grid_lonlat)}: move or enlarge the bounds"
+        )
         raise CoverageError(message)
     newest = max(row.timestamp for row in scan.rows)
     return Reading(
@@ -152,7 +154,9 @@ def _check_covered(path: Path, wanted: Box, coverage: shapely.Geometry) -> None:
         raise CoverageError(message)
     if not shapely.intersects(coverage, shapely.box(*wanted)):
         covered = _written(shapely.bounds(coverage))
-        message = f"bounds {_written(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
+        message = (
+            f"bounds {_written(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
+        )
         raise CoverageError(message)
 
 

@@ -111,15 +111,19 @@ class Classifier:
     def area_labels(self, get: Get, *, is_relation: bool) -> tuple[Label, ...]:
         """Labels of an object that is an area: of area rules; of line rules only where the object says it is filled."""
         labels = self.as_area(get).area
-        if labels or not (is_relation or get("area") == "yes"):
+        if not labels:
+            return self.as_line(get).line if is_relation or get("area") == "yes" else ()
+        if is_relation or not any(label.is_outline for label in labels):
             return labels
-        return self.as_line(get).line
+        # A fenced field: the fence is the boundary, its outline is not drawn a second time.
+        drawn = {label.class_name for label in self.as_line(get).line}
+        return tuple(label for label in labels if not (label.is_outline and label.class_name in drawn))
 
     def kind(self, get: Get, labels: tuple[Label, ...], *, is_area: bool) -> int:
         """Index of the object's traits in `Scan.traits`; counts what is hidden from above."""
         keys = _AREA_MODIFIERS if is_area else _LINE_MODIFIERS
         modifiers = tuple(map(get, keys))
-        signature = (id(labels), is_area, modifiers)  # labels come from the cache above, which keeps them alive
+        signature = (labels, is_area, modifiers)
         index = self._kinds.get(signature)
         if index is None:
             index = self._kinds[signature] = len(self._scan.traits)
@@ -197,12 +201,10 @@ def reaches(wkb: bytes, box: Box) -> bool:
     count, rest = divmod(len(wkb) - (start or 0), _POINT_BYTES)
     if start is None or rest or not 0 < count < len(_POINTS):
         return True  # long, or with the headers of further rings between the points
-    values = _POINTS[count].unpack_from(wkb, start)
+    values: tuple[float, ...] = _POINTS[count].unpack_from(wkb, start)
     west, south, east, north = box
     longitudes, latitudes = values[0::2], values[1::2]
-    return (
-        max(longitudes) >= west and min(longitudes) <= east and max(latitudes) >= south and min(latitudes) <= north
-    )
+    return max(longitudes) >= west and min(longitudes) <= east and max(latitudes) >= south and min(latitudes) <= north
 
 
 def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box = WORLD) -> Scan:
@@ -250,7 +252,8 @@ def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
     with_key = osmium.filter.KeyFilter(*taxonomy.keys)
     processor = osmium.FileProcessor(str(path)).with_locations().with_areas(with_key)
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
-    lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line")).enable_for(osmium.osm.WAY)
+    lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line"))
+    lines.enable_for(osmium.osm.WAY)
     return iter(processor.with_filter(kinds).with_filter(with_key).with_filter(lines))
 
 
@@ -279,10 +282,12 @@ def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally
     """List what should become an area: the main pass sees only what did."""
     line_keys = taxonomy.keys_of("line")
     area_keys = tuple(key for key in taxonomy.keys_of("area") if key not in line_keys)
-    wanted = osmium.filter.KeyFilter(*area_keys).enable_for(osmium.osm.WAY)
-    typed = osmium.filter.KeyFilter("type").enable_for(osmium.osm.RELATION)
+    wanted, typed = osmium.filter.KeyFilter(*area_keys), osmium.filter.KeyFilter("type")
+    wanted.enable_for(osmium.osm.WAY)
+    typed.enable_for(osmium.osm.RELATION)
     expected = _Expected()
     elements = osmium.FileProcessor(str(path), osmium.osm.WAY | osmium.osm.RELATION)
+    item: Any  # osmium's own type allows for every kind of element
     for item in elements.with_filter(wanted).with_filter(typed):
         if item.is_relation():
             relation = _area_relation(item, classifier)
@@ -394,7 +399,7 @@ def _area_relation(item: Any, classifier: Classifier) -> _Relation | None:  # no
 def _scan_lost(
     path: Path, closed: set[int], relations: dict[int, _Relation], scan: Scan, classifier: Classifier
 ) -> None:
-    """Mend what osmium could not assemble: rings with missing nodes or that cross themselves, relations cut at the edge."""
+    """Mend what osmium could not assemble: rings that lack nodes or cross themselves, relations cut at an edge."""
     members = {ref for relation in relations.values() for ref in (*relation.outer, *relation.inner)}
     lines: dict[int, shapely.Geometry] = {}
     buildings: set[int] = set()
@@ -408,9 +413,13 @@ def _scan_lost(
         labels = classifier.area_labels(get, is_relation=False)
         if any(label.class_name == "building" for label in labels):
             buildings.add(way.id)
-        if way.id in closed and labels:
+        if way.id in closed and get("area") == "no":
+            scan.tally.drops["area=no on an area class"] += 1
+        elif way.id in closed and labels:
             area = _ring_area(lines[way.id])
-            _add_mended(scan, way, area, classifier.kind(get, labels, is_area=True), what="closed way", identifier=way.id)
+            _add_mended(
+                scan, way, area, classifier.kind(get, labels, is_area=True), what="closed way", identifier=way.id
+            )
     for identifier, relation in sorted(relations.items()):
         if relation.is_building and buildings.intersection(relation.outer):
             scan.tally.drops["building relation whose outline is a building itself"] += 1

@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -66,7 +67,7 @@ class Sketch:
                 self.ways.append(Way(line=shapely.get_coordinates(part), tags=tags))
 
     def ground(self, polygon: shapely.Geometry, *, is_free: bool = True, **tags: str) -> bool:
-        """Draw an area, as a closed way or with holes as a multipolygon; False where the ground is taken or too small."""
+        """Draw an area, with holes as a multipolygon; False where the ground is taken or too small."""
         if polygon.geom_type == "Polygon" and not self.square.contains(polygon):
             polygon = shapely.intersection(polygon, self.square)
         if polygon.geom_type != "Polygon" or polygon.area < 4.0:  # noqa: PLR2004 - m2
@@ -91,7 +92,7 @@ class Sketch:
 
     def build(self, polygon: shapely.Geometry, **tags: str) -> bool:
         """Build a house where the ground is free and within the town."""
-        if not self.square.contains(polygon) or not self.ground(polygon, **tags):
+        if not self.square.contains(polygon) or not self.ground(polygon, is_free=True, **tags):
             return False
         self.taken.append(shapely.buffer(polygon, 1.0))
         return True
@@ -127,7 +128,7 @@ def house(
 
     Examples
     --------
-    >>> round(house((0.0, 0.0), 10.0, 8.0, 0.0, np.random.default_rng(3)).area)
+    >>> round(house((0.0, 0.0), 10.0, 8.0, 0.0, np.random.default_rng(1)).area)
     80
     """
     x, y = width_m / 2, depth_m / 2
@@ -218,8 +219,8 @@ def split_at(line: Line, start_m: float, end_m: float) -> tuple[Line, Line, Line
     along = np.array([base.project(shapely.Point(point)) for point in line])
     along[-1] = base.length
     parts = []
-    for low, high in zip(stops[:-1], stops[1:], strict=True):
-        inside = line[(along > low + 0.01) & (along < high - 0.01)]  # noqa: PLR2004 - a centimetre
+    for low, high in pairwise(stops):
+        inside = line[(along > low + 0.01) & (along < high - 0.01)]
         ends = [shapely.get_coordinates(base.interpolate(stop)) for stop in (low, high)]
         parts.append(np.vstack((ends[0], inside, ends[1])).round(_DECIMALS))
     return parts[0], parts[1], parts[2]

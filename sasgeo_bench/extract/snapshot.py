@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import osmium
@@ -197,6 +197,7 @@ def _cut_history(path: Path, target: Path, *, at: dt.date) -> None:
 def _versions_at(path: Path, *, until: dt.datetime) -> NDArray[np.int64]:
     """Positions in the file, ascending, of the versions alive at a moment. Needs no order of versions."""
     latest: dict[tuple[str, int], tuple[int, int, bool]] = {}
+    item: Any  # osmium's own type allows for changesets, which no such file holds
     for number, item in enumerate(osmium.FileProcessor(str(path))):
         if item.timestamp <= until:
             key, version = (item.type_str(), item.id), item.version

@@ -3,11 +3,10 @@
 
 import datetime as dt
 import hashlib
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import osmium
@@ -72,14 +71,15 @@ class _Thing:
 
 
 class _Element(NamedTuple):
-    """One element to be written; `refs` are node ids of a way or (way id, role) of a relation."""
+    """One element to be written: a node by its place, a way by its nodes, a relation by its (way id, role) members."""
 
     rank: int
     osm_id: int
     version: int
     on: dt.date
     tags: Tags
-    refs: tuple[int, ...] | tuple[tuple[int, str], ...] = ()
+    nodes: tuple[int, ...] = ()
+    members: tuple[tuple[int, str], ...] = ()
     xy_m: tuple[float, float] = (0.0, 0.0)
 
 
@@ -123,7 +123,7 @@ def write_town(plan: TownPlan, path: Path, *, on: dt.date | None = None) -> None
     temporary = path.with_name(f".{path.name}.partial.osm.pbf")
     try:
         _write(elements, plan, temporary)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except (OSError, RuntimeError) as error:
         message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
         raise ExtractError(message) from error
@@ -141,7 +141,9 @@ def _things(plan: TownPlan) -> list[_Thing]:
     """Draw the town and give every object a life."""
     sketch = Sketch(half_m=plan.size_m / 2, rng=_rng(plan, "sketch"))
     draw(plan.morphology, sketch)
-    drawn = [((way.line,), way.tags, None) for way in join_streets(sketch.ways)]
+    drawn: list[tuple[tuple[Line, ...], Tags, str | None]] = [
+        ((way.line,), way.tags, None) for way in join_streets(sketch.ways)
+    ]
     drawn += [((area.outer, *area.inner), area.tags, area.kind) for area in sketch.areas]
     return [_lived(plan, number, *shape) for number, shape in enumerate(drawn)]
 
@@ -156,7 +158,9 @@ def _lived(plan: TownPlan, number: int, rings: tuple[Line, ...], tags: Tags, rel
     stays = any(name in tags for name in ("highway", "railway", "waterway", "landuse", "barrier"))
     if not stays and rng.random() < _MOVES:
         angle, shift_m = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 3.0)
-        changes.append(_Change(_day(rng, born, LAST_DATE), float(shift_m * np.cos(angle)), float(shift_m * np.sin(angle))))
+        changes.append(
+            _Change(_day(rng, born, LAST_DATE), float(shift_m * np.cos(angle)), float(shift_m * np.sin(angle)))
+        )
     retag = next(((name, _RETAGGED[value]) for name, value in tags.items() if value in _RETAGGED), None)
     if retag is not None and rng.random() < _RETAGS:
         changes.append(_Change(_day(rng, born, LAST_DATE), tags=(retag,)))
@@ -227,10 +231,10 @@ def _thing_elements(thing: _Thing, on: dt.date, own_base: int, network_ids: list
         yield _Element(1, way_id, version, last, tags, ring_refs[0])
         return
     roles = ["outline" if thing.relation == "building" else "outer", *["inner"] * (len(ring_refs) - 1)]
-    for number, refs in enumerate(ring_refs):
-        yield _Element(1, way_id + number, 1, thing.born, {}, refs)
+    for number, ring_nodes in enumerate(ring_refs):
+        yield _Element(1, way_id + number, 1, thing.born, {}, ring_nodes)
     members = tuple((way_id + number, role) for number, role in enumerate(roles))
-    yield _Element(2, _FIRST_RELATION + thing.number, version, last, tags | {"type": thing.relation}, members)
+    yield _Element(2, _FIRST_RELATION + thing.number, version, last, tags | {"type": thing.relation}, members=members)
 
 
 def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
@@ -255,7 +259,9 @@ def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
 
 def _to_lonlat(plan: TownPlan) -> "_ToLonLat":
     longitude_deg, latitude_deg = plan.center_lonlat
-    crs = pyproj.CRS.from_proj4(f"+proj=tmerc +lat_0={latitude_deg} +lon_0={longitude_deg} +k=1 +x_0=0 +y_0=0 +datum=WGS84")
+    crs = pyproj.CRS.from_proj4(
+        f"+proj=tmerc +lat_0={latitude_deg} +lon_0={longitude_deg} +k=1 +x_0=0 +y_0=0 +datum=WGS84"
+    )
     return _ToLonLat(pyproj.Transformer.from_crs(crs, 4326, always_xy=True))
 
 
@@ -271,7 +277,7 @@ class _ToLonLat:
 
 
 def _add(writer: osmium.SimpleWriter, element: _Element, to_lonlat: _ToLonLat) -> None:
-    common = {
+    common: dict[str, Any] = {
         "id": element.osm_id,
         "version": element.version,
         "timestamp": dt.datetime.combine(element.on, dt.time(12), tzinfo=dt.UTC),
@@ -281,7 +287,7 @@ def _add(writer: osmium.SimpleWriter, element: _Element, to_lonlat: _ToLonLat) -
     if element.rank == 0:
         writer.add_node(OsmNode(location=to_lonlat(*element.xy_m), **common))
     elif element.rank == 1:
-        writer.add_way(OsmWay(nodes=list(element.refs), **common))
+        writer.add_way(OsmWay(nodes=list(element.nodes), **common))
     else:
-        members = [("w", ref, role) for ref, role in element.refs]  # type: ignore[misc]
+        members = [("w", ref, role) for ref, role in element.members]
         writer.add_relation(OsmRelation(members=members, **common))

@@ -95,10 +95,14 @@ def _scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
     length_m = float(max(step * power for step in (1, 2, 5) if step * power <= goal))
     left, bottom, thick = 0.03 * width_m, 0.03 * height_m, 0.008 * max(width_m, height_m)
     pad = 0.015 * max(width_m, height_m)
-    chart.add_patch(Rectangle((left - pad, bottom - pad), length_m + 2 * pad, thick + 4.2 * pad, color="white", alpha=0.85, lw=0))
+    chart.add_patch(
+        Rectangle((left - pad, bottom - pad), length_m + 2 * pad, thick + 4.2 * pad, color="white", alpha=0.85, lw=0)
+    )
     for number in range(4):
         colour = "black" if number % 2 == 0 else "white"
-        box = Rectangle((left + number * length_m / 4, bottom), length_m / 4, thick, facecolor=colour, edgecolor="black", lw=0.6)
+        box = Rectangle(
+            (left + number * length_m / 4, bottom), length_m / 4, thick, facecolor=colour, edgecolor="black", lw=0.6
+        )
         chart.add_patch(box)
     kilometre_m = 1000
     text = f"{length_m / kilometre_m:g} km" if length_m >= kilometre_m else f"{length_m:g} m"
@@ -108,8 +112,15 @@ def _scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
 def _north_arrow(chart: Axes, width_m: float, height_m: float) -> None:
     size = 0.05 * max(width_m, height_m)
     x, y = width_m - 0.9 * size, height_m - 1.5 * size
-    chart.add_patch(Rectangle((x - 0.55 * size, y - 0.25 * size), 1.1 * size, 1.6 * size, color="white", alpha=0.85, lw=0))
-    arrow = [(x, y + 0.75 * size), (x - 0.28 * size, y - 0.1 * size), (x, y + 0.1 * size), (x + 0.28 * size, y - 0.1 * size)]
+    chart.add_patch(
+        Rectangle((x - 0.55 * size, y - 0.25 * size), 1.1 * size, 1.6 * size, color="white", alpha=0.85, lw=0)
+    )
+    arrow = [
+        (x, y + 0.75 * size),
+        (x - 0.28 * size, y - 0.1 * size),
+        (x, y + 0.1 * size),
+        (x + 0.28 * size, y - 0.1 * size),
+    ]
     chart.add_patch(Polygon(arrow, closed=True, color="black"))
     chart.text(x, y + 0.8 * size, "N", ha="center", va="bottom", fontsize=10, fontweight="bold")
 
@@ -131,12 +142,19 @@ def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, 
     """Classes that are there, with their number of objects, and what the hatching means."""
     titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
     entries = [
-        Patch(facecolor=titles[name][1], edgecolor="#666666", lw=0.4, label=f"{titles[name][0]}  ({manifest.counts[name]:,})")
+        Patch(
+            facecolor=titles[name][1],
+            edgecolor="#666666",
+            lw=0.4,
+            label=f"{titles[name][0]}  ({manifest.counts[name]:,})",
+        )
         for name in manifest.classes
         if manifest.counts.get(name)
     ]
     if (overview[0] == OUTSIDE).any():
-        hatched = Patch(facecolor=_UNMAPPED[0], edgecolor=_UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)")
+        hatched = Patch(
+            facecolor=_UNMAPPED[0], edgecolor=_UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)"
+        )
         entries.append(hatched)
     if not entries:
         figure.text(left, top, "no element of any class", fontsize=9, va="top")

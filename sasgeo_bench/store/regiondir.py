@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import geopandas as gpd
 import pandas as pd
@@ -19,8 +19,10 @@ from pydantic import ValidationError
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.features import check_features
 from sasgeo_bench.graph import MapGraph
-from sasgeo_bench.region import SCHEMA_VERSION, FileRecord, Manifest, Region
+from sasgeo_bench.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, FileRecord, Manifest, Region
 from sasgeo_bench.store.layerfile import read_layers
+
+Table = TypeVar("Table", bound=pd.DataFrame)
 
 MANIFEST: Final = "region.json"
 LAYERS: Final = "layers.tif"
@@ -52,9 +54,17 @@ def file_record(path: Path) -> FileRecord:
 
 def write_tables(folder: Path, features: gpd.GeoDataFrame, graph: MapGraph) -> None:
     """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder."""
-    features.to_parquet(folder / FEATURES, compression="zstd", schema_version="1.1.0", write_covering_bbox=True)
-    graph.nodes.to_parquet(folder / NODES, compression="zstd", schema_version="1.1.0")
-    graph.edges.to_parquet(folder / EDGES, compression="zstd", index=False)
+    geographic = {"compression": "zstd", "schema_version": "1.1.0"}
+    _attributed(features).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
+    _attributed(graph.nodes).to_parquet(folder / NODES, **geographic)
+    _attributed(graph.edges).to_parquet(folder / EDGES, compression="zstd", index=False)
+
+
+def _attributed(table: Table) -> Table:
+    """A view of the table whose parquet file says where its data come from (`attrs` in the file's metadata)."""
+    shown = table.copy(deep=False)
+    shown.attrs = {"attribution": ATTRIBUTION, "licence": LICENCE}
+    return shown
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -86,7 +96,9 @@ def read_manifest(folder: Path) -> Manifest:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content.get("schema_version") if isinstance(content, dict) else None
         if found != SCHEMA_VERSION:
-            message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: build the region again"
+            message = (
+                f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: build the region again"
+            )
             raise StoreError(message)
         return Manifest.model_validate(content)
     except (json.JSONDecodeError, UnicodeDecodeError, ValidationError) as error:

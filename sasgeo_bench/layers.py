@@ -2,6 +2,7 @@
 """Features + grid -> one raster per class, by the cell-centre rule, lines as wide as they are in metres."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import geopandas as gpd
@@ -18,13 +19,18 @@ OUTSIDE: Final = 255  # beyond the mapped area: not absent, unknown
 _ARC_SEGMENTS: Final = 2  # per quarter circle at line ends and bends: 3 % of the radius, a few centimetres on a road
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Paint:
     """What is to be burnt: for each class, in band order, its polygons with the outer ring counter-clockwise."""
 
     classes: tuple[str, ...]
     areas: tuple[NDArray[np.object_], ...]
     coverage: NDArray[np.object_]
+
+    @cached_property
+    def bounds(self) -> tuple[NDArray[np.float64], ...]:
+        """West, south, east, north of every polygon, shape (N, 4) for each class."""
+        return tuple(shapely.bounds(areas).reshape(-1, 4) for areas in self.areas)
 
 
 def make_paint(
@@ -106,8 +112,8 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
     layers = np.zeros((len(paint.classes), grid.rows, grid.cols), dtype=np.uint8)
     mapped = burn(paint.coverage, grid)
     is_whole = bool(mapped.all())
-    for band, areas in zip(layers, paint.areas, strict=True):
-        near = _near(areas, grid)
+    for band, areas, bounds in zip(layers, paint.areas, paint.bounds, strict=True):
+        near = areas[_meets(bounds, grid)]
         if len(near):
             band[...] = burn(near, grid)
         if not is_whole:
@@ -115,11 +121,9 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
     return layers
 
 
-def _near(areas: NDArray[np.object_], grid: Grid) -> NDArray[np.object_]:
+def _meets(bounds: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
     west, south, east, north = grid.bounds_m
-    bounds = shapely.bounds(areas).reshape(-1, 4)
-    meets = (bounds[:, 0] < east) & (bounds[:, 2] > west) & (bounds[:, 1] < north) & (bounds[:, 3] > south)
-    return np.asarray(areas[meets])
+    return (bounds[:, 0] < east) & (bounds[:, 2] > west) & (bounds[:, 1] < north) & (bounds[:, 3] > south)
 
 
 def burn(areas: NDArray[np.object_], grid: Grid) -> NDArray[np.bool_]:

@@ -241,6 +241,10 @@ def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box = WORLD) -> Scan:
                 assembled.add(item.orig_id())
             else:
                 expected.relations.pop(item.orig_id(), None)
+    for identifier in [key for key, item in expected.relations.items() if item.is_building]:
+        if assembled.intersection(expected.relations[identifier].outer):
+            del expected.relations[identifier]
+            scan.tally.drops["building relation whose outline is a building itself"] += 1
     lost = expected.ways - assembled
     if lost or expected.relations:
         _scan_lost(path, lost, expected.relations, scan, classifier)
@@ -402,7 +406,6 @@ def _scan_lost(
     """Mend what osmium could not assemble: rings that lack nodes or cross themselves, relations cut at an edge."""
     members = {ref for relation in relations.values() for ref in (*relation.outer, *relation.inner)}
     lines: dict[int, shapely.Geometry] = {}
-    buildings: set[int] = set()
     ways = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.EntityFilter(osmium.osm.WAY))
     for way in ways.with_filter(osmium.filter.IdFilter(closed | members)):
         wkb = line_wkb(way, scan.tally)
@@ -411,8 +414,6 @@ def _scan_lost(
         lines[way.id] = shapely.from_wkb(wkb)
         get = way.tags.get
         labels = classifier.area_labels(get, is_relation=False)
-        if any(label.class_name == "building" for label in labels):
-            buildings.add(way.id)
         if way.id in closed and get("area") == "no":
             scan.tally.drops["area=no on an area class"] += 1
         elif way.id in closed and labels:
@@ -421,9 +422,6 @@ def _scan_lost(
                 scan, way, area, classifier.kind(get, labels, is_area=True), what="closed way", identifier=way.id
             )
     for identifier, relation in sorted(relations.items()):
-        if relation.is_building and buildings.intersection(relation.outer):
-            scan.tally.drops["building relation whose outline is a building itself"] += 1
-            continue
         area = _relation_area(relation, lines)
         kind = classifier.kind(relation.tags.get, relation.labels, is_area=True)
         _add_mended(scan, relation, area, kind, what="relation", identifier=identifier)

@@ -2,6 +2,7 @@
 """`layers.tif`: a cloud-optimized GeoTIFF with one band per class, written window by window."""
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -19,8 +20,8 @@ from sasgeo_bench.layers import OUTSIDE
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 
 BLOCK_CELLS: Final = 512
-WINDOW_CELLS: Final = 2048  # 13 classes of one window take 55 MB, whatever the size of the region
-_CACHE_BYTES: Final = 64 * 2**20
+WINDOW_CELLS: Final = 1024  # 13 classes of one window take 14 MB, whatever the size of the region
+_CACHE_BYTES: Final = 24 * 2**20
 _BIGTIFF_CELLS: Final = 2**31  # compressed, such a file stays far below the 4 GiB that need BigTIFF
 
 PaintWindow = Callable[[Grid], NDArray[np.uint8]]
@@ -110,8 +111,16 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: tuple[in
 
 
 def _fill(target: rasterio.io.DatasetWriter, grid: Grid, burn: PaintWindow) -> None:
-    for row, col, window in grid.windows(WINDOW_CELLS):
-        target.write(burn(window), window=Window(col, row, window.cols, window.rows))
+    """Burn the next window while GDAL packs the one before, which needs no interpreter; two windows are held at most."""
+    with ThreadPoolExecutor(max_workers=1) as beside:
+        packing: Future[None] | None = None
+        for row, col, window in grid.windows(WINDOW_CELLS):
+            layers = burn(window)
+            if packing is not None:
+                packing.result()
+            packing = beside.submit(target.write, layers, window=Window(col, row, window.cols, window.rows))
+        if packing is not None:
+            packing.result()
 
 
 def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:

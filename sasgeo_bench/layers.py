@@ -67,8 +67,9 @@ def make_paint(
     width_m = seen["width_m"].to_numpy(dtype=np.float64)
     is_line = ~np.isnan(width_m)
     half_m = np.maximum(width_m[is_line], least_width_m) / 2
-    lines = shapely.simplify(shape[is_line], least_width_m / 8) if least_width_m > 0 else shape[is_line]
-    shape[is_line] = shapely.buffer(lines, half_m, quad_segs=_ARC_SEGMENTS)
+    is_coarse = least_width_m > 0
+    lines = shapely.simplify(shape[is_line], least_width_m / 8) if is_coarse else shape[is_line]
+    shape[is_line] = shapely.buffer(lines, half_m, quad_segs=1 if is_coarse else _ARC_SEGMENTS)
     names = seen["class"].to_numpy()
     return Paint(
         classes=classes,

@@ -52,7 +52,7 @@ class Pose:
         [[7.0, 5.0]]
         """
         turned = self.scale * offsets_m @ rotation(self.yaw_deg).T
-        return np.asarray(turned + (self.easting_m, self.northing_m))
+        return np.asarray(turned + np.array([self.easting_m, self.northing_m]))
 
 
 def compose(first: Pose, second: Pose) -> Pose:

@@ -111,7 +111,7 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: tuple[in
 
 
 def _fill(target: rasterio.io.DatasetWriter, grid: Grid, burn: PaintWindow) -> None:
-    """Burn the next window while GDAL packs the one before, which needs no interpreter; two windows are held at most."""
+    """Burn the next window while GDAL packs the one before, which needs no interpreter; at most two are held."""
     with ThreadPoolExecutor(max_workers=1) as beside:
         packing: Future[None] | None = None
         for row, col, window in grid.windows(WINDOW_CELLS):

@@ -259,6 +259,7 @@ def _painter(reading: Reading, grid: Grid, taxonomy: Taxonomy) -> Callable[[int]
     """Overview factor -> what burns a window; overviews draw lines at least one of their cells wide."""
 
     def of_level(factor: int) -> PaintWindow:
+        """What burns a window of one overview, or of the map itself (1)."""
         least_width_m = 0.0 if factor == 1 else grid.cell_size_m * factor
         paint = make_paint(reading.features, taxonomy.names, reading.coverage, least_width_m=least_width_m)
         return lambda window: burn_layers(paint, window)

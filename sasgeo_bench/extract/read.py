@@ -128,6 +128,7 @@ def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
     to_grid = pyproj.Transformer.from_crs(_WGS84, epsg, always_xy=True)
 
     def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates of shape (N, 2), degrees -> metres."""
         return np.column_stack(to_grid.transform(points[:, 0], points[:, 1])).round(_DECIMALS) + 0.0
 
     return shapely.transform(geometry, projected)

@@ -67,6 +67,7 @@ class _Thing:
     changes: tuple[_Change, ...]
 
     def alive(self, on: dt.date) -> bool:
+        """Whether it stands in the map at the end of a day."""
         return self.born <= on and (self.died is None or on < self.died)
 
 

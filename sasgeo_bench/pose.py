@@ -55,6 +55,55 @@ class Pose:
         return np.asarray(turned + np.array([self.easting_m, self.northing_m]))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prior:
+    """What is known before matching: a disc that holds the place, a yaw and a scale, each with its sigma, or None.
+
+    Parameters
+    ----------
+    center_m : tuple of float, optional
+        Easting and northing of the disc's centre; None where the place may be anywhere in the region.
+    radius_m : float, optional
+        Radius of the disc, given with `center_m`.
+    yaw_deg, yaw_sigma_deg : float, optional
+        Heading and its standard deviation; None where any heading may be.
+    scale_sigma : float
+        Standard deviation of the view's scale around 1.
+
+    Raises
+    ------
+    PoseError
+        If a value is out of range, or one of a pair is missing.
+
+    Examples
+    --------
+    >>> Prior(center_m=(10.0, 10.0), radius_m=5.0, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03).has_place
+    True
+    """
+
+    center_m: tuple[float, float] | None
+    radius_m: float | None
+    yaw_deg: float | None
+    yaw_sigma_deg: float | None
+    scale_sigma: float
+
+    def __post_init__(self) -> None:
+        """Refuse halves of pairs and impossible values."""
+        if (self.center_m is None) != (self.radius_m is None) or (self.yaw_deg is None) != (self.yaw_sigma_deg is None):
+            message = f"a prior has center_m with radius_m and yaw_deg with yaw_sigma_deg, or neither, got {self!r}"
+            raise PoseError(message)
+        spreads = [value for value in (self.radius_m, self.yaw_sigma_deg) if value is not None]
+        numbers = (*(self.center_m or ()), self.yaw_deg or 0.0, self.scale_sigma, *spreads)
+        if not all(map(math.isfinite, numbers)) or min(spreads, default=1.0) <= 0 or self.scale_sigma < 0:
+            message = f"a prior has finite values, a positive radius and sigmas, got {self!r}"
+            raise PoseError(message)
+
+    @property
+    def has_place(self) -> bool:
+        """Whether the place is known within a disc."""
+        return self.center_m is not None
+
+
 def compose(first: Pose, second: Pose) -> Pose:
     """Pose of `second`, given in the frame of `first`.
 

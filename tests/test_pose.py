@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.angles import wrap_deg
 from sasgeo_bench.errors import PoseError
-from sasgeo_bench.pose import Pose, compose, exp, inverse, log
+from sasgeo_bench.pose import Pose, Prior, compose, exp, inverse, log
 
 poses = st.builds(
     Pose,
@@ -78,3 +78,28 @@ def test_what_is_no_pose_is_refused(wrong):
 def test_a_tangent_of_another_shape_is_refused():
     with pytest.raises(PoseError, match=r"\(3,\)"):
         exp(np.zeros(3))
+
+
+KNOWN = {"center_m": (1.0, 2.0), "radius_m": 500.0, "yaw_deg": 10.0, "yaw_sigma_deg": 5.0, "scale_sigma": 0.03}
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"radius_m": None}, "or neither"),
+        ({"center_m": None}, "or neither"),
+        ({"yaw_sigma_deg": None}, "or neither"),
+        ({"radius_m": -1.0}, "positive"),
+        ({"radius_m": 0.0}, "positive"),
+        ({"yaw_sigma_deg": float("nan")}, "finite"),
+        ({"scale_sigma": -0.1}, "positive"),
+        ({"center_m": (float("inf"), 0.0)}, "finite"),
+    ],
+)
+def test_a_prior_with_a_fault_is_refused(change, fault):
+    with pytest.raises(PoseError, match=fault):
+        Prior(**(KNOWN | change))
+
+
+def test_a_prior_may_know_nothing():
+    assert not Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.15).has_place

@@ -42,8 +42,14 @@ def views(tmp_path_factory) -> Sequence[Evidence]:
 
 @pytest.fixture(scope="session")
 def view(views) -> Evidence:
-    """One of them."""
-    return views[0]
+    """One by the river, with what towns have little of drawn in: paths and hedges through green and fields, parking."""
+    scene, cells = views[VIEWS_PER_TOWN], views[VIEWS_PER_TOWN].cells.copy()
+    at = {name: cells[index] for index, name in enumerate(scene.classes)}
+    at["green"][100:170, 20:90] = at["farmland"][20:90, 100:180] = at["parking"][150:175, 120:160] = 1
+    at["water"][10:60, 10:60] = 1
+    for row in range(20, 180, 30):
+        at["path_track"][row : row + 2] = at["field_boundary"][row + 10] = at["waterway"][row + 20] = 1
+    return scene.replace(cells)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import numpy as np
 
 from sasgeo_bench.evidence import UNKNOWN, Evidence
 from sasgeo_bench.perturb.base import check_ranges, with_cells
-from sasgeo_bench.perturb.fields import NoisePool, roughly_highest
+from sasgeo_bench.perturb.fields import NoisePool, highest_within
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +53,6 @@ class FalseUnknown:
         for layer in cells:
             noise, known = pool.take(self.patch_m / evidence.cell_size_m, rng), layer != UNKNOWN
             count = np.count_nonzero(known)
-            values = noise.ravel() if count == known.size else noise[known]
-            layer[known & (noise >= roughly_highest(values, self.share * count, rng))] = UNKNOWN
+            veil = known & (noise >= highest_within(noise, known, self.share * count, rng))
+            np.maximum(layer, veil.view(np.uint8) * np.uint8(UNKNOWN), out=layer)
         return with_cells(evidence, cells)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Field = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+_MIRRORED: Final = (-1, 0, 1)  # how OpenCV names a flip: both ways, upside down, sideways
 _FEWEST: Final = 4096  # enough values to place a threshold within half a percent
 
 
@@ -57,14 +58,15 @@ class NoisePool:
     def take(self, scale_cells: float, rng: np.random.Generator) -> Field:
         """Cut a window of `smooth_noise`, at random and mirrored at random; read it, do not write to it."""
         rows, cols = self._shape
-        spare_rows, spare_cols = rows // 2 + 1, cols // 2 + 1
+        spare_rows, spare_cols = rows // 3 + 1, cols // 3 + 1
         whole = self._fields.get(scale_cells)
         if whole is None:
             whole = smooth_noise((rows + spare_rows, cols + spare_cols), scale_cells, rng)
             self._fields[scale_cells] = whole
-        top, left, mirrored = rng.integers(0, (spare_rows + 1, spare_cols + 1, 4)).tolist()
+        down, right, mirrored = rng.random(3).tolist()
+        top, left = int(down * (spare_rows + 1)), int(right * (spare_cols + 1))
         window = whole[top : top + rows, left : left + cols]
-        return window[:: -1 if mirrored & 1 else 1, :: -1 if mirrored & 2 else 1]
+        return np.asarray(cv2.flip(window, _MIRRORED[int(mirrored * 3)]), dtype=np.float32).reshape(self._shape)
 
 
 def top_share(field: Field, share: float) -> Mask:
@@ -94,13 +96,22 @@ def highest(values: Field, count: float) -> float:
     return float(np.partition(values, values.size - kth)[values.size - kth])
 
 
-def roughly_highest(values: Field, count: float, rng: np.random.Generator) -> float:
-    """`highest`, read off an even part of the values where there are many: within half a percent of them."""
-    step = values.size // _FEWEST
-    if step < 2 or count * 8 < step * step:  # noqa: PLR2004 - a part must be smaller than the whole
-        return highest(values, count)
-    part = values[int(rng.integers(step)) :: step]
-    return highest(part, count * part.size / values.size)
+def highest_within(field: Field, mask: Mask, count: float, rng: np.random.Generator) -> float:
+    """`highest` of a field within a mask; off some of the rows where the mask is large, so to about half a percent.
+
+    Examples
+    --------
+    >>> field = np.array([[5.0, 1.0], [3.0, 9.0]], dtype=np.float32)
+    >>> highest_within(field, field < 9.0, 2, np.random.default_rng(0))
+    3.0
+    """
+    size = np.count_nonzero(mask)
+    step = size // _FEWEST
+    if step < 2:  # noqa: PLR2004 - a part must be smaller than the whole
+        return highest(field[mask], count)
+    first = int(rng.random() * step)
+    part = field[first::step][mask[first::step]]
+    return highest(part, count * part.size / size)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,7 @@ class Objects:
 
     def mask_of(self, chosen: Mask) -> Mask:
         """Cells of the things chosen, one boolean each."""
-        return np.concatenate((np.zeros(1, dtype=bool), chosen))[self.labels]
+        return np.concatenate((np.zeros(1, dtype=bool), chosen)).take(self.labels)
 
 
 def find_objects(mask: Mask) -> Objects:
@@ -38,7 +38,7 @@ def find_objects(mask: Mask) -> Objects:
     [2, 1]
     """
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8, ltype=cv2.CV_32S)
-    areas = np.bincount(labels.ravel(), minlength=count)
+    areas = np.bincount(labels[mask], minlength=count)
     return Objects(labels=np.asarray(labels, dtype=np.int32), areas_cells=areas[1:])
 
 

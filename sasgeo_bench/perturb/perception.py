@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.perturb.base import check_ranges, with_cells
 from sasgeo_bench.perturb.detector import TOLERANCE_CELLS, ClassErrors, PerceptionSettings
-from sasgeo_bench.perturb.fields import Field, NoisePool, dilated, eroded, roughly_highest
+from sasgeo_bench.perturb.fields import Field, NoisePool, dilated, eroded, highest_within
 from sasgeo_bench.perturb.objects import find_objects, pick_up_to, thin_classes
 
 Mask = NDArray[np.bool_]
@@ -155,7 +155,7 @@ class _Look:
         rest = budget_cells - np.count_nonzero(mask) + np.count_nonzero(kept)
         if rest > 0:
             noise = self.noise(self.settings.patch_m, rng)
-            kept &= noise < roughly_highest(noise[kept], rest, rng)
+            kept &= noise < highest_within(noise, kept, rest, rng)
         return kept, mask & ~kept & ~edge
 
     def _lose_line(self, mask: Mask, budget_cells: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
@@ -164,7 +164,7 @@ class _Look:
         # A gap is missed only where no line is left within the tolerance, so its ends do not count: rank the weakest
         # noise around each cell instead of its own.
         around = cv2.erode(np.ascontiguousarray(noise), np.ones((3, 3), dtype=np.uint8))
-        lost = mask & (noise >= roughly_highest(np.asarray(around, dtype=np.float32)[mask], budget_cells, rng))
+        lost = mask & (noise >= highest_within(np.asarray(around, dtype=np.float32), mask, budget_cells, rng))
         return _nudged(mask & ~lost, self.noise(self.settings.patch_m, rng)), lost
 
     def gain(self, seen: Mask, taken: Sequence[Mask], rng: np.random.Generator) -> None:
@@ -181,7 +181,7 @@ class _Look:
             count = np.count_nonzero(new)
             if count > _MOST_TAKEN * budget_cells:
                 whole = self.noise(settings.patch_m, rng)
-                new &= whole >= roughly_highest(whole[new], _MOST_TAKEN * budget_cells, rng)
+                new &= whole >= highest_within(whole, new, _MOST_TAKEN * budget_cells, rng)
                 count = np.count_nonzero(new)
             np.logical_or(seen, new, out=seen)
             budget_cells -= count
@@ -201,7 +201,7 @@ class _Look:
         if budget_cells >= 1:
             noise = self.noise(self.settings.patch_m, rng)
             away = free & ~seen
-            np.logical_or(seen, away & (noise >= roughly_highest(noise[away], budget_cells, rng)), out=seen)
+            np.logical_or(seen, away & (noise >= highest_within(noise, away, budget_cells, rng)), out=seen)
 
     def _add_stubs(self, seen: Mask, free: Mask, budget_cells: float, rng: np.random.Generator) -> None:
         """Short false lines, every other one a branch of what is seen."""
@@ -232,7 +232,7 @@ def _inner_edge(mask: Mask, noise: Field, budget_cells: float, rng: np.random.Ge
     first = eroded(mask, TOLERANCE_CELLS)
     second = eroded(first, TOLERANCE_CELLS)
     ring = mask & ~first
-    limit = roughly_highest(noise[ring], 0.8 * budget_cells, rng)
+    limit = highest_within(noise, ring, 0.8 * budget_cells, rng)
     return (ring & (noise >= limit)) | (first & ~second & (noise >= limit + _SECOND_RING))
 
 
@@ -240,7 +240,7 @@ def _outer_edge(mask: Mask, free: Mask, noise: Field, budget_cells: float, rng: 
     """Free cells one or two beyond the edge where the noise is strong."""
     first = dilated(mask, TOLERANCE_CELLS)
     ring = first & free & ~mask
-    limit = roughly_highest(noise[ring], 0.8 * budget_cells, rng)
+    limit = highest_within(noise, ring, 0.8 * budget_cells, rng)
     second = dilated(first, TOLERANCE_CELLS) & ~first & free
     return (ring & (noise >= limit)) | (second & (noise >= limit + _SECOND_RING))
 

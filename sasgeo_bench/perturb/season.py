@@ -94,7 +94,8 @@ class Season:
             from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * cell_size_m
             gentle = np.clip(1 + noise / 2, 0.2, 2.0)
             _clear(layers, ("water",), water & (from_bank_m <= self.strength * _RETREAT_M * gentle))
-        _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway"), self.strength))
+        # A line within a lake or broad river is where it flows: it does not fall dry before the water around it.
+        _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
 
     def _harvest(self, layers: Layers, noise: Field, rng: np.random.Generator) -> None:
         """Take fields for green and green for fields, each as a whole, and lose the boundaries that ran between."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,8 @@ from sasgeo_bench.angles import rotation
 from sasgeo_bench.evidence import PRESENT, Evidence
 from sasgeo_bench.perturb.base import check_ranges, hide
 from sasgeo_bench.perturb.fields import Field, centres, smooth_noise, top_share
+
+Mask = NDArray[np.bool_]
 
 MASKS: Final = 32
 _KINDS: Final = 4
@@ -53,24 +56,35 @@ class AdversarialMask:
         """Cover the view with the mask that hides most present cells; the first of them where several do."""
         if self.share == 0:
             return evidence
-        masks = library(evidence.shape, self.share)
         present = np.add.reduce(evidence.cells == PRESENT, axis=0, dtype=np.float32)
-        worst = int(np.argmax(masks.reshape(MASKS, -1) @ present.ravel()))
-        return hide(evidence, masks[worst] > 0)
+        covered = np.einsum("mp,p->m", _halved(evidence.shape, self.share), _half(present).ravel())
+        return hide(evidence, library(evidence.shape, self.share)[int(np.argmax(covered))])
 
 
 @lru_cache(maxsize=4)
-def library(shape: tuple[int, int], share: float) -> Field:
-    """Masks for views of a shape that each cover a share of it, 0 or 1, shape (32, rows, cols).
+def library(shape: tuple[int, int], share: float) -> Mask:
+    """Masks for views of a shape that each cover a share of it, boolean of shape (32, rows, cols).
 
     Examples
     --------
     >>> library((64, 64), 0.25).mean(axis=(1, 2)).round(2).tolist() == [0.25] * 32
     True
     """
-    masks = np.stack([top_share(_score(shape, index), share) for index in range(MASKS)]).astype(np.float32)
+    masks = np.stack([top_share(_score(shape, index), share) for index in range(MASKS)])
     masks.flags.writeable = False
     return masks
+
+
+@lru_cache(maxsize=4)
+def _halved(shape: tuple[int, int], share: float) -> Field:
+    """The library at half its resolution, to weigh the masks with, shape (32, cells)."""
+    return np.stack([_half(mask.astype(np.float32)).ravel() for mask in library(shape, share)])
+
+
+def _half(values: Field) -> Field:
+    """Means over two by two cells."""
+    rows, cols = (max(1, count // 2) for count in values.shape)
+    return np.asarray(cv2.resize(values, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def _score(shape: tuple[int, int], index: int) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ from sasgeo_bench.evidence import PRESENT, Evidence
 from sasgeo_bench.perturb.base import check_ranges, with_cells
 from sasgeo_bench.perturb.fields import NoisePool, dilated
 from sasgeo_bench.perturb.objects import Objects, find_objects, thin_classes
+from sasgeo_bench.perturb.resample import shifted
 from sasgeo_bench.taxonomy import load_taxonomy
 
 Mask = NDArray[np.bool_]
@@ -176,7 +177,7 @@ class Ageing:
         group = rng.integers(0, _GROUPS, size=count)
         for index in range(_GROUPS if anew.any() else 0):
             rows, cols = (rng.normal(0, self.shift_m, size=2) / cell_size_m).round().astype(int).tolist()
-            kept |= shifted(found.mask_of(anew & (group == index)), rows, cols)
+            kept |= shifted(found.mask_of(anew & (group == index)), rows, cols, beyond=False)
         return kept
 
     def _appear(
@@ -201,23 +202,6 @@ class Ageing:
             for below in _CLEARED.get(name, ()):
                 if below in layers:
                     layers[below][window] &= ~stamp
-
-
-def shifted(mask: Mask, rows: int, cols: int) -> Mask:
-    """Move a mask down and right by whole cells; what leaves the frame is lost.
-
-    Examples
-    --------
-    >>> shifted(np.array([[True, False], [False, False]]), 0, 1).tolist()
-    [[False, True], [False, False]]
-    """
-    height, width = mask.shape
-    out = np.zeros_like(mask)
-    if abs(rows) < height and abs(cols) < width:
-        out[max(rows, 0) : height + min(rows, 0), max(cols, 0) : width + min(cols, 0)] = mask[
-            max(-rows, 0) : height + min(-rows, 0), max(-cols, 0) : width + min(-cols, 0)
-        ]
-    return out
 
 
 def _things(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.random.Generator) -> Objects:

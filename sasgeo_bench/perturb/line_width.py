@@ -8,11 +8,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import PRESENT, Evidence
+from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.perturb.base import check_ranges, with_cells
-from sasgeo_bench.perturb.fields import centres, dilated, eroded
+from sasgeo_bench.perturb.fields import dilated, eroded
 from sasgeo_bench.perturb.objects import thin_classes
-from sasgeo_bench.perturb.resample import resample
+from sasgeo_bench.perturb.resample import shifted
 
 Mask = NDArray[np.bool_]
 
@@ -65,7 +65,7 @@ class LayerOffset:
     Parameters
     ----------
     offset_m : float
-        How far, metres; less than half a cell does nothing.
+        How far, metres, to the nearest whole cell.
     thin_only : bool
         Whether areas stay where they are.
 
@@ -90,28 +90,17 @@ class LayerOffset:
         """Shift the layers; what comes from beyond the view is unknown."""
         if self.offset_m == 0:
             return evidence
-        at, zero = centres(evidence.shape, evidence.cell_size_m), np.zeros(evidence.shape)
         cells = evidence.cells.copy()
         confidence = None if evidence.confidence is None else evidence.confidence.copy()
+        offset_cells = self.offset_m / evidence.cell_size_m
         for index, heading in enumerate(rng.uniform(0, 2 * np.pi, size=len(cells))):
             if self.thin_only and evidence.classes[index] not in thin_classes():
                 continue
-            right_m, up_m = self.offset_m * np.sin(heading), self.offset_m * np.cos(heading)
-            moved = resample(_one_class(evidence, index), at.right_m - right_m + zero, at.up_m - up_m + zero)
-            cells[index] = moved.cells[0]
-            if confidence is not None and moved.confidence is not None:
-                confidence[index] = moved.confidence[0]
+            rows, cols = round(-offset_cells * np.cos(heading)), round(offset_cells * np.sin(heading))
+            cells[index] = shifted(evidence.cells[index], rows, cols, beyond=UNKNOWN)
+            if confidence is not None and evidence.confidence is not None:
+                confidence[index] = shifted(evidence.confidence[index], rows, cols, beyond=0)
         return evidence.replace(cells, confidence)
-
-
-def _one_class(evidence: Evidence, index: int) -> Evidence:
-    part = slice(index, index + 1)
-    return Evidence(
-        classes=evidence.classes[part],
-        cells=evidence.cells[part],
-        cell_size_m=evidence.cell_size_m,
-        confidence=None if evidence.confidence is None else evidence.confidence[part],
-    )
 
 
 def _narrowed(mask: Mask, radius_cells: float) -> Mask:

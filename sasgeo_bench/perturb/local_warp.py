@@ -34,9 +34,9 @@ class LocalWarp:
 
     Notes
     -----
-    Sixteen plane waves in random directions for each component. Where `rms_m` is more than about an eighth of the
-    wavelength the field folds in places: some ground is seen twice; `folded_share` says how much. 15 m at 60 m fold a
-    third of the view, 10 m at 90 m a twentieth.
+    Sixteen plane waves in random directions for each component. Where `rms_m` is more than about a tenth of the
+    wavelength the field folds in places, and some ground is seen twice; `folded_share` says how much: 10 m fold 0.09
+    of the view at 60 m, 0.005 at 90 m and nothing at 120 m, 15 m fold 0.24, 0.08 and 0.01, 5 m nothing.
 
     Examples
     --------
@@ -82,9 +82,11 @@ class LocalWarp:
         wavelengths_m = self.wavelength_m * rng.uniform(1 - _SPREAD, 1 + _SPREAD, size=_WAVES)
         heading, phase = rng.uniform(0, 2 * np.pi, size=(2, _WAVES))
         number = 2 * np.pi / wavelengths_m
-        across = np.exp(1j * np.outer(number * np.cos(heading), right_m))
-        along = np.exp(1j * (np.outer(up_m, number * np.sin(heading)) + phase))
-        return np.asarray((along @ across).real)
+        across = np.outer(number * np.cos(heading), right_m)
+        along = np.outer(up_m, number * np.sin(heading)) + phase
+        rows = np.concatenate((np.cos(along), -np.sin(along)), axis=1)
+        # Not `@`: its last digit depends on how many threads the machine has, and with it what a seed gives.
+        return np.asarray(np.einsum("rw,wc->rc", rows, np.concatenate((np.cos(across), np.sin(across)))))
 
 
 def warped(evidence: Evidence, field_m: NDArray[np.float64]) -> Evidence:

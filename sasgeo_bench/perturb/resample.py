@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells of a view that take their content from elsewhere in it: what every geometric perturbation ends with."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import UNKNOWN, Evidence
 
+Value = TypeVar("Value", np.uint8, np.bool_)
 Metres = NDArray[np.floating]
 
 
@@ -39,6 +42,23 @@ def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
     if evidence.confidence is None:
         return evidence.replace(cells)
     return evidence.replace(cells, _take(evidence.confidence, places, within, 0))
+
+
+def shifted(layer: NDArray[Value], rows: int, cols: int, *, beyond: int) -> NDArray[Value]:
+    """Move a layer down and right by whole cells, with a value for what comes from beyond the view.
+
+    Examples
+    --------
+    >>> shifted(np.array([[1, 0], [0, 0]], dtype=np.uint8), 0, 1, beyond=2).tolist()
+    [[2, 1], [2, 0]]
+    """
+    height, width = layer.shape
+    out = np.full_like(layer, beyond)
+    if abs(rows) < height and abs(cols) < width:
+        out[max(rows, 0) : height + min(rows, 0), max(cols, 0) : width + min(cols, 0)] = layer[
+            max(-rows, 0) : height + min(-rows, 0), max(-cols, 0) : width + min(-cols, 0)
+        ]
+    return out
 
 
 def _take(

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.perturb.ageing import Ageing, AgeingRates, Rates, shifted
+from sasgeo_bench.perturb.ageing import Ageing, AgeingRates, Rates
 from sasgeo_bench.perturb.objects import find_objects, pick_up_to
+from sasgeo_bench.perturb.resample import shifted
 from sasgeo_bench.perturb.season import Season
 
 
@@ -130,7 +131,9 @@ def test_shifting_a_mask_is_rolling_it_without_what_comes_round(rows, cols):
     mask = np.random.default_rng(0).random((9, 7)) < 0.5
     wide = np.zeros((49, 47), dtype=bool)
     wide[20:29, 20:27] = mask
-    np.testing.assert_array_equal(shifted(mask, rows, cols), np.roll(wide, (rows, cols), axis=(0, 1))[20:29, 20:27])
+    np.testing.assert_array_equal(
+        shifted(mask, rows, cols, beyond=False), np.roll(wide, (rows, cols), axis=(0, 1))[20:29, 20:27]
+    )
 
 
 @given(budget=st.floats(0, 100), seed=st.integers(0, 999))

@@ -97,7 +97,7 @@ class PerceptionSettings:
     classes: Mapping[str, ClassErrors] = field(default_factory=_openearthmap)
     edge_m: float = 4.0
     patch_m: float = 12.0
-    gap_m: float = 10.0
+    gap_m: float = 12.0
     stub_m: float = 25.0
     spread: float = 0.3
     seen_anywhere: float = 0.2

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 Field = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+SIGMA: Final = 0.575  # standard deviation of smooth noise: interpolation takes the rest of the variance
 _MIRRORED: Final = (-1, 0, 1)  # how OpenCV names a flip: both ways, upside down, sideways
 _FEWEST: Final = 4096  # enough values to place a threshold within half a percent
 
 
 def smooth_noise(shape: tuple[int, int], scale_cells: float, rng: np.random.Generator) -> Field:
-    """Gaussian noise with mean 0 whose hills and hollows are about `scale_cells` wide; shape (rows, cols).
+    """Gaussian noise whose hills and hollows are about `scale_cells` wide, shape (rows, cols); mean 0, deviation SIGMA.
 
     Normal values on a coarse lattice, drawn out twice by linear interpolation, which rounds the corners a single step
     would leave; the lattice is cut out at a random place, so that it lies nowhere twice. Equal for equal generators.

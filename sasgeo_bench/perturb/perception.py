@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.perturb.base import check_ranges, with_cells
 from sasgeo_bench.perturb.detector import TOLERANCE_CELLS, ClassErrors, PerceptionSettings
-from sasgeo_bench.perturb.fields import Field, NoisePool, dilated, eroded, highest_within
+from sasgeo_bench.perturb.fields import SIGMA, Field, NoisePool, dilated, eroded, highest_within, smooth_noise
 from sasgeo_bench.perturb.objects import find_objects, pick_up_to, thin_classes
 
 Mask = NDArray[np.bool_]
@@ -26,6 +26,7 @@ _MOST_ERROR: Final = 0.95
 _SECOND_RING: Final = 0.8  # a cell two from the edge goes over where the noise is this much stronger than at the edge
 _DROPPABLE: Final = 0.25  # an object that is more than this share of its class in view is frayed rather than dropped
 _MOST_TAKEN: Final = 0.6  # of a class's false alarms: what other classes lose to it comes first, but not alone
+_FLAWLESS: Final = ClassErrors(f1=1.0)
 _STUB_SPENDS: Final = 0.85  # of the cells of a false line: the rest lies on what is there already or beyond the view
 
 
@@ -45,7 +46,9 @@ class Perception:
     -----
     For an error of x = 1 - F1, a share x of the cells of a class is lost and as many are seen in the wrong place, so
     that precision and recall are both F1. Objects, edges and confusion spend this budget first, patches and false lines
-    what is left. `detector.measured_f1` says what came out.
+    what is left. `detector.measured_f1` says what came out; the tests hold it to within 0.06 of the target, pooled over
+    views of towns, for classes that cover a third of their `usual_share` or more. For one that is hardly there, what is
+    seen anywhere makes it worse than that.
 
     Examples
     --------
@@ -72,8 +75,7 @@ class Perception:
         """Lose, then gain: a class gains first what another one lost to it."""
         if self.error_factor == 0:
             return evidence
-        pool = NoisePool(evidence.shape)
-        looks = [self._look(evidence, index, pool, rng) for index in range(len(evidence.classes))]
+        looks = self._looks(evidence, rng)
         taken_for: dict[str | None, list[Mask]] = {}
         seen = []
         for look in looks:
@@ -85,22 +87,30 @@ class Perception:
             look.gain(kept, taken_for.get(look.name, ()), rng)
         return with_cells(evidence, np.stack(seen).view(np.uint8))
 
-    def _look(self, evidence: Evidence, index: int, pool: NoisePool, rng: np.random.Generator) -> "_Look":
-        """One class of the view, and the share of it that goes wrong; classes without settings are seen as they are."""
-        name, layer = evidence.classes[index], evidence.cells[index]
-        errors = self.settings.classes.get(name, ClassErrors(f1=1.0))
-        share, spread = self.error_factor * (1 - errors.f1), self.settings.spread
-        if spread > 0:
-            share *= rng.gamma(spread**-2, spread**2)
-        return _Look(
-            name=name,
-            layer=layer,
-            errors=errors,
-            settings=self.settings,
-            share=min(share, _MOST_ERROR),
-            cell_size_m=evidence.cell_size_m,
-            pool=pool,
-        )
+    def _looks(self, evidence: Evidence, rng: np.random.Generator) -> list["_Look"]:
+        """Each class, and the share of it that goes wrong; classes without settings are seen as they are."""
+        settings, pool = self.settings, NoisePool(evidence.shape)
+        errors = [settings.classes.get(name, _FLAWLESS) for name in evidence.classes]
+        shares = self.error_factor * np.array([1 - item.f1 for item in errors])
+        if settings.spread > 0:
+            shares *= rng.gamma(settings.spread**-2, settings.spread**2, size=len(shares))
+        present, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
+        # Wider noise than that of the patches: most things are taken for something else as a whole or not at all.
+        mixed_up = smooth_noise(evidence.shape, 3 * settings.patch_m / evidence.cell_size_m, rng)
+        return [
+            _Look(
+                name=name,
+                mask=present[index],
+                unknown=unknown[index],
+                errors=errors[index],
+                settings=settings,
+                share=min(float(shares[index]), _MOST_ERROR),
+                cell_size_m=evidence.cell_size_m,
+                pool=pool,
+                mixed_up=mixed_up,
+            )
+            for index, name in enumerate(evidence.classes)
+        ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,12 +126,14 @@ class _Look:
     """One class in one view, before and on its way through the detector."""
 
     name: str
-    layer: NDArray[np.uint8]
+    mask: Mask
+    unknown: Mask
     errors: ClassErrors
     settings: PerceptionSettings
     share: float
     cell_size_m: float
     pool: NoisePool
+    mixed_up: Field
 
     def noise(self, width_m: float, rng: np.random.Generator) -> Field:
         """Smooth noise as large as the view."""
@@ -134,18 +146,16 @@ class _Look:
 
     def lose(self, rng: np.random.Generator) -> _Loss:
         """Miss the share that goes wrong."""
-        mask = self.layer == PRESENT
-        budget_cells = self.share * np.count_nonzero(mask)
+        mask, budget_cells = self.mask, self.share * np.count_nonzero(self.mask)
         if budget_cells == 0:
-            return _Loss(kept=mask)
+            return _Loss(kept=mask.copy())
         kept, lost = (
             self._lose_line(mask, budget_cells, rng) if self.is_thin else self._lose_area(mask, budget_cells, rng)
         )
         if self.errors.confused == 0:
             return _Loss(kept=kept)
-        # Wider noise than that of the patches: most things are taken for something else as a whole or not at all.
-        whole = self.noise(3 * self.settings.patch_m, rng)
-        return _Loss(kept=kept, taken=lost & (whole < NormalDist().inv_cdf(min(self.errors.confused, 1 - 1e-9))))
+        limit = NormalDist(sigma=SIGMA).inv_cdf(min(self.errors.confused, 1 - 1e-9))
+        return _Loss(kept=kept, taken=lost & (self.mixed_up < limit))
 
     def _lose_area(self, mask: Mask, budget_cells: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
         """Whole objects, then the edge, then patches; what is left, and what went besides the edge."""
@@ -169,13 +179,13 @@ class _Look:
 
     def gain(self, seen: Mask, taken: Sequence[Mask], rng: np.random.Generator) -> None:
         """Add false alarms to what is seen of the class, in place."""
-        settings, was = self.settings, self.layer == PRESENT
+        settings, was = self.settings, self.mask
         usual_cells = self.errors.usual_share * was.size
         expected = (1 - settings.seen_anywhere) * np.count_nonzero(was) + settings.seen_anywhere * usual_cells
         budget_cells = self.share * expected
         if budget_cells < 1:
             return
-        free = (self.layer != UNKNOWN) & ~was
+        free = ~(self.unknown | was)
         for lost in taken:
             new = lost & free & ~seen
             count = np.count_nonzero(new)

@@ -54,6 +54,7 @@ check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m mypy
 
 bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, never a test
+	$(VENV_PYTHON) benchmarks/perturb.py
 	$(VENV_PYTHON) benchmarks/build_region.py $(ARGS)
 
 docs: $(STAMP) ## run the examples in the docstrings and follow the links between the documents; builds no site

@@ -38,3 +38,7 @@ class CoverageError(SasgeoError, ValueError):
 
 class StoreError(SasgeoError, OSError):
     """A folder or file of ours that cannot be written, or is not what its manifest says."""
+
+
+class PerturbError(SasgeoError, ValueError):
+    """A perturbation with a strength out of range, or asked for what it must not do."""

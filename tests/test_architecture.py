@@ -33,7 +33,11 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "search": None,
     "camera": None,
     "imagery": None,
-    "perturb": (),
+    "perturb": (
+        *("base", "fields", "objects", "resample", "detector"),
+        *("perception", "occlusion", "border", "wedge", "glare", "canopy", "adversarial", "false_unknown"),
+        *("local_warp", "tilt", "crop", "rotation", "scale", "line_width", "season", "ageing"),
+    ),
     "query": None,
     "split": None,
     "trajectory": None,

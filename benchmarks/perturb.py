@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Milliseconds of each perturbation for a view of 192 x 192 cells and 13 classes, on one core.
+
+Views are cut from three embedded towns, so nothing is downloaded. Each figure is the mean over the views of the median
+of the runs on each. `make bench` runs it.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sasgeo_bench.build import build_region, plan_build
+from sasgeo_bench.evidence import Evidence, LayerBits, observe
+from sasgeo_bench.perturb.adversarial import AdversarialMask
+from sasgeo_bench.perturb.ageing import Ageing, AgeingRates
+from sasgeo_bench.perturb.base import Perturbation, share_changed, share_hidden
+from sasgeo_bench.perturb.border import Border
+from sasgeo_bench.perturb.canopy import CanopyAndShadow
+from sasgeo_bench.perturb.crop import CentralCrop
+from sasgeo_bench.perturb.false_unknown import FalseUnknown
+from sasgeo_bench.perturb.glare import Glare
+from sasgeo_bench.perturb.line_width import LayerOffset, LineWidth
+from sasgeo_bench.perturb.local_warp import LocalWarp
+from sasgeo_bench.perturb.occlusion import Rectangles
+from sasgeo_bench.perturb.perception import Perception
+from sasgeo_bench.perturb.rotation import Rotation
+from sasgeo_bench.perturb.scale import Scale
+from sasgeo_bench.perturb.season import Season
+from sasgeo_bench.perturb.tilt import Tilt
+from sasgeo_bench.perturb.wedge import TiltWedge
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.store.catalog import find_region_file, read_region_file
+from sasgeo_bench.store.regiondir import read_region
+
+TOWNS = ("town-suburb", "town-riverside", "town-agricultural")
+VIEWS_PER_TOWN = 4
+SIZE_CELLS = 192
+
+RATES = AgeingRates.set_by_hand()
+MEASURED: dict[str, Perturbation] = {
+    "perception, in domain": Perception(error_factor=1.0),
+    "perception, across domains": Perception(error_factor=2.0),
+    "rectangles 0.3": Rectangles(share=0.3),
+    "rectangles 0.6": Rectangles(share=0.6),
+    "border 0.3": Border(share=0.3),
+    "tilt wedge 0.3": TiltWedge(share=0.3),
+    "glare 0.2": Glare(share=0.2),
+    "canopy and shadow 0.6": CanopyAndShadow(share=0.6),
+    "adversarial mask 0.3": AdversarialMask(share=0.3),
+    "false unknown 0.2": FalseUnknown(share=0.2),
+    "local warp 10 m": LocalWarp(rms_m=10.0),
+    "tilt 3 deg": Tilt(tilt_deg=3.0),
+    "central crop 0.3": CentralCrop(share=0.3),
+    "rotation 5 deg": Rotation(angle_deg=5.0),
+    "scale 0.1": Scale(excess=0.1),
+    "lines wider by 1 m": LineWidth(grow_m=1.0),
+    "layers off by 5 m": LayerOffset(offset_m=5.0),
+    "leaf on 0.5": Season(kind="leaf_on", strength=0.5),
+    "snow 0.5": Season(kind="snow", strength=0.5),
+    "low water 0.5": Season(kind="low_water", strength=0.5),
+    "harvest 0.5": Season(kind="harvest", strength=0.5),
+    "ageing 10 years": Ageing(years=10.0, rates=RATES, place="-", redrawn=0.2),
+    "ageing 30 years": Ageing(years=30.0, rates=RATES, place="-", redrawn=0.2),
+}
+
+
+def town_views() -> list[Evidence]:
+    """Views of the middles of the towns, each at four headings."""
+    views = []
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+        for town in TOWNS:
+            plan = plan_build(read_region_file(find_region_file(town)), out=Path(folder))
+            build_region(plan, tell=lambda _: None, with_preview=False)
+            region = read_region(plan.folder)
+            bits = LayerBits.of(region.layers)
+            west_m, south_m, east_m, north_m = region.grid.bounds_m
+            for index in range(VIEWS_PER_TOWN):
+                pose = Pose(
+                    easting_m=(west_m + east_m) / 2,
+                    northing_m=(south_m + north_m) / 2 - 60 * index,
+                    yaw_deg=37.0 * index,
+                )
+                cells = observe(bits, region.grid, pose, size_cells=SIZE_CELLS, cell_size_m=1.0)
+                views.append(Evidence(classes=region.classes, cells=cells, cell_size_m=1.0))
+    return views
+
+
+def milliseconds(perturbation: Perturbation, view: Evidence, runs: int) -> float:
+    """Median of the runs on one view, after one that warms up."""
+    rng, seconds = np.random.default_rng(0), []
+    perturbation(view, rng)
+    for _ in range(runs):
+        start = time.perf_counter()
+        perturbation(view, rng)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds) * 1e3
+
+
+def main() -> None:
+    """Print one row for each perturbation: time, and what it did."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=15)
+    given = parser.parse_args()
+    cv2.setNumThreads(1)
+    views = town_views()
+    print(f"{len(views)} views of {SIZE_CELLS} x {SIZE_CELLS} cells, {len(views[0].classes)} classes")
+    print(f"{'':28} {'ms':>6} {'changed':>8} {'hidden':>7}")
+    for name, perturbation in MEASURED.items():
+        after = [perturbation(view, np.random.default_rng(index)) for index, view in enumerate(views)]
+        changed = statistics.fmean(map(share_changed, views, after))
+        hidden = statistics.fmean(map(share_hidden, views, after))
+        took_ms = statistics.fmean(milliseconds(perturbation, view, given.runs) for view in views)
+        print(f"{name:28} {took_ms:6.2f} {changed:8.4f} {hidden:7.4f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -7,12 +7,13 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
+import geopandas as gpd
 import shapely
 
 from sasgeo_bench.errors import SasgeoError, StoreError
@@ -32,6 +33,7 @@ from sasgeo_bench.region import (
     CoverageRecord,
     ExtractRecord,
     Manifest,
+    Region,
 )
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.store import regiondir
@@ -215,6 +217,14 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: boo
         f"{name}: {len(reading.features)} features into a graph and {len(taxonomy.names)} layers"
         f" of {plan.grid.rows} x {plan.grid.cols} cells"
     )
+    return _write_into(scratch, plan, extract, reading, with_preview=with_preview)
+
+
+def _write_into(
+    scratch: Path, plan: BuildPlan, extract: ExtractRecord, reading: Reading, *, with_preview: bool
+) -> Manifest:
+    """Burn the layers, make the graph, and write all files of a region."""
+    taxonomy = load_taxonomy()
     # GDAL packs blocks without holding the interpreter, so the layers are written beside the graph.
     with ThreadPoolExecutor(max_workers=1) as beside:
         paint = _painter(reading, plan.grid, taxonomy)
@@ -230,6 +240,60 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: boo
     manifest = manifest.model_copy(update={"files": files})
     regiondir.write_manifest(scratch, manifest)
     return manifest
+
+
+def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, suffix: str, note: str) -> Path:
+    """Write a region whose features were edited beside the one it comes from, as `<id>+<suffix>`.
+
+    Parameters
+    ----------
+    plan : BuildPlan
+        Of the region that was edited.
+    base : Region
+        That region.
+    features : geopandas.GeoDataFrame
+        The edited feature table; coverage and provenance stay those of the base.
+    suffix : str
+        What the copy is for.
+    note : str
+        What was done, for the manifest.
+
+    Returns
+    -------
+    Path
+        Its folder.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be written.
+    """
+    name = f"{plan.folder.name}+{suffix}"
+    inputs = hashlib.sha256(f"{base.manifest.inputs_sha256}/{note}/{fingerprint(features)}".encode()).hexdigest()
+    spec = plan.spec.model_copy(update={"id": name, "title": f"{plan.spec.title} ({suffix})"})
+    edited = replace(plan, spec=spec, folder=plan.folder.parent / name, inputs_sha256=inputs)
+    record = base.manifest
+    reading = Reading(
+        features=features,
+        coverage=base.coverage,
+        coverage_source=record.coverage.source,
+        osm_timestamp=record.extract.osm_timestamp,
+        drops=record.drops,
+        hidden=record.hidden,
+        notes=record.notes,
+        warnings=(*record.warnings, note),
+    )
+    try:
+        with regiondir.locked(edited.folder, tell=lambda _: None):
+            if not _is_current(edited.folder, inputs):
+                with regiondir.fresh_folder(edited.folder) as scratch:
+                    _write_into(scratch, edited, record.extract, reading, with_preview=True)
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = f"{edited.folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        raise StoreError(message) from error
+    return edited.folder
 
 
 @contextmanager

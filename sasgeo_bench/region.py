@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
+from sasgeo_bench.extract.coverage import Source
 from sasgeo_bench.graph import MapGraph
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.tomlfile import Document
@@ -49,7 +50,7 @@ class ExtractRecord(_Record):
 class CoverageRecord(_Record):
     """The mapped area: where it is known from, its share of the grid, and its outline as WKT in the region's CRS."""
 
-    source: str
+    source: Source
     share: Annotated[float, Field(ge=0, le=1)]
     wkt: str
 

@@ -18,7 +18,7 @@ from sasgeo_bench.region import Manifest
 from sasgeo_bench.taxonomy import load_taxonomy
 
 # Painted in this order: land first, then what lies on it, then what runs over it.
-_ORDER: Final = (
+PAINT_ORDER: Final = (
     *("farmland", "green", "water", "parking", "building", "field_boundary", "path_track", "waterway", "coastline"),
     *("road_minor", "road_major", "railway", "bridge"),
 )
@@ -77,7 +77,7 @@ def _picture(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.floa
     picture = np.empty((rows, cols, 3))
     picture[:] = to_rgb(_GROUND)
     colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
-    for name in _ORDER:
+    for name in PAINT_ORDER:
         if name in manifest.classes:
             picture[overview[manifest.classes.index(name)] == PRESENT] = colours[name]
     outside = overview[0] == OUTSIDE

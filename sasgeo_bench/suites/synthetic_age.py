@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `synthetic-age`: the world is the map grown older, at rates measured in other places."""
+
+from dataclasses import replace
+from typing import Final
+
+from sasgeo_bench.perturb.ageing import Ageing
+from sasgeo_bench.suites.base import (
+    VIEW_CELLS,
+    Draft,
+    Scene,
+    Seeds,
+    Site,
+    Suite,
+    SuiteCard,
+    Variant,
+    changed_share,
+    controls,
+    ladder,
+    perceived,
+)
+
+YEARS: Final = (2.0, 5.0, 10.0, 30.0)
+REDRAWN_WITHIN_YEARS: Final = 10.0  # the span that the share of redrawn things in a scene's ageing stands for
+
+
+class SyntheticAgeSuite(Suite):
+    """Years pass between map and view; for places of which there is one date only."""
+
+    def lack(self, scene: Scene) -> str | None:
+        """Rates of other places are needed."""
+        return "no rates of ageing from another place" if scene.ageing is None else super().lack(scene)
+
+    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+        """Let the years pass, then perceive; a control sees the map's own day."""
+        if variant.strength == 0 or scene.ageing is None:
+            return Draft(evidence=perceived(scene.world, site, variant, seeds), changed_share=0.0)
+        clean = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+        grown = after(scene.ageing, variant.strength)(clean, seeds.rng("ageing", variant.view_cells))
+        share = changed_share(clean, grown)
+        return Draft(
+            evidence=perceived(scene.world, site, variant, seeds, clean=grown),
+            changed_share=share,
+            measured={"changed_share": share},
+        )
+
+
+def after(ageing: Ageing, years: float) -> Ageing:
+    """Ageing by so many years; the share that was drawn anew grows with them.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.perturb.ageing import AgeingRates
+    >>> slow = Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="-", redrawn=0.36)
+    >>> round(after(slow, 5.0).redrawn, 3)
+    0.2
+    """
+    kept = (1 - ageing.redrawn) ** (years / REDRAWN_WITHIN_YEARS)
+    return replace(ageing, years=years, redrawn=1 - kept)
+
+
+SUITE: Final = SyntheticAgeSuite(
+    card=SuiteCard(
+        name="synthetic-age",
+        version=1,
+        title="Synthetic ageing",
+        what="Things vanish, appear and are drawn anew for 2 to 30 years, at the rates measured in other places.",
+        separates="Stability from uniform weights where no second date is there; to be read beside real-age.",
+        falsifier="No year has passed: scores as in the control.",
+        strength_unit="years between map and world",
+    ),
+    variants=(
+        *controls(views=VIEW_CELLS),
+        *ladder("aged", YEARS, views=VIEW_CELLS, middle=10.0),
+        Variant(role="falsifier", kind="no year"),
+    ),
+)

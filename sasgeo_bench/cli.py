@@ -4,6 +4,8 @@
 import datetime as dt
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Final
@@ -15,9 +17,23 @@ from rich.table import Table
 from sasgeo_bench.build import BuildPlan, build_region, plan_build
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import ConfigError, SasgeoError
+from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.region import Manifest
-from sasgeo_bench.store.catalog import find_region_file, list_region_files, read_region_file
+from sasgeo_bench.split import make_split
+from sasgeo_bench.store.catalog import (
+    find_region_file,
+    find_split_file,
+    list_region_files,
+    list_split_files,
+    read_region_file,
+    read_split_file,
+)
 from sasgeo_bench.store.regiondir import differing_files, read_manifest
+from sasgeo_bench.store.sheet import write_sheet
+from sasgeo_bench.store.splitmap import write_split_map
+from sasgeo_bench.store.taskdir import TASK, read_task
+from sasgeo_bench.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.tasks import Request, default_suites, make_tasks, panels, wrong_place
 
 EXIT_USER: Final = 2
 EXIT_INTERRUPTED: Final = 130
@@ -101,16 +117,162 @@ def list_regions_command(regions: RegionFolders = None) -> None:
     _print(table)
 
 
+@app.command("list-suites")
+def list_suites_command() -> None:
+    """List the suites: what each does and what it separates."""
+    table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
+    for name, suite in SUITES.items():
+        card = suite.card
+        table.add_row(
+            name, card.title, ", ".join(card.tracks), str(len(suite.variants) * len(card.tracks)), card.separates
+        )
+    _print(table)
+
+
+@app.command("make-queries")
+def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its users need
+    *,
+    suite: Annotated[
+        list[str] | None, typer.Option(help="name from list-suites; may be repeated; default: all")
+    ] = None,
+    regions: Annotated[
+        list[str] | None, typer.Option("--regions", help="id from list-regions or own file; may be repeated")
+    ] = None,
+    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
+    n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8,
+    seed: Annotated[int, typer.Option(help="root of all chance")] = 0,
+    prior: Annotated[
+        str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")
+    ] = None,
+    extracts: ExtractFolders = None,
+    region_folders: Annotated[
+        list[Path] | None, typer.Option("--region-files", help="folder with region files of your own")
+    ] = None,
+    out: Out = Path("out"),
+    up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False,
+    skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="regions at once")] = 1,
+) -> None:
+    """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
+    requests = _requests(
+        suite or list(default_suites()), regions, split, n=n, seed=seed, out=out, folders=region_folders or []
+    )
+    group = PriorGroup.parse(prior) if prior else None
+    requests = [
+        replace(item, group=group, may_be_fewer=up_to, extract_folders=tuple(extracts or ())) for item in requests
+    ]
+    if dry_run:
+        for item in requests:
+            per_site = len(find_suite(item.suite).variants) * len(find_suite(item.suite).card.tracks)
+            folder = item.out / "tasks" / item.suite / item.region.id
+            most = f"at most {item.count} sites, {item.count * per_site} queries"
+            typer.echo(f"{item.suite} on {item.region.id}: {most}, {folder}")
+        return
+    by_region: dict[str, list[Request]] = {}
+    for item in requests:
+        by_region.setdefault(item.region.id, []).append(item)
+    work = partial(_make_all, skip=skip)
+    if jobs == 1 or len(by_region) == 1:
+        for items in by_region.values():
+            work(items)
+        return
+    with ProcessPoolExecutor(max_workers=jobs, mp_context=get_context("spawn")) as pool:
+        for _ in pool.map(work, by_region.values()):
+            pass
+
+
+def _make_all(requests: list[Request], *, skip: bool) -> None:
+    """Make the tasks of one region in turn."""
+    for request in requests:
+        try:
+            make_tasks(request, tell=_tell)
+        except ConfigError as error:
+            if not skip:
+                raise
+            _tell(f"{request.suite} on {request.region.id}: passed over, {error}")
+
+
+def _requests(
+    suites: list[str], regions: list[str] | None, split: str, *, n: int, seed: int, out: Path, folders: list[Path]
+) -> list[Request]:
+    """One request for every suite and region; everything is checked before anything is made."""
+    known = {name: read_region_file(path) for name, path in list_region_files(folders=folders).items()}
+    if n < 1:
+        message = f"--n must be at least 1, got {n}"
+        raise ConfigError(message)
+    if not regions:
+        message = "name the regions: --regions vaduz --regions monaco (list-regions shows all)"
+        raise ConfigError(message)
+    specs = [read_region_file(find_region_file(name, folders=folders)) for name in dict.fromkeys(regions)]
+    known |= {spec.id: spec for spec in specs}
+    for name in suites:
+        find_suite(name)
+    checked = make_split(read_split_file(find_split_file(split)), {name: item.grid() for name, item in known.items()})
+    return [
+        Request(
+            suite=name,
+            region=spec,
+            split=checked,
+            count=n,
+            seed=seed,
+            out=out,
+            elsewhere=wrong_place(checked, spec, known),
+        )
+        for spec in specs
+        for name in suites
+    ]
+
+
 @app.command("inspect")
 def inspect_command(
-    region: Annotated[str, typer.Argument(help="id of a built region, or its folder")], out: Out = Path("out")
+    target: Annotated[str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one")],
+    query: Annotated[str | None, typer.Option(help="of a task: this query alone, by the beginning of its id")] = None,
+    rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12,
+    region_folders: RegionFolders = None,
+    out: Out = Path("out"),
 ) -> None:
-    """Say what is in a built region: provenance, coverage, classes, graph, what was dropped, files."""
-    folder = Path(region) if Path(region).is_dir() else out / "regions" / region
+    """Say what is in a region, a task or a split; of a task draw a contact sheet, of a split its map."""
+    folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
+    if (folder / TASK).is_file():
+        _inspect_task(folder, out, query=query, rows=rows)
+        return
+    if target.endswith(".toml") or target in list_split_files():
+        _inspect_split(target, out, region_folders or [])
+        return
+    folder = Path(target) if Path(target).is_dir() else out / "regions" / target
     manifest = read_manifest(folder)
     _print(_summary(manifest, folder))
     _print(_class_table(manifest))
     _print(_reasons(manifest))
+
+
+def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
+    """Print what a task is and draw its contact sheet."""
+    about = read_task(folder)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in about.items():
+        table.add_row(
+            name, ", ".join(f"{key} {item}" for key, item in value.items()) if isinstance(value, dict) else str(value)
+        )
+    _print(table)
+    truth_folder = out / "truth" / about["suite"] / about["region"]
+    chosen = panels(folder, truth_folder, out=out, count=rows, query_id=query)
+    path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
+    typer.echo(f"contact sheet: {path}")
+
+
+def _inspect_split(target: str, out: Path, folders: list[Path]) -> None:
+    """Print the places of a split and draw their map."""
+    grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
+    split = make_split(read_split_file(find_split_file(target)), grids)
+    typer.echo(split.to_text())
+    path = out / "sheets" / f"split-{split.spec.id}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_split_map(path, split)
+    typer.echo(f"map of parts: {path}")
 
 
 def _summary(manifest: Manifest, folder: Path) -> Table:

@@ -36,7 +36,7 @@ MAX_FILE_BYTES = 500_000
 IMPORTED_AS = {"opencv-python-headless": "cv2"}
 
 # Declared, though no file of ours imports them: another library needs them for what we ask of it.
-INDIRECT = {"pyarrow": "GeoParquet through geopandas", "tqdm": "the progress bar of pooch"}
+INDIRECT = {"tqdm": "the progress bar of pooch"}
 
 
 def repository_files() -> list[Path]:

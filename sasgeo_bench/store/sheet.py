@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact sheets: of some queries of a task the view, the map at the true place, what differs, the likest decoy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Final
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.query import Query, Truth
+from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.store.preview import PAINT_ORDER
+from sasgeo_bench.taxonomy import load_taxonomy
+
+GROUND: Final = "#fbfaf5"
+HIDDEN: Final = "#9e9e9e"
+ONLY_SEEN: Final = "#c2185b"
+ONLY_MAPPED: Final = "#1565c0"
+AGREE: Final = "#d9d9d9"
+_CELL_INCHES: Final = 2.1
+_DPI: Final = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """One row of a sheet: a query, its truth, and what the map shows there; None where there is no such place."""
+
+    query: Query
+    truth: Truth
+    at_truth: Evidence | None
+    at_decoy: Evidence | None
+
+
+def paint(evidence: Evidence) -> NDArray[np.float64]:
+    """Colours of a view, shape (rows, cols, 3), 0..1; grey where at least half of the classes are unknown."""
+    picture = np.empty((*evidence.shape, 3))
+    picture[:] = to_rgb(GROUND)
+    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+    for name in PAINT_ORDER:
+        if name in evidence.classes:
+            picture[evidence.layer(name) == PRESENT] = colours[name]
+    unknown = (evidence.cells == UNKNOWN).mean(axis=0)[..., None]
+    return np.asarray(picture * (1 - unknown) + np.array(to_rgb(HIDDEN)) * unknown)
+
+
+def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
+    """Where view and map agree, where only the view has something, where only the map has."""
+    known = (seen.cells != UNKNOWN) & (mapped.cells != UNKNOWN)
+    one, two = (known & (item.cells == PRESENT) for item in (seen, mapped))
+    picture = np.empty((*seen.shape, 3))
+    picture[:] = to_rgb(GROUND)
+    picture[(one & two).any(axis=0)] = to_rgb(AGREE)
+    picture[(two & ~one).any(axis=0)] = to_rgb(ONLY_MAPPED)
+    picture[(one & ~two).any(axis=0)] = to_rgb(ONLY_SEEN)
+    picture[~known.any(axis=0)] = to_rgb(HIDDEN)
+    return picture
+
+
+def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
+    """Draw a contact sheet.
+
+    Parameters
+    ----------
+    path : Path
+        The PNG to write.
+    title : str
+        What the sheet shows.
+    panels : sequence of Panel
+        Its rows.
+    """
+    columns = ("view", "map at the true place", "view against map", "likest decoy")
+    width, height = 2.6 + _CELL_INCHES * len(columns), 1.0 + (_CELL_INCHES + 0.1) * len(panels)
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
+    legend = "pink: only seen   blue: only mapped   grey: unknown   light grey: agree"
+    figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=8, color="#444444")
+    for at, panel in enumerate(panels):
+        bottom = height - 0.95 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
+        text = "\n".join(line for part in _words(panel) for line in wrap(part, 30))
+        figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=7.5)
+        pictures = _pictures(panel)
+        for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):
+            left = 2.5 + _CELL_INCHES * place
+            box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
+            chart = figure.add_axes(box)
+            chart.set_xticks([])
+            chart.set_yticks([])
+            if picture is None:
+                chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=9, transform=chart.transAxes)
+            else:
+                chart.imshow(picture, interpolation="nearest")
+            if at == 0:
+                chart.set_title(name, fontsize=9, pad=3)
+    figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
+    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+
+
+def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:
+    seen, mapped, decoy = panel.query.evidence, panel.at_truth, panel.at_decoy
+    return (
+        paint(seen),
+        None if mapped is None else paint(mapped),
+        None if mapped is None else paint_difference(seen, mapped),
+        None if decoy is None else paint(decoy),
+    )
+
+
+def _words(panel: Panel) -> tuple[str, ...]:
+    query, truth = panel.query, panel.truth
+    rows, cols = query.evidence.shape
+    measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items())
+    return (
+        f"{truth.role}: {truth.kind}",
+        f"strength {truth.strength:g} ({truth.strength_unit})",
+        f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
+        f"priors {query.prior_group}; {len(query.candidates)} candidates"
+        + (f", {len(query.vectors)} vectors" if query.vectors is not None else ""),
+        "present" if truth.is_present else "ABSENT",
+        f"unknown {truth.unknown_share:.2f}, changed {truth.changed_share:.2f}, alias {truth.alias_index:.2f}",
+        f"measured: {measured}" if measured else "",
+        f"{truth.block}, {query.query_id[:8]}",
+    )

@@ -562,9 +562,20 @@ def panels(
             message = f"{task_folder} holds no query {query_id!r}"
             raise ConfigError(message)
     wanted = {truth.query_id for truth in chosen}
-    queries = {query.query_id: query for query in taskdir.read_queries(task_folder) if query.query_id in wanted}
-    windows: dict[float, Windows] = {}
-    return tuple(_panel(queries[truth.query_id], truth, state, windows) for truth in chosen)
+    queries = {}
+    rivals: dict[Pose, tuple[Pose, ...]] = {}
+    poses = {truth.pose for truth in chosen}
+    for query in taskdir.read_queries(task_folder):
+        truth = truths[query.query_id]
+        if query.query_id in wanted:
+            queries[query.query_id] = query
+        if query.candidates and truth.pose in poses and truth.pose is not None:
+            others = tuple(pose for at, pose in enumerate(query.candidates) if at != truth.candidate)
+            rivals.setdefault(truth.pose, others)
+    return tuple(
+        _panel(queries[truth.query_id], truth, state, rivals.get(truth.pose, ()) if truth.pose else ())
+        for truth in chosen
+    )
 
 
 def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
@@ -585,18 +596,20 @@ def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
     return (chosen + rest)[:count]
 
 
-def _panel(query: Query, truth: Truth, state: State, windows: dict[float, Windows]) -> Panel:
-    size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
+def _panel(query: Query, truth: Truth, state: State, rivals: Sequence[Pose]) -> Panel:
+    """What the map shows at the truth, and at the candidate that overlaps most with it; mined where there is none."""
     if truth.pose is None:
         return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
-    side_m = size * cell_m
-    if side_m not in windows:
-        windows[side_m] = describe(state, side_m=side_m)
-    center_m = (truth.pose.easting_m, truth.pose.northing_m)
-    decoys = mine(windows[side_m], center_m, count=1).points_m
-    at_decoy = None
-    if len(decoys):
-        pose = replace(truth.pose, easting_m=float(decoys[0, 0]), northing_m=float(decoys[0, 1]))
-        at_decoy = state.view(pose, size_cells=size, cell_size_m=cell_m)
+    size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
     at_truth = state.view(truth.pose, size_cells=size, cell_size_m=cell_m)
-    return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=at_decoy)
+    places = [(pose.easting_m, pose.northing_m) for pose in rivals]
+    if not places:
+        center_m = (truth.pose.easting_m, truth.pose.northing_m)
+        mined = mine(describe(state, side_m=size * cell_m), center_m, count=1).points_m
+        places = [(float(x), float(y)) for x, y in mined]
+    views = [
+        state.view(replace(truth.pose, easting_m=x, northing_m=y), size_cells=size, cell_size_m=cell_m)
+        for x, y in places
+    ]
+    hardest = min(views, key=lambda view: changed_share(at_truth, view), default=None)
+    return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=hardest)

@@ -17,6 +17,8 @@ Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
 
 _ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
+_AT_M: Final = 0.1  # a road this near to a junction meets it
+_OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
 _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 
 
@@ -185,7 +187,7 @@ def open_gaps(
     is_road = features["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
     for point in junctions_m:
         place = shapely.Point(point)
-        near = np.flatnonzero(is_road & (shapely.distance(shapes, place) < 0.1))  # noqa: PLR2004 - metres
+        near = np.flatnonzero(is_road & (shapely.distance(shapes, place) < _AT_M))
         if len(near) < 2:  # noqa: PLR2004 - two roads make a junction
             continue
         picked = int(near[rng.integers(len(near))])
@@ -195,6 +197,84 @@ def open_gaps(
     is_left = ~shapely.is_empty(shapes)
     table = features[is_left]
     return table.set_geometry(gpd.GeoSeries(shapes[is_left], index=table.index, crs=features.crs))
+
+
+def stagger(
+    features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, offset_m: float, rng: np.random.Generator
+) -> gpd.GeoDataFrame:
+    """Make two T-junctions of each X-junction: one road's further part starts `offset_m` along the other road.
+
+    Parameters
+    ----------
+    features : geopandas.GeoDataFrame
+        A feature table; roads are cut and moved.
+    junctions_m : ndarray of float, shape (N, 2)
+        Easting and northing of the junctions; where no road goes on across another one nothing is done.
+    offset_m : float
+        Between the two new junctions.
+    rng : numpy.random.Generator
+        Picks the road and the way it is moved.
+    """
+    shapes = features.geometry.to_numpy().copy()
+    is_road = features["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    for point in junctions_m:
+        arms = _arms(shapes, np.flatnonzero(is_road), point)
+        pairs = [
+            (one, two)
+            for at, one in enumerate(arms)
+            for two in arms[at + 1 :]
+            if float(np.dot(one.direction, two.direction)) < _OPPOSITE
+        ]
+        if len(pairs) < 2:  # noqa: PLR2004 - two roads that both go on make an X
+            continue
+        order = rng.permutation(len(pairs))
+        moving, other = pairs[order[0]][int(rng.integers(2))], pairs[order[1]][0]
+        shift = offset_m * other.direction
+        shapes[moving.index] = _end_moved(shapes[moving.index], point, moving, shift)
+        shapes[other.index] = _with_vertices(shapes[other.index], [shapely.Point((point + shift).round(_DECIMALS))])
+    return features.set_geometry(gpd.GeoSeries(shapes, index=features.index, crs=features.crs))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Arm:
+    """A road that leaves a junction: which feature, in which direction (a unit vector), and which of its neighbours."""
+
+    index: int
+    direction: NDArray[np.float64]
+    vertex: int
+    step: int
+
+
+def _arms(shapes: NDArray[np.object_], roads: NDArray[np.int64], point: NDArray[np.float64]) -> list[_Arm]:
+    """Arms of a junction that is a vertex of every road that meets there; roads in several parts are left alone."""
+    found = []
+    near = roads[shapely.distance(shapes[roads], shapely.Point(point)) < _AT_M]
+    for index in near.tolist():
+        if shapes[index].geom_type != "LineString":
+            continue
+        at = shapely.get_coordinates(shapes[index])
+        vertex = int(np.argmin(np.hypot(*(at - point).T)))
+        for step in (-1, 1):
+            if 0 <= vertex + step < len(at) and np.hypot(*(at[vertex] - point)) < _AT_M:
+                away = at[vertex + step] - at[vertex]
+                found.append(
+                    _Arm(index=index, direction=away / max(float(np.hypot(*away)), 1e-9), vertex=vertex, step=step)
+                )
+    return found
+
+
+def _end_moved(
+    line: shapely.Geometry, point: NDArray[np.float64], arm: _Arm, shift: NDArray[np.float64]
+) -> shapely.Geometry:
+    """Move where an arm begins; a road that passed through the junction is in two parts then."""
+    at = shapely.get_coordinates(line)
+    moved = (point + shift).round(_DECIMALS)
+    if arm.step == 1:
+        parts = [at[: arm.vertex + 1], np.vstack((moved, at[arm.vertex + 1 :]))]
+    else:
+        parts = [np.vstack((at[: arm.vertex], moved)), at[arm.vertex :]]
+    lines = [shapely.LineString(part) for part in parts if len(part) > 1]
+    return lines[0] if len(lines) == 1 else shapely.multilinestrings(lines)
 
 
 def level_crossings(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:

@@ -38,7 +38,7 @@ def _grid(sketch: Sketch) -> None:
         is_avenue = number % 4 == 1
         tags = {"highway": "primary", "lanes": "4"} if is_avenue else {"highway": "residential"}
         if is_avenue:
-            _bridged(sketch, np.array([(x, -half), (x, half)]), along_m=rail_y + half, span_m=24.0, **tags)
+            _bridged(sketch, np.array([(x, -half), (x, half)]), [(rail_y + half, 24.0)], **tags)
         else:
             sketch.street([(x, -half), (x, rail_y - 14)], **tags)
             sketch.street([(x, rail_y + 14), (x, half)], **tags)
@@ -270,13 +270,16 @@ def _industrial(sketch: Sketch) -> None:
             service="siding",
         )
     sketch.keep_free(shapely.linestrings(rail).buffer(34))
+    through = shapely.linestrings([(-half, -0.42 * half), (half, -0.42 * half + 10)])
     for number, x in enumerate(np.linspace(-0.85, 0.85, 6) * half):
         line = np.array([(x, -half), (x + 20, half)])
         if number % 2 == 0:
-            along = float(
-                shapely.linestrings(line).project(shapely.linestrings(line).intersection(shapely.linestrings(canal)))
-            )
-            _bridged(sketch, line, along_m=along, span_m=36.0, highway="secondary", lanes="2")
+            path = shapely.linestrings(line)
+            over_canal = float(path.project(path.intersection(shapely.linestrings(canal))))
+            over_road = float(path.project(path.intersection(through)))
+            # The last one meets the road through the estate at grade, the others pass over it.
+            spans = [(over_road, 28.0)] if number < 4 else []
+            _bridged(sketch, line, [*spans, (over_canal, 36.0)], highway="secondary", lanes="2")
         else:
             sketch.street([(x, -half), (x + 16, 0.62 * half)], highway="service", width="6")
     for y in (-0.75, -0.42, 0.32, 0.58):
@@ -330,7 +333,7 @@ def _riverside(sketch: Sketch) -> None:
         middle = float(shapely.linestrings(line).project(across.centroid))
         tags = {"highway": "primary" if number == 4 else "residential"}
         if number in (1, 4, 7):
-            _bridged(sketch, line, along_m=middle, span_m=across.length + 16.0, **tags)
+            _bridged(sketch, line, [(middle, across.length + 16.0)], **tags)
         else:
             gap = across.length + 0.13 * half
             before, _, after = split_at(line, middle - gap / 2, middle + gap / 2)
@@ -446,12 +449,15 @@ def _railway(sketch: Sketch, points: list[tuple[float, float]], *, tunnel_from_m
     sketch.line(rest, railway="rail", gauge="1435")
 
 
-def _bridged(sketch: Sketch, line: Line, *, along_m: float, span_m: float, **tags: str) -> None:
-    """A street with a bridge in it."""
-    before, bridge, after = split_at(line, along_m - span_m / 2, along_m + span_m / 2)
-    sketch.street(before, **tags)
-    sketch.street(bridge, bridge="yes", layer="1", **tags)
-    sketch.street(after, **tags)
+def _bridged(sketch: Sketch, line: Line, spans: list[tuple[float, float]], **tags: str) -> None:
+    """A street with bridges in it, each by its middle along the line and its length, metres, in this order."""
+    rest, passed_m = line, 0.0
+    for along_m, span_m in spans:
+        before, bridge, rest = split_at(rest, along_m - passed_m - span_m / 2, along_m - passed_m + span_m / 2)
+        passed_m = along_m + span_m / 2
+        sketch.street(before, **tags)
+        sketch.street(bridge, bridge="yes", layer="1", **tags)
+    sketch.street(rest, **tags)
 
 
 _DRAWINGS: Final[dict[Morphology, Callable[[Sketch], None]]] = {

@@ -8,6 +8,8 @@ from textwrap import wrap
 from typing import Final
 
 import numpy as np
+import shapely
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -24,6 +26,7 @@ HIDDEN: Final = "#9e9e9e"
 ONLY_SEEN: Final = "#c2185b"
 ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
+_COLUMNS: Final = ("view", "map at the true place", "view against map", "hardest decoy")
 _CELL_INCHES: Final = 2.1
 _DPI: Final = 100
 
@@ -75,7 +78,8 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
     panels : sequence of Panel
         Its rows.
     """
-    columns = ("view", "map at the true place", "view against map", "likest decoy")
+    has_vectors = any(panel.query.vectors is not None for panel in panels)
+    columns = (*_COLUMNS, "perceived vectors") if has_vectors else _COLUMNS
     width, height = 2.6 + _CELL_INCHES * len(columns), 1.0 + (_CELL_INCHES + 0.1) * len(panels)
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
@@ -86,17 +90,19 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
         bottom = height - 0.95 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
         text = "\n".join(line for part in _words(panel) for line in wrap(part, 30))
         figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=7.5)
-        pictures = _pictures(panel)
+        pictures = (*_pictures(panel), None)[: len(columns)]
         for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):
             left = 2.5 + _CELL_INCHES * place
             box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
             chart = figure.add_axes(box)
             chart.set_xticks([])
             chart.set_yticks([])
-            if picture is None:
-                chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=9, transform=chart.transAxes)
-            else:
+            if picture is not None:
                 chart.imshow(picture, interpolation="nearest")
+            elif name == "perceived vectors" and panel.query.vectors is not None:
+                _draw_vectors(chart, panel.query)
+            else:
+                chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=9, transform=chart.transAxes)
             if at == 0:
                 chart.set_title(name, fontsize=9, pad=3)
     figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
@@ -111,6 +117,23 @@ def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:
         None if mapped is None else paint_difference(seen, mapped),
         None if decoy is None else paint(decoy),
     )
+
+
+def _draw_vectors(chart: Axes, query: Query) -> None:
+    """Lines and outlines in the colours of their classes; what passes over something is dashed."""
+    colours = {item.name: item.colour for item in load_taxonomy().classes}
+    vectors = query.vectors
+    if vectors is None:
+        return
+    for name, is_bridge, shape in zip(vectors["class"], vectors["is_bridge"], vectors.geometry, strict=True):
+        for line in shapely.get_parts(shapely.boundary(shape) if shapely.get_dimensions(shape) > 1 else shape):
+            at = shapely.get_coordinates(line)
+            chart.plot(at[:, 0], at[:, 1], color=colours[name], linewidth=1.0, linestyle=":" if is_bridge else "-")
+    rows, cols = query.evidence.shape
+    half_m = query.evidence.cell_size_m / 2
+    chart.set_xlim(-cols * half_m, cols * half_m)
+    chart.set_ylim(-rows * half_m, rows * half_m)
+    chart.set_aspect("equal")
 
 
 def _words(panel: Panel) -> tuple[str, ...]:

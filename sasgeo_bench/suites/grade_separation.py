@@ -12,7 +12,7 @@ from sasgeo_bench.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of
 from sasgeo_bench.twin import Change, level_crossings
 
 
-def _overpasses(scene: Scene) -> NDArray[np.float64] | None:
+def _overpasses(scene: Scene) -> NDArray[np.float64]:
     """Places where two roads cross without meeting."""
     nodes = nodes_of(scene, ["crossing"])
     is_road = nodes["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
@@ -28,7 +28,7 @@ class GradeSeparation(TwinSuite):
     """As every twin suite; the bridge layer is unknown in every view, so that only the vectors tell."""
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """Hide the bridge layer; controls and falsifiers have no vectors."""
+        """Hide the bridge layer."""
         draft = super().draw(scene, site, variant, seeds)
         return Draft(evidence=without(draft.evidence, "bridge"), vectors=draft.vectors)
 
@@ -47,7 +47,7 @@ SUITE: Final = GradeSeparation(
         title="Grade separation (G4)",
         what="A twin in which bridges lie on the ground, so that roads which pass over each other meet.",
         separates="Crossings without connection in the perceived vectors from rasters, in which both look alike.",
-        falsifier="With the bridge observation withheld (the control and falsifier) nothing separates the two.",
+        falsifier="Bridges withheld: the vectors of both places show a level junction, and nothing separates them.",
         strength_unit="1 with perceived vectors",
         tracks=("retrieval", "localization"),
         group=TWIN_GROUP,
@@ -61,4 +61,5 @@ SUITE: Final = GradeSeparation(
     change_of=_change,
     find=_overpasses,
     needs="no bridge that carries one road over another",
+    falsifier_sees_change=True,
 )

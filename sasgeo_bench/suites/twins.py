@@ -2,7 +2,7 @@
 """What the twin suites share: copies of a site elsewhere on the map, changed or not, and queries that must choose."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import geopandas as gpd
@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant, perceived
 from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
@@ -45,6 +46,9 @@ class TwinSuite(Suite):
         Twins of a site.
     is_swapped : bool
         Whether every second site is changed in place.
+    falsifier_sees_change : bool
+        Of which of the two places the falsifier's vectors are, at every site: of the changed one, or of the plain one.
+        So they tell nothing about which of the two is seen.
     """
 
     change_of: ChangeOf | None
@@ -52,6 +56,7 @@ class TwinSuite(Suite):
     needs: str
     copies: int = 1
     is_swapped: bool = True
+    falsifier_sees_change: bool = False
 
     def lack(self, scene: Scene) -> str | None:
         """Places of the right kind are needed."""
@@ -87,16 +92,26 @@ class TwinSuite(Suite):
         return Edit(map_pastes=tuple(pastes), world_pastes=None, twins=targets)
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """See the true place; vectors as well, unless the variant is the control that has none."""
+        """See the true place; the control has no vectors, the falsifier's do not tell the two places apart."""
         seen = perceived(scene.world, site, variant, seeds)
+        if variant.role == "control":
+            return Draft(evidence=seen)
         vectors = perceive_vectors(
             scene.world,
-            site.pose,
+            site.pose if variant.role == "stress" else self._told_nothing(scene, site),
             side_m=variant.side_m,
             noise=VectorNoise(),
             rng=seeds.rng("vectors", variant.view_cells),
         )
-        return Draft(evidence=seen, vectors=vectors if variant.role == "stress" else None)
+        return Draft(evidence=seen, vectors=vectors)
+
+    def _told_nothing(self, scene: Scene, site: Site) -> Pose:
+        """The site where it is the place that the falsifier's vectors are of, else its twin."""
+        is_changed = self.is_swapped and site.index % 2 == 1
+        if is_changed == self.falsifier_sees_change:
+            return site.pose
+        easting_m, northing_m = scene.twins[site.index][0]
+        return replace(site.pose, easting_m=easting_m, northing_m=northing_m)
 
 
 def _key(site: Site) -> tuple[int, int]:

@@ -226,8 +226,12 @@ def observe(
     [0, 0, 1, 0, 0]
     """
     shape = (size_cells, size_cells)
-    cells = grid.to_cells(pose.to_map(cell_offsets_m(shape, cell_size_m)))
-    bits = _sample(layers.bits, cells, _NOT_KNOWN).reshape(shape)
+    # A pose is an affine map, so three points give it, and each of a view's cells is a sum of two numbers.
+    middle, right, up = grid.to_uv(pose.to_map(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
+    steps_m = (np.arange(size_cells) + 0.5 - size_cells / 2) * cell_size_m
+    across, along = np.outer(right - middle, steps_m), middle[:, None] + np.outer(up - middle, -steps_m)
+    cols, rows = np.floor(along[:, :, None] + across[:, None, :]).astype(np.int64)
+    bits = _sample(layers.bits, rows, cols, _NOT_KNOWN)
     seen = np.empty((layers.count, *shape), dtype=np.uint8)
     for index, layer in enumerate(seen):
         np.bitwise_and(bits >> np.uint32(index), 1, out=layer, casting="unsafe")
@@ -264,8 +268,8 @@ def to_map(evidence: Evidence, pose: Pose, grid: Grid) -> NDArray[np.uint8]:
     rows, cols = np.indices(grid.shape)
     centres = grid.to_centres_m(np.column_stack((rows.ravel(), cols.ravel())))
     offsets = inverse(pose).to_map(centres)
-    cells = _view_grid(evidence.shape, evidence.cell_size_m).to_cells(offsets)
-    laid = np.stack([_sample(layer, cells, np.uint8(UNKNOWN)) for layer in evidence.cells])
+    at_row, at_col = _view_grid(evidence.shape, evidence.cell_size_m).to_cells(offsets).T
+    laid = np.stack([_sample(layer, at_row, at_col, np.uint8(UNKNOWN)) for layer in evidence.cells])
     return laid.reshape(-1, *grid.shape)
 
 
@@ -302,11 +306,11 @@ def _view_grid(shape: tuple[int, int], cell_size_m: float) -> Grid:
     return Grid(epsg=0, west_m=west_m, north_m=north_m, cell_size_m=cell_size_m, rows=rows, cols=cols)
 
 
-def _sample(source: NDArray[Value], cells: NDArray[np.int64], beyond: Value) -> NDArray[Value]:
-    """Values of a raster at (row, col) cells, shape (N, 2); `beyond` outside of it."""
-    rows, cols = cells[:, 0], cells[:, 1]
-    within = (rows >= 0) & (rows < source.shape[0]) & (cols >= 0) & (cols < source.shape[1])
-    if within.all():
-        return np.asarray(source.ravel()[rows * source.shape[1] + cols])
-    found = source.ravel()[np.where(within, rows * source.shape[1] + cols, 0)]
-    return np.where(within, found, beyond)
+def _sample(source: NDArray[Value], rows: NDArray[np.int64], cols: NDArray[np.int64], beyond: Value) -> NDArray[Value]:
+    """Values of a raster at cells of any shape; `beyond` outside of it."""
+    height, width = source.shape
+    at = rows * width + cols
+    if rows.min() >= 0 and rows.max() < height and cols.min() >= 0 and cols.max() < width:
+        return np.asarray(source.ravel()[at])
+    within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+    return np.where(within, source.ravel()[np.where(within, at, 0)], beyond)

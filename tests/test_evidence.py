@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -86,6 +86,8 @@ def test_what_a_view_shows_lies_on_the_map_where_the_pose_puts_it(u, v, yaw_deg,
     pose = at(u, v, yaw_deg, scale)
     seen = observe(LayerBits.of(layers), GRID, pose, size_cells=41, cell_size_m=1.0)
     point = pose.to_map(cell_offsets_m((41, 41), 1.0)[[row * 41 + col]])
+    from_edge = np.abs(GRID.to_uv(point) - np.rint(GRID.to_uv(point)))
+    assume(from_edge.min() > 1e-6)  # on an edge the last digit decides which cell it is
     map_row, map_col = GRID.to_cells(point)[0]
     assert (seen[:, row, col] == layers[:, map_row, map_col]).all()
 

@@ -65,8 +65,8 @@ class State:
 
     def has(self, class_name: str) -> NDArray[np.bool_]:
         """Where one class is present, shape (rows, cols)."""
-        index = np.uint32(self.classes.index(class_name))
-        return np.asarray((self.bits.bits >> index & np.uint32(1)).astype(bool) & self.known)
+        bit, unknown = 1 << self.classes.index(class_name), 1 << 31
+        return np.asarray(self.bits.bits & np.uint32(bit | unknown) == np.uint32(bit))
 
     @cached_property
     def drawn(self) -> NDArray[np.bool_]:

@@ -24,8 +24,8 @@ class CleanSuite(PlainSuite):
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """See the world with as much error as the variant says; controls and falsifiers without any."""
-        seen = perceived(scene.world, site, variant, seeds, error_factor=variant.strength)
-        perfect = perceived(scene.world, site, variant, seeds, error_factor=0.0)
+        perfect = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+        seen = perceived(scene.world, site, variant, seeds, error_factor=variant.strength, clean=perfect)
         changed = float((seen.cells != perfect.cells).mean())
         return Draft(evidence=seen, measured={"cells_changed": changed})
 

@@ -81,8 +81,8 @@ def describe(state: State, *, side_m: float) -> Windows:
     cells = np.column_stack((rows[mapped], cols[mapped])).astype(np.int64)
     rings = np.stack(
         [
-            _filtered(_mean_blocks(state.has(name), factor), kernel)[cells[:, 0], cells[:, 1]]
-            for name in state.classes
+            _filtered(share, kernel)[cells[:, 0], cells[:, 1]]
+            for share in (_mean_blocks(state.has(name), factor) for name in state.classes)
             for kernel in kernels
         ],
         axis=1,
@@ -248,23 +248,37 @@ def _in_turn(
     order: list[NDArray[np.int64]], points_m: NDArray[np.float64], *, spacing_m: float, count: int
 ) -> Iterator[tuple[int, str]]:
     """First of the first scorer, first of the second, ..., second of the first; none near one taken before."""
-    is_free = np.ones(len(points_m), dtype=bool)
-    taken = 0
-    at = [0] * len(order)
+    places = np.rint((points_m - points_m.min(axis=0)) / STRIDE_M).astype(np.int64)
+    reach = int(np.ceil(spacing_m / STRIDE_M))
+    aside = np.arange(-reach, reach + 1) * STRIDE_M
+    disc = np.hypot(aside[:, None], aside[None, :]) < spacing_m
+    # One cell for each place of the lattice, and a rim as wide as the disc, so that it need not be cut.
+    is_taken = np.zeros(places.max(axis=0) + 1 + 2 * reach, dtype=bool)
+    flat = np.ravel_multi_index(tuple((places + reach).T), is_taken.shape)
+    taken, at = 0, [0] * len(order)
     while taken < count and any(at[scorer] < len(ranked) for scorer, ranked in enumerate(order)):
         for scorer, ranked in enumerate(order):
-            left = is_free[ranked[at[scorer] :]]
-            step = int(np.argmax(left)) if left.any() else -1
-            if step < 0:
-                at[scorer] = len(ranked)
+            at[scorer] = _next_free(ranked, at[scorer], is_taken.ravel(), flat)
+            if at[scorer] == len(ranked):
                 continue
-            index = int(ranked[at[scorer] + step])
-            at[scorer] += step + 1
-            taken += 1
+            index = int(ranked[at[scorer]])
             yield index, SCORERS[scorer]
-            is_free &= np.hypot(*(points_m - points_m[index]).T) >= spacing_m
+            x, y = places[index]
+            is_taken[x : x + len(disc), y : y + len(disc)] |= disc
+            taken += 1
             if taken == count:
                 return
+
+
+def _next_free(ranked: NDArray[np.int64], start: int, is_taken: NDArray[np.bool_], flat: NDArray[np.int64]) -> int:
+    """Position of the first free place from `start` on; looks at ever longer parts of the ranking."""
+    length = 64
+    while start < len(ranked):
+        free = np.flatnonzero(~is_taken[flat[ranked[start : start + length]]])
+        if len(free):
+            return start + int(free[0])
+        start, length = start + length, 2 * length
+    return len(ranked)
 
 
 def candidates(

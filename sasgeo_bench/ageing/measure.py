@@ -169,8 +169,9 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
     """
     kinds: dict[str, Kind] = {item.name: item.kind for item in load_taxonomy().classes}
     stocks = [_stocks(state, history.area, kinds) for state in history.states]
-    pairs = [*pairwise(range(len(history.states))), (0, len(history.states) - 1)]
-    changes = [_changes(history.states, stocks, pair, kinds) for pair in pairs]
+    changes = [_changes(history.states, stocks, pair, kinds) for pair in pairwise(range(len(history.states)))]
+    ends = (0, len(history.states) - 1)
+    changes.append(changes[0] if ends == (0, 1) else _changes(history.states, stocks, ends, kinds))
     rows: list[dict[str, object]] = []
     for name in kinds:
         of_class = [change[name] for change in changes]

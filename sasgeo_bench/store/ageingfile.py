@@ -2,6 +2,7 @@
 """`ageing.parquet`, `ageing.md`, `ageing.svg`: what was measured of one place, and a table of several places."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
@@ -10,7 +11,7 @@ import pandas as pd
 
 from sasgeo_bench.ageing.measure import DTYPES, Ageing
 from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.ageingplot import draw_ageing
 
@@ -133,11 +134,20 @@ def ageing_text(ageing: Ageing) -> str:
 def summary_text(places: Sequence[Ageing]) -> str:
     """Markdown of several places: the rates of each class beside each other.
 
+    Raises
+    ------
+    ConfigError
+        If two places have one name.
+
     Examples
     --------
     >>> summary_text([]).splitlines()[0]
     '# How maps aged'
     """
+    twice = [name for name, count in Counter(place.place for place in places).items() if count > 1]
+    if twice:
+        message = f"two tables are of {twice[0]!r}: measure one of them with another --place"
+        raise ConfigError(message)
     parts = ["# How maps aged", _READING, _grid(_PLACE_HEAD, [_place_cells(place) for place in places])]
     tables = [place.table.assign(place=place.place) for place in places]
     together = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(DTYPES))
@@ -153,6 +163,8 @@ def write_summary(path: Path, places: Sequence[Ageing]) -> Path:
     ------
     StoreError
         If the file cannot be written.
+    ConfigError
+        If two places have one name.
     """
     text = summary_text(places)
     return _replace(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))

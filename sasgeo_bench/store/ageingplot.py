@@ -22,6 +22,7 @@ _TICKS: Final = (0.01, 0.1, 1.0, 10.0, 100.0)
 _POOLED: Final = "#000000"
 _WHOLE: Final = "#d55e00"
 _BY_ID: Final = "#0072b2"
+_LATE: Final = 0.8  # of viridis: beyond, its yellow is too pale on white
 _ROW_INCHES: Final = 0.42
 _WIDTH_INCHES: Final = 12.0
 _FRAME_INCHES: Final = 2.75
@@ -53,7 +54,7 @@ def draw_ageing(path: Path, ageing: Ageing) -> None:
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 3, sharey=True, width_ratios=[1, 1, 0.8])
         low, high = 1.3 / height, 1 - _TOP_INCHES / height
-        figure.subplots_adjust(left=0.16, right=0.985, bottom=low, top=high, wspace=0.06)
+        figure.subplots_adjust(left=0.16, right=0.985, bottom=low, top=high, wspace=0.1)
         _draw_rates(panels[0], ageing.table, names, "vanish_per_year", "vanishes: %/year of the older map")
         _draw_rates(panels[1], ageing.table, names, "appear_per_year", "appears: %/year of the newer map")
         _draw_shares(panels[2], ageing.table, names)
@@ -66,7 +67,7 @@ def draw_ageing(path: Path, ageing: Ageing) -> None:
 def _draw_rates(chart: Axes, table: pd.DataFrame, names: list[str], column: str, title: str) -> None:
     rows = {name: number for number, name in enumerate(names)}
     chart.set_xscale("log")
-    chart.set_xlim(_RANGE[0] * 0.75, _RANGE[1])
+    chart.set_xlim(_RANGE[0] * 0.75, _RANGE[1] * 1.3)
     middles = (table["date_from"] + (table["date_to"] - table["date_from"]) / 2).astype("int64").to_numpy()
     age = (middles - middles.min()) / max(np.ptp(middles), 1)
     shade = mpl.colormaps["viridis"]
@@ -78,7 +79,7 @@ def _draw_rates(chart: Axes, table: pd.DataFrame, names: list[str], column: str,
         if np.isnan(value):
             continue
         if span == "interval":
-            colour = shade(0.95 * age[number])
+            colour = shade(_LATE * age[number])
             chart.plot(_within(value), at + 0.22, marker="o", color=colour, ms=4, ls="", mec="none", clip_on=False)
         elif span == "whole":
             chart.plot(_within(value), at, marker="D", color="none", mec=_WHOLE, ms=7, ls="", mew=1.4, zorder=4)
@@ -109,7 +110,7 @@ def _draw_shares(chart: Axes, table: pd.DataFrame, names: list[str]) -> None:
         chart.plot(by_id, at, marker="s", color=_BY_ID, ms=6, ls="", zorder=3)
         chart.plot(by_place, at, marker="D", color="white", mec=_WHOLE, ms=7, ls="", mew=1.4, zorder=2)
     chart.set_xlim(-3, 103)
-    _dress(chart, "gone, first map to last: %", len(names))
+    _dress(chart, "gone from first map to last: %", len(names))
 
 
 def _dress(chart: Axes, title: str, rows: int) -> None:
@@ -134,11 +135,19 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
     marks = [
         Line2D([], [], color=_POOLED, marker="o", ms=5, lw=1.6, label="rate over all intervals, 95 %"),
         Line2D([], [], color=mpl.colormaps["viridis"](0.0), ms=4, label="one interval, early", **common),
-        Line2D([], [], color=mpl.colormaps["viridis"](0.95), ms=4, label="one interval, late", **common),
+        Line2D([], [], color=mpl.colormaps["viridis"](_LATE), ms=4, label="one interval, late", **common),
         Line2D(
-            [], [], color="white", mec=_WHOLE, marker="D", ms=7, mew=1.4, ls="", label="first map to last, by place"
+            [],
+            [],
+            color="white",
+            mec=_WHOLE,
+            marker="D",
+            ms=7,
+            mew=1.4,
+            ls="",
+            label="first map to last, by place (% of amount)",
         ),
-        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="first map to last, by id"),
+        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="by id (% of things)"),
     ]
     figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=5, frameon=False)
     note = "What appears may be mapping that catches up. Rates have a log scale; those below 0.01 lie on its left edge."

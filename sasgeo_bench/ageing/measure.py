@@ -377,8 +377,8 @@ def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, F
     """Lost and whole amount of the older state, then of the newer; each of shape (blocks, intervals)."""
     verdicts = [(change.old, change.new) for change in changes]
     cells = [_cells(verdict.xy_m) for pair in verdicts for verdict in pair]
-    blocks, number = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
-    parts = np.split(number.ravel(), np.cumsum([len(cell) for cell in cells])[:-1])
+    blocks, number = np.unique(np.concatenate(cells), return_inverse=True)
+    parts = np.split(number, np.cumsum([len(cell) for cell in cells])[:-1])
     tables = np.zeros((4, len(blocks), len(changes)))
     for column, pair in enumerate(verdicts):
         for side, verdict in enumerate(pair):
@@ -389,7 +389,9 @@ def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, F
 
 
 def _cells(xy_m: Floats) -> Ints:
-    return np.floor(xy_m / BLOCK_M).astype(np.int64).reshape(-1, 2)
+    """One number for the block around each point."""
+    cells = np.floor(xy_m / BLOCK_M).astype(np.int64).reshape(-1, 2)
+    return np.asarray(cells[:, 0] * 2**32 + cells[:, 1])
 
 
 def _moved(verdict: Verdict) -> tuple[Floats, Floats]:

@@ -22,7 +22,7 @@ from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.extract.lifecycle import Lifecycle, read_lifecycle
 from sasgeo_bench.extract.read import Reading, project, read_extract
 from sasgeo_bench.extract.scan import Box
-from sasgeo_bench.extract.snapshot import is_history, open_snapshot
+from sasgeo_bench.extract.snapshot import is_history, open_snapshot, read_header
 from sasgeo_bench.grid import Grid, utm_epsg
 
 CELL_M: Final = 10.0  # of the grid that frames the reading; nothing is burnt into it
@@ -120,15 +120,16 @@ def _checked(dated: Sequence[DatedExtract]) -> tuple[DatedExtract, ...]:
 
 
 def _own_date(path: Path) -> dt.date:
+    header = read_header(path)
+    if header.replicated_at is not None:
+        return header.replicated_at.date()
+    named: list[str] = _NAMED_DATE.findall(path.name)
+    for text in reversed(named):
+        try:
+            return dt.date.fromisoformat(text)
+        except ValueError:
+            continue
     with open_snapshot(path) as snapshot:
-        if snapshot.replicated_at is not None:
-            return snapshot.replicated_at.date()
-        named: list[str] = _NAMED_DATE.findall(path.name)
-        for text in reversed(named):
-            try:
-                return dt.date.fromisoformat(text)
-            except ValueError:
-                continue
         elements: Iterable[Any] = osmium.FileProcessor(str(snapshot.path))
         newest = max((item.timestamp for item in elements), default=None)
     if newest is None or newest.year <= 1970:  # noqa: PLR2004 - what osmium says where a file carries no times
@@ -212,9 +213,10 @@ def _one_state(item: DatedExtract) -> Iterator[Path]:
 
 def _frame(path: Path) -> Box:
     """The box of a file's header, else of its nodes, degrees; what is mapped lies within."""
+    box = read_header(path).box_lonlat
+    if box is not None:
+        return box
     with open_snapshot(path, at=dt.date.max if is_history(path) else None) as snapshot:
-        if snapshot.box_lonlat is not None:
-            return snapshot.box_lonlat
         nodes: Iterable[Any] = osmium.FileProcessor(str(snapshot.path), osmium.osm.NODE)
         places = np.array([(node.lon, node.lat) for node in nodes if node.location.valid()]).reshape(-1, 2)
     if len(places) == 0:

@@ -272,7 +272,7 @@ def test_start_dates_that_say_nothing_are_left_out(text):
 @pytest.mark.real
 def test_the_redraw_of_2021_in_liechtenstein_changed_ids_but_hardly_any_house(real_extracts):
     paths = [real_extracts / f"liechtenstein-{day}.osm.pbf" for day in ("2021-05-05", "2021-10-28")]
-    row = found(read_history(date_extracts(paths), bounds=(9.49, 47.12, 9.54, 47.18)))
+    row = found(read_history(date_extracts(paths), bounds=(9.47, 47.20, 9.60, 47.27)))
     assert row["n_from"] > 1000
     assert row["id_vanished_share"] > 0.2
     assert row["vanished_share"] < 0.05

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ageing.parquet`, `ageing.md`, `ageing.svg`: what was measured of one place, and a table of several places."""
 
+import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ area that grew has moved too). Ground lost and gained is what the class no longe
 an exponential life whose end is known only to lie between two dates, with 95 % intervals from 1,000 draws of blocks of
 1 km. Of what vanished or appeared, some is retagged (another class of its kind gave or took its place), some tags tell
 to be the world's change (construction, demolished, a start date after the older map) or the map's catching up (a start
-date before); the rest cannot be told. A dash: nothing to measure."""
+date before); the rest cannot be told. A dash: nothing to measure; "all": no bound."""
 
 
 def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
@@ -252,8 +253,13 @@ def _rate(row: pd.Series, name: str) -> str:
     value, lo, hi = (100 * row[f"{name}{end}"] for end in ("", "_lo", "_hi"))
     if pd.isna(value):
         return "-"
-    known = "" if pd.isna(lo) else f" ({lo:.2f} to {hi:.2f})"
-    return f"{value:.2f}{known}"
+    known = "" if pd.isna(lo) or math.isinf(lo) else f" ({lo:.2f} to {_bounded(hi)})"
+    return f"{_bounded(value)}{known}"
+
+
+def _bounded(percent: float) -> str:
+    """A rate whose likelihood grows without end belongs to a class of which nothing stayed."""
+    return "all" if math.isinf(percent) else f"{percent:.2f}"
 
 
 def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

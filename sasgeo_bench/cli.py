@@ -16,7 +16,7 @@ from sasgeo_bench.ageing.measure import measure_ageing
 from sasgeo_bench.build import BuildPlan, build_region, plan_build
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import ConfigError, SasgeoError
-from sasgeo_bench.extract.history import date_extracts, read_history
+from sasgeo_bench.extract.history import MARGIN_M, date_extracts, read_history
 from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
@@ -103,12 +103,15 @@ def measure_ageing_command(
     ] = None,
     place: Annotated[str | None, typer.Option(help="name of the place; default: how the first file begins")] = None,
     bounds: Annotated[str | None, typer.Option(metavar="W,S,E,N", help="degrees; default: what all map")] = None,
+    margin_m: Annotated[
+        float, typer.Option(min=0, help="cut off along the edges of extracts where those are estimated, metres")
+    ] = MARGIN_M,
     out: Out = Path("out"),
 ) -> None:
     """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg."""
     box = _box(bounds)
     dated = date_extracts(extract, at=[_day(text, flag="--at") for text in at or ()])
-    history = read_history(dated, bounds=box, tell=_tell)
+    history = read_history(dated, bounds=box, margin_m=margin_m, tell=_tell)
     name = place or extract[0].name.split(".")[0].split("-")[0]
     for path in write_ageing(out, measure_ageing(history, place=name)):
         typer.echo(path)

@@ -19,12 +19,14 @@ import pyproj
 import shapely
 
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
+from sasgeo_bench.extract.coverage import CLOSE_M
 from sasgeo_bench.extract.lifecycle import Lifecycle, read_lifecycle
 from sasgeo_bench.extract.read import Reading, project, read_extract
 from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.extract.snapshot import is_history, open_snapshot, read_header
 from sasgeo_bench.grid import Grid, utm_epsg
 
+MARGIN_M: Final = CLOSE_M / 2  # so far does an estimated coverage reach beyond the edge that an extract was cut along
 CELL_M: Final = 10.0  # of the grid that frames the reading; nothing is burnt into it
 _EDGE_DEG: Final = 0.01  # a box's straight sides in degrees bend when projected: a corner at least so often
 _LEAST_STATES: Final = 2
@@ -139,7 +141,11 @@ def _own_date(path: Path) -> dt.date:
 
 
 def read_history(
-    dated: Sequence[DatedExtract], *, bounds: Box | None = None, tell: Callable[[str], None] = _SILENT
+    dated: Sequence[DatedExtract],
+    *,
+    bounds: Box | None = None,
+    margin_m: float = MARGIN_M,
+    tell: Callable[[str], None] = _SILENT,
 ) -> History:
     """Read dated extracts over the area that all of them map.
 
@@ -149,6 +155,10 @@ def read_history(
         From `date_extracts`.
     bounds : tuple of float, optional
         West, south, east, north, degrees: no more than this.
+    margin_m : float
+        Cut off along the edges of coverages that are estimated: two extracts of a country are seldom cut along one
+        line, and what lies between their lines would vanish or appear in a day. States of one file have one edge, so
+        nothing is cut off there.
     tell : callable, optional
         Takes a line about each extract.
 
@@ -176,6 +186,7 @@ def read_history(
     west, south, east, north = frame
     epsg = utm_epsg((west + east) / 2, (south + north) / 2)
     grid = _grid_around(frame, epsg)
+    is_one_file = len(boxes) == 1
     states: list[State] = []
     area = _projected_box(frame, epsg)
     for item in dated:
@@ -183,13 +194,24 @@ def read_history(
             reading = read_extract(plain, grid)
             with open_snapshot(plain) as snapshot:
                 lifecycle = read_lifecycle(snapshot.path, epsg=epsg)
-        area = shapely.intersection(area, reading.coverage)
+        area = shapely.intersection(area, _inner(reading, grid, margin_m=0.0 if is_one_file else margin_m))
         states.append(State(source=item.path.name, on=item.on, features=reading.features, lifecycle=lifecycle))
         tell(_line(item, reading))
     if shapely.area(area) <= 0:
-        message = "the extracts map no area in common: choose extracts of one place, or other --bounds"
+        message = (
+            f"the extracts map no area in common that lies {margin_m:g} m within their estimated edges: "
+            "choose extracts of one place, other --bounds, or a smaller --margin-m"
+        )
         raise CoverageError(message)
     return History(states=tuple(states), area=area, epsg=epsg)
+
+
+def _inner(reading: Reading, grid: Grid, *, margin_m: float) -> shapely.Geometry:
+    """The coverage less a margin along its own edges, if they are estimated; those of the grid are no edges of a map."""
+    if reading.coverage_source != "estimated" or margin_m <= 0:
+        return reading.coverage
+    beyond = shapely.difference(shapely.box(*grid.bounds_m), reading.coverage)
+    return shapely.difference(reading.coverage, shapely.buffer(beyond, margin_m))
 
 
 def _line(item: DatedExtract, reading: Reading) -> str:

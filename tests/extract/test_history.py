@@ -150,8 +150,25 @@ def test_a_file_without_a_header_box_is_framed_by_its_nodes(tmp_path):
     paths = [osm(tmp_path / f"a-{day}.osm", (1, {"building": "yes"}, square(4, 4, 2))) for day in DAYS]
     for path in paths:
         path.write_text(path.read_text().replace(BOX, ""))
-    history = read_history(date_extracts(paths))
+    with pytest.raises(CoverageError, match="300 m within their estimated edges"):
+        read_history(date_extracts(paths))
+    history = read_history(date_extracts(paths), margin_m=0.0)
     assert found(history)["vanished_share"] == 0.0
+
+
+def test_what_lies_near_an_estimated_edge_is_left_out_unless_all_states_are_of_one_file(tmp_path):
+    wide = [(50 + y, {"highway": "path"}, [(x, y) for x in range(31)]) for y in range(31)]
+    path = osm(tmp_path / "a-2014-01-01.osm", *wide)
+    path.write_text(path.read_text().replace(BOX, '<bounds minlat="46.9" minlon="8.9" maxlat="47.1" maxlon="9.1"/>'))
+    other = tmp_path / "b-2016-01-01.osm"
+    other.write_text(path.read_text())
+    areas = [
+        shapely.area(read_history(date_extracts([path, other]), margin_m=margin_m).area)
+        for margin_m in (0.0, 100.0, 300.0)
+    ]
+    side_m = np.sqrt(areas)
+    assert side_m[0] - side_m[1] == pytest.approx(200, rel=0.2)
+    assert side_m[0] - side_m[2] == pytest.approx(600, rel=0.2)
 
 
 # The embedded towns, whose lives the generator knows
@@ -173,7 +190,7 @@ def truth(day_from, day_to, kind):
 def test_what_is_measured_of_a_town_is_what_its_generator_made(kind, tmp_path):
     dated = [town(tmp_path, day, kind=kind) for day in DAYS]
     vanished, appeared = truth(DAYS[0], DAYS[-1], kind)
-    row = found(read_history(dated))
+    row = found(read_history(dated, margin_m=0.0))
     assert vanished > 0.01
     assert appeared > 0.1
     assert row["vanished_share"] == pytest.approx(vanished, abs=0.006)

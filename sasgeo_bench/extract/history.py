@@ -207,7 +207,7 @@ def read_history(
 
 
 def _inner(reading: Reading, grid: Grid, *, margin_m: float) -> shapely.Geometry:
-    """The coverage less a margin along its own edges, if they are estimated; those of the grid are no edges of a map."""
+    """The coverage less a margin along its own edges, if they are estimated; the grid's are no edges of a map."""
     if reading.coverage_source != "estimated" or margin_m <= 0:
         return reading.coverage
     beyond = shapely.difference(shapely.box(*grid.bounds_m), reading.coverage)

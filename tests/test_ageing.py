@@ -29,6 +29,7 @@ from sasgeo_bench.extract.history import History, State
 from sasgeo_bench.extract.lifecycle import Lifecycle, ObjectKey, Span, no_lifecycle
 from sasgeo_bench.features import DTYPES, make_features
 from sasgeo_bench.store.ageingfile import read_ageing, summary_text, write_ageing
+from sasgeo_bench.taxonomy import load_taxonomy
 
 OLD, NEW = dt.date(2015, 1, 1), dt.date(2020, 1, 1)
 AREA = shapely.box(-1000, -1000, 3000, 3000)
@@ -302,6 +303,13 @@ def test_pooled_rows_weigh_all_intervals_and_whole_rows_compare_the_ends():
     assert (row(table, "building", "pooled")["n_from"], row(table, "building", "pooled")["n_to"]) == (8, 2)
 
 
+def test_maps_a_day_apart_have_shares_but_no_yearly_rates():
+    houses = [(k, "building", house(100 * k)) for k in range(4)]
+    table = measured(state(OLD, houses), state(OLD + dt.timedelta(days=1), houses[:3]))
+    assert row(table, "building")["vanished_share"] == 0.25
+    assert table[[column for column in COLUMNS if "per_year" in column]].isna().all(axis=None)
+
+
 # Files
 
 
@@ -335,9 +343,21 @@ def test_the_summary_has_a_row_for_each_place_under_each_class(ageing):
     assert "(c) OpenStreetMap contributors, ODbL" in text
 
 
-def test_two_tables_of_one_place_are_refused(ageing):
+def test_the_summary_tells_of_the_hand_set_rates_and_of_controls_apart(ageing):
+    text = summary_text([ageing], [replace(ageing, place="Elsewhere")])
+    building = load_taxonomy()["building"].persistence
+    assert f"set by hand: vanishes {100 * building.vanish_per_year:.2f}, appears" in text
+    places, controls = text.split("## Controls")
+    assert places.count("| Elsewhere |") == 1
+    assert "| class | Elsewhere |" in controls
+    vanished, appeared = (100 * row(ageing.table, "building")[f"{what}_share"] for what in ("vanished", "appeared"))
+    assert f"| building | {vanished:.1f} %, {appeared:.1f} % |" in controls
+
+
+@pytest.mark.parametrize("others", ["places", "controls"])
+def test_two_tables_of_one_place_are_refused(ageing, others):
     with pytest.raises(ConfigError, match="two tables are of 'Toytown'"):
-        summary_text([ageing, ageing])
+        summary_text([ageing, ageing] if others == "places" else [ageing], [ageing] if others == "controls" else [])
 
 
 def test_a_file_that_is_no_table_of_ageing_is_told(tmp_path):

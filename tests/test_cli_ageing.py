@@ -46,7 +46,7 @@ def test_three_files_are_written_and_named(program, towns, tmp_path):
     assert out.split() == ["a/ageing.parquet", "a/ageing.md", "a/ageing.svg"]
     assert "suburb-2014-01-01.osm.pbf of 2014-01-01" in err
     text = (tmp_path / "a/ageing.md").read_text()
-    assert "How the map of suburb aged" in text
+    assert "suburb: how the map aged" in text
     assert str(tmp_path) not in text
 
 

@@ -40,6 +40,7 @@ from sasgeo_bench.taxonomy import Kind, load_taxonomy
 
 BLOCK_M: Final = 1000.0
 DAYS_PER_YEAR: Final = 365.25
+LEAST_DAYS: Final = 30  # a yearly rate out of a shorter time would be one day's accident times 365
 UNITS: Final[dict[Kind, str]] = {"area": "m2", "line": "m"}
 _DECIMALS: Final = 6
 _REASONS: Final = ("world", "catch_up", "retagged")
@@ -149,7 +150,8 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
     Notes
     -----
     Only what is visible from above counts, as in the layers: a stream put into a culvert has vanished, and is counted
-    as retagged. `vanished_share` is of the older amount, `appeared_share` of the newer.
+    as retagged. `vanished_share` is of the older amount, `appeared_share` of the newer. Dates less than `LEAST_DAYS`
+    apart get shares but no rates.
 
     Examples
     --------
@@ -336,18 +338,21 @@ def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> d
     years = np.array([change.years for change in changes])
     first, last = changes[0].date_from, changes[-1].date_to
     tables = _block_tables(changes)
-    vanish = bootstrap_rate(
-        *tables[:2],
-        years,
-        things=sum(change.n_from for change in changes),
-        rng=seeded_rng(place, name, span, first, last, "vanish"),
-    )
-    appear = bootstrap_rate(
-        *tables[2:],
-        years,
-        things=sum(change.n_to for change in changes),
-        rng=seeded_rng(place, name, span, first, last, "appear"),
-    )
+    if (last - first).days >= LEAST_DAYS:
+        vanish = bootstrap_rate(
+            *tables[:2],
+            years,
+            things=sum(change.n_from for change in changes),
+            rng=seeded_rng(place, name, span, first, last, "vanish"),
+        )
+        appear = bootstrap_rate(
+            *tables[2:],
+            years,
+            things=sum(change.n_to for change in changes),
+            rng=seeded_rng(place, name, span, first, last, "appear"),
+        )
+    else:
+        vanish = appear = Rate(per_year=np.nan, lo=np.nan, hi=np.nan)
     return {
         "span": span,
         "date_from": pd.Timestamp(first),

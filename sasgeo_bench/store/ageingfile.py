@@ -10,11 +10,12 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.ageing.measure import DTYPES, Ageing
+from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing
 from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.ageingplot import draw_ageing
+from sasgeo_bench.taxonomy import load_taxonomy
 
 TABLE: Final = "ageing.parquet"
 TEXT: Final = "ageing.md"
@@ -28,7 +29,12 @@ area that grew has moved too). Ground lost and gained is what the class no longe
 an exponential life whose end is known only to lie between two dates, with 95 % intervals from 1,000 draws of blocks of
 1 km. Of what vanished or appeared, some is retagged (another class of its kind gave or took its place), some tags tell
 to be the world's change (construction, demolished, a start date after the older map) or the map's catching up (a start
-date before); the rest cannot be told. A dash: nothing to measure; "all": no bound."""
+date before); the rest cannot be told. A dash: nothing to measure, or a rate of dates less than {LEAST_DAYS} days apart;
+"all": no bound."""
+
+_CONTROLS: Final = """\
+Pairs of maps so near in time that next to nothing can have changed: what is found here is not ageing but the floor of
+the method, mostly things that one extract was cut to hold and the other was not. Shares vanished, appeared."""
 
 
 def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
@@ -64,10 +70,17 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
         TEXT: lambda path: path.write_text(ageing_text(ageing), encoding="utf-8"),
         PLOT: lambda path: draw_ageing(path, ageing),
     }
-    return tuple(_replace(folder / name, write) for name, write in writers.items())
+    return tuple(replace_file(folder / name, write) for name, write in writers.items())
 
 
-def _replace(target: Path, write: Callable[[Path], object]) -> Path:
+def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
+    """Let a function write a scratch file beside the target, then put it in the target's place.
+
+    Raises
+    ------
+    StoreError
+        If the folder or the file cannot be written.
+    """
     scratch = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +133,7 @@ def ageing_text(ageing: Ageing) -> str:
     sources = "\n".join(f"- {source}" for source in ageing.sources)
     return "\n\n".join(
         (
-            f"# How the map of {ageing.place} aged",
+            f"# {ageing.place}: how the map aged",
             _READING,
             f"{ageing.area_km2:,.1f} km2 that all of these map:\n\n{sources}",
             "## Rates over all intervals",
@@ -132,8 +145,8 @@ def ageing_text(ageing: Ageing) -> str:
     )
 
 
-def summary_text(places: Sequence[Ageing]) -> str:
-    """Markdown of several places: the rates of each class beside each other.
+def summary_text(places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> str:
+    """Markdown of several places: the rates of each class beside each other, then what controls found.
 
     Raises
     ------
@@ -145,19 +158,64 @@ def summary_text(places: Sequence[Ageing]) -> str:
     >>> summary_text([]).splitlines()[0]
     '# How maps aged'
     """
+    check_names((*places, *controls))
+    rows = [_place_cells(place) for place in (*places, *controls)]
+    parts = ["# How maps aged", _READING, _grid(_PLACE_HEAD, rows)]
+    together = _together(places)
+    for name in _classes_of(together):
+        handset = load_taxonomy()[name].persistence
+        rates = (100 * handset.vanish_per_year, 100 * handset.appear_per_year)
+        note = f"The taxonomy has, set by hand: vanishes {rates[0]:.2f}, appears {rates[1]:.2f} %/year."
+        parts += [f"## {name}", note, _rate_table(together[together["class"] == name], by="place")]
+    if controls:
+        parts += ["## Controls", _CONTROLS, _control_table(controls)]
+    return "\n\n".join((*parts, f"{ATTRIBUTION}\n"))
+
+
+def check_names(places: Sequence[Ageing]) -> None:
+    """Refuse two tables of one place.
+
+    Raises
+    ------
+    ConfigError
+        If two places have one name.
+
+    Examples
+    --------
+    >>> check_names([])
+    """
     twice = [name for name, count in Counter(place.place for place in places).items() if count > 1]
     if twice:
         message = f"two tables are of {twice[0]!r}: measure one of them with another --place"
         raise ConfigError(message)
-    parts = ["# How maps aged", _READING, _grid(_PLACE_HEAD, [_place_cells(place) for place in places])]
+
+
+def _together(places: Sequence[Ageing]) -> pd.DataFrame:
     tables = [place.table.assign(place=place.place) for place in places]
-    together = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(DTYPES))
-    for name in dict.fromkeys(together["class"]):
-        parts += [f"## {name}", _rate_table(together[together["class"] == name], by="place")]
-    return "\n\n".join((*parts, f"{ATTRIBUTION}\n"))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(DTYPES))
 
 
-def write_summary(path: Path, places: Sequence[Ageing]) -> Path:
+def _classes_of(table: pd.DataFrame) -> list[str]:
+    """Names in a table, in the order of their ids."""
+    found = set(table["class"])
+    return [name for name in load_taxonomy().names if name in found]
+
+
+def _control_table(controls: Sequence[Ageing]) -> str:
+    """A row for each class, a column for each control."""
+    tables = {control.place: control.table.set_index(["span", "class"]) for control in controls}
+    lines = [
+        [name, *(_control_cell(table, name) for table in tables.values())] for name in _classes_of(_together(controls))
+    ]
+    return _grid(("class", *tables), lines)
+
+
+def _control_cell(table: pd.DataFrame, name: str) -> str:
+    shares = (table[f"{what}_share"].get(("whole", name)) for what in ("vanished", "appeared"))
+    return ", ".join("-" if share is None else _percent(share) for share in shares)
+
+
+def write_summary(path: Path, places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> Path:
     """Write `summary_text` into a file, replaced whole.
 
     Raises
@@ -167,8 +225,8 @@ def write_summary(path: Path, places: Sequence[Ageing]) -> Path:
     ConfigError
         If two places have one name.
     """
-    text = summary_text(places)
-    return _replace(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
+    text = summary_text(places, controls)
+    return replace_file(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
 
 
 _PLACE_HEAD: Final = ("place", "km2", "maps", "first", "last")
@@ -188,7 +246,7 @@ def _place_cells(ageing: Ageing) -> list[str]:
 _RATE_HEAD: Final = (
     *("first amount", "last amount", "vanishes, %/year", "appears, %/year"),
     *("vanished", "appeared", "re-drawn", "ids gone"),
-    *("of vanished: world, retagged", "of appeared: world, catch-up, retagged"),
+    *("of vanished: world, retagged, untold", "of appeared: world, catch-up, retagged, untold"),
 )
 
 
@@ -206,8 +264,8 @@ def _rate_table(table: pd.DataFrame, *, by: str) -> str:
                 _rate(rate, "vanish_per_year"),
                 _rate(rate, "appear_per_year"),
                 *(_percent(share[f"{what}_share"]) for what in ("vanished", "appeared", "redrawn", "id_vanished")),
-                _shares(rate, "vanished", ("world", "retagged")),
-                _shares(rate, "appeared", ("world", "catch_up", "retagged")),
+                _shares(rate, "vanished", ("world", "retagged", "untold")),
+                _shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")),
             ]
         )
     return _grid((by, *_RATE_HEAD), lines)

@@ -17,7 +17,7 @@ from sasgeo_bench.ageing.measure import Ageing
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.taxonomy import load_taxonomy
 
-_RANGE: Final = (0.01, 100.0)  # %/year: what is less is drawn at the left edge
+_RANGE: Final = (0.01, 100.0)  # %/year: what is less is drawn at the left edge, what is more at the right one
 _TICKS: Final = (0.01, 0.1, 1.0, 10.0, 100.0)
 _POOLED: Final = "#000000"
 _WHOLE: Final = "#d55e00"
@@ -54,9 +54,9 @@ def draw_ageing(path: Path, ageing: Ageing) -> None:
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 3, sharey=True, width_ratios=[1, 1, 0.8])
         low, high = 1.3 / height, 1 - _TOP_INCHES / height
-        figure.subplots_adjust(left=0.16, right=0.985, bottom=low, top=high, wspace=0.1)
-        _draw_rates(panels[0], ageing.table, names, "vanish_per_year", "vanishes: %/year of the older map")
-        _draw_rates(panels[1], ageing.table, names, "appear_per_year", "appears: %/year of the newer map")
+        figure.subplots_adjust(left=0.16, right=0.985, bottom=low, top=high, wspace=0.13)
+        _draw_rates(panels[0], ageing.table, names, "vanish_per_year", "vanishes, % of the older map a year")
+        _draw_rates(panels[1], ageing.table, names, "appear_per_year", "appears, % of the newer map a year")
         _draw_shares(panels[2], ageing.table, names)
         panels[0].set_yticks(range(len(names)), [titles[name] for name in names])
         panels[0].set_ylim(len(names) - 0.5, -0.5)
@@ -89,11 +89,14 @@ def _draw_rates(chart: Axes, table: pd.DataFrame, names: list[str], column: str,
     chart.xaxis.set_major_locator(FixedLocator(_TICKS))
     chart.xaxis.set_minor_locator(NullLocator())
     chart.xaxis.set_major_formatter(FuncFormatter(_tick))
+    if table[column].isna().all():
+        chart.text(0.5, 0.5, "too short a time\nfor yearly rates", ha="center", va="center", transform=chart.transAxes)
     _dress(chart, title, len(names))
 
 
 def _tick(value: float, _: object) -> str:
-    return ("\u2264 " if value <= _RANGE[0] else "") + f"{value:g}"
+    beyond = {_RANGE[0]: "\u2264 ", _RANGE[1]: "\u2265 "}
+    return f"{beyond.get(value, '')}{value:g}"
 
 
 def _within(percent: float) -> float:
@@ -110,7 +113,7 @@ def _draw_shares(chart: Axes, table: pd.DataFrame, names: list[str]) -> None:
         chart.plot(by_id, at, marker="s", color=_BY_ID, ms=6, ls="", zorder=3)
         chart.plot(by_place, at, marker="D", color="white", mec=_WHOLE, ms=7, ls="", mew=1.4, zorder=2)
     chart.set_xlim(-3, 103)
-    _dress(chart, "gone from first map to last: %", len(names))
+    _dress(chart, "gone from first map to last, %", len(names))
 
 
 def _dress(chart: Axes, title: str, rows: int) -> None:
@@ -129,7 +132,7 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
     table = ageing.table
     first, last = table["date_from"].min(), table["date_to"].max()
     states = f"{len(ageing.sources)} maps from {first:%Y-%m-%d} to {last:%Y-%m-%d}, {ageing.area_km2:,.1f} km2"
-    figure.text(0.015, 1 - 0.15 / height, f"How the map of {ageing.place} aged", fontsize=14, weight="bold", va="top")
+    figure.text(0.015, 1 - 0.15 / height, f"{ageing.place}: how the map aged", fontsize=14, weight="bold", va="top")
     figure.text(0.015, 1 - 0.47 / height, states, fontsize=9.5, color="#444444", va="top")
     common: dict[str, Any] = {"ls": "", "marker": "o"}
     marks = [
@@ -145,11 +148,14 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
             ms=7,
             mew=1.4,
             ls="",
-            label="first map to last, by place (% of amount)",
+            label="first map to last, by geometry",
         ),
-        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="by id (% of things)"),
+        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="first map to last, by id"),
     ]
     figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=5, frameon=False)
-    note = "What appears may be mapping that catches up. Rates have a log scale; those below 0.01 lie on its left edge."
+    note = (
+        "What appears may be mapping that catches up. Rates beyond the scale lie on its edges. "
+        "By geometry: share of the amount; by id: share of the things."
+    )
     figure.text(0.015, 0.33 / height, note, fontsize=8.5, color="#444444", va="top")
     figure.text(0.985, 0.33 / height, ATTRIBUTION, fontsize=8.5, va="top", ha="right")

@@ -21,6 +21,7 @@ from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
 from sasgeo_bench.store.catalog import find_region_file, list_region_files, read_region_file
+from sasgeo_bench.store.ratebookfile import write_ratebook
 from sasgeo_bench.store.regiondir import differing_files, read_manifest
 
 EXIT_USER: Final = 2
@@ -133,10 +134,17 @@ def _box(text: str | None) -> Box | None:
 @app.command("compare-ageing")
 def compare_ageing_command(
     folder: Annotated[list[Path], typer.Argument(help="folders that measure-ageing wrote")],
+    control: Annotated[
+        list[Path] | None, typer.Option(help="folder of maps a day apart: told of beside the places, never as a rate")
+    ] = None,
+    rates: Annotated[Path | None, typer.Option(help="also write the rates of the places into this TOML file")] = None,
     out: Annotated[Path, typer.Option(help="the Markdown file to write")] = Path("ageing-summary.md"),
 ) -> None:
     """Put the measured rates of several places beside each other, class by class."""
-    typer.echo(write_summary(out, [read_ageing(item) for item in folder]))
+    places, controls = ([read_ageing(item) for item in items] for items in (folder, control or ()))
+    typer.echo(write_summary(out, places, controls))
+    if rates is not None:
+        typer.echo(write_ratebook(rates, places))
 
 
 @app.command("list-regions")

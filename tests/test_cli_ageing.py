@@ -8,6 +8,7 @@ import pytest
 
 from sasgeo_bench import cli
 from sasgeo_bench.extract.town import TownPlan, write_town
+from sasgeo_bench.store.ratebookfile import read_ratebook
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +58,11 @@ def test_places_are_put_beside_each_other(program, towns, tmp_path):
     assert code == 0, err
     assert out.strip() == "both.md"
     assert "| south |" in Path(tmp_path / "both.md").read_text()
+    code, out, err = program("compare-ageing", "north", "--control", "south", "--rates", "r.toml", "--out", "one.md")
+    assert code == 0, err
+    assert out.split() == ["one.md", "r.toml"]
+    assert read_ratebook(tmp_path / "r.toml").names == ("north",)
+    assert "| class | south |" in (tmp_path / "one.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Measure everything in this folder anew: measure.sh PROGRAM FOLDER-OF-EXTRACTS ('make ageing' calls it).
+# Measure everything in this folder anew, and the rates that come with the package:
+# measure.sh PROGRAM FOLDER-OF-EXTRACTS ('make ageing' calls it).
 set -eu
 program=$1
 extracts=$(cd "$2" && pwd)
@@ -28,6 +29,9 @@ measure Dreieich dreieich "dreieich-2013-07-19.osm.pbf dreieich-2022-10-16.osm.p
 measure "Faroe Islands" faroe "faroe-2017-02-18.osh.pbf" "2010-01-01 2012-01-01 2014-01-01 2016-01-01 2017-02-01"
 # A control: one day apart, from two independent files. What it finds is the floor of the method, not ageing.
 measure "Andorra, a day apart" andorra-control "andorra-2013-05-28.osm.pbf andorra-2017-02-19.osh.pbf" "2013-05-27"
+measure "Andorra, a day apart, edges kept" andorra-control-edges \
+    "andorra-2013-05-28.osm.pbf andorra-2017-02-19.osh.pbf" "2013-05-27" --margin-m 0
 
 "$program" compare-ageing "$here/liechtenstein" "$here/andorra" "$here/monaco" "$here/dreieich" "$here/faroe" \
-    "$here/andorra-control" --out "$here/summary.md"
+    --control "$here/andorra-control" --control "$here/andorra-control-edges" \
+    --rates "$here/../../sasgeo_bench/ageing/ratebook.toml" --out "$here/summary.md"

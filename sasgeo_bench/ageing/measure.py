@@ -118,6 +118,7 @@ class _Change:
 
     @property
     def years(self) -> float:
+        """Time between the two states."""
         return (self.date_to - self.date_from).days / DAYS_PER_YEAR
 
 

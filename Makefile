@@ -5,6 +5,7 @@ PYTHON ?= python3
 UV ?= uv
 OUT ?= out
 ARGS ?=
+EXTRACTS ?= $(SASGEO_EXTRACTS)
 VENV := .venv
 STAMP := $(VENV)/.installed
 VENV_PYTHON := $(VENV)/bin/python
@@ -14,7 +15,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region test check bench docs lock clean
+.PHONY: help install demo list-regions build-region test check bench ageing docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -56,6 +57,10 @@ check: $(STAMP) ## ruff and mypy, as CI runs them
 bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, never a test
 	$(VENV_PYTHON) benchmarks/perturb.py
 	$(VENV_PYTHON) benchmarks/build_region.py $(ARGS)
+
+ageing: $(STAMP) ## measure docs/ageing anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
+	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make ageing EXTRACTS=~/osm" >&2; exit 2; }
+	docs/ageing/measure.sh $(abspath $(SASGEO)) "$(EXTRACTS)"
 
 docs: $(STAMP) ## run the examples in the docstrings and follow the links between the documents; builds no site
 	$(VENV_PYTHON) -m pytest -q -p no:benchmark sasgeo_bench

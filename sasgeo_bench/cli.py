@@ -14,12 +14,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from sasgeo_bench.ageing.measure import measure_ageing
 from sasgeo_bench.build import BuildPlan, build_region, plan_build
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import ConfigError, SasgeoError
+from sasgeo_bench.extract.history import MARGIN_M, date_extracts, read_history
+from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.split import make_split
+from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
 from sasgeo_bench.store.catalog import (
     find_region_file,
     find_split_file,
@@ -28,6 +32,7 @@ from sasgeo_bench.store.catalog import (
     read_region_file,
     read_split_file,
 )
+from sasgeo_bench.store.ratebookfile import write_ratebook
 from sasgeo_bench.store.regiondir import differing_files, read_manifest
 from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
@@ -92,15 +97,70 @@ def _plan(
 
 
 def _date(text: str | None) -> dt.date | None:
+    return _day(text, flag="--date") if text else None
+
+
+def _day(text: str, *, flag: str) -> dt.date:
     try:
-        return dt.date.fromisoformat(text) if text else None
+        return dt.date.fromisoformat(text)
     except ValueError as error:
-        message = f"--date must be a date as in 2021-10-28, got {text!r}"
+        message = f"{flag} must be a date as in 2021-10-28, got {text!r}"
         raise ConfigError(message) from error
 
 
 def _tell(line: str) -> None:
     errors.print(line, markup=False)
+
+
+@app.command("measure-ageing")
+def measure_ageing_command(
+    extract: Annotated[list[Path], typer.Option(help="a dated extract, or one full history with several --at")],
+    at: Annotated[
+        list[str] | None, typer.Option(help="YYYY-MM-DD: of each extract in order, or to cut a full history at")
+    ] = None,
+    place: Annotated[str | None, typer.Option(help="name of the place; default: how the first file begins")] = None,
+    bounds: Annotated[str | None, typer.Option(metavar="W,S,E,N", help="degrees; default: what all map")] = None,
+    margin_m: Annotated[
+        float, typer.Option(min=0, help="cut off along the edges of extracts where those are estimated, metres")
+    ] = MARGIN_M,
+    out: Out = Path("out"),
+) -> None:
+    """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg."""
+    box = _box(bounds)
+    dated = date_extracts(extract, at=[_day(text, flag="--at") for text in at or ()])
+    history = read_history(dated, bounds=box, margin_m=margin_m, tell=_tell)
+    name = place or extract[0].name.split(".")[0].split("-")[0]
+    for path in write_ageing(out, measure_ageing(history, place=name)):
+        typer.echo(path)
+
+
+def _box(text: str | None) -> Box | None:
+    if text is None:
+        return None
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError:
+        west, south, east, north = 0.0, 0.0, 0.0, 0.0
+    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees on a sphere
+        message = f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
+        raise ConfigError(message)
+    return (west, south, east, north)
+
+
+@app.command("compare-ageing")
+def compare_ageing_command(
+    folder: Annotated[list[Path], typer.Argument(help="folders that measure-ageing wrote")],
+    control: Annotated[
+        list[Path] | None, typer.Option(help="folder of maps a day apart: told of beside the places, never as a rate")
+    ] = None,
+    rates: Annotated[Path | None, typer.Option(help="also write the rates of the places into this TOML file")] = None,
+    out: Annotated[Path, typer.Option(help="the Markdown file to write")] = Path("ageing-summary.md"),
+) -> None:
+    """Put the measured rates of several places beside each other, class by class."""
+    places, controls = ([read_ageing(item) for item in items] for items in (folder, control or ()))
+    typer.echo(write_summary(out, places, controls))
+    if rates is not None:
+        typer.echo(write_ratebook(rates, places))
 
 
 @app.command("list-regions")

@@ -12,23 +12,26 @@ import geopandas as gpd
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
 from sasgeo_bench.errors import ConfigError, ExtractError, SasgeoError, StoreError
 from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
-from sasgeo_bench.perturb.ageing import Ageing, AgeingRates
+from sasgeo_bench.perturb.ageing import Ageing
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import TASK_VERSION, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.split import Block, Split
 from sasgeo_bench.store import regiondir, taskdir
+from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sheet import Panel
 from sasgeo_bench.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
 from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, mine
 from sasgeo_bench.suites.sites import choose_sites
+from sasgeo_bench.suites.synthetic_age import ageing_of
 from sasgeo_bench.twin import paste
 
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
@@ -168,9 +171,16 @@ def _scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
         scenes=base.manifest.scenes,
         others=others,
         elsewhere=elsewhere,
-        ageing=Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place=request.region.id, redrawn=0.3),
+        ageing=_ageing(request.region) if suite.card.name == "synthetic-age" else None,
     )
     return scene, base
+
+
+def _ageing(spec: RegionFile) -> Ageing:
+    """Ageing by the rates measured in all places but the region's own."""
+    book = load_ratebook()
+    place = book.place_of(spec.pick(None).file)
+    return ageing_of(pool_rates(book, besides=[place] if place else []), place=place or spec.id)
 
 
 def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell) -> Region:

@@ -36,6 +36,37 @@ class Snapshot:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """What the header of a file says; each may be None. The box is west, south, east, north, degrees."""
+
+    box_lonlat: tuple[float, float, float, float] | None
+    replicated_at: dt.datetime | None
+
+
+def read_header(path: Path) -> Header:
+    """Read the header of an extract and no more.
+
+    Raises
+    ------
+    ExtractError
+        If the file is missing, empty, damaged or of an unknown format.
+
+    Examples
+    --------
+    >>> read_header(Path("nowhere.osm.pbf"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
+    """
+    _check_file(path)
+    with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
+        content = _as_its_content(path, Path(scratch))
+        with osmium.io.Reader(str(content), osmium.osm.NOTHING) as reader:
+            header = reader.header()
+        return Header(box_lonlat=_header_box(header), replicated_at=_header_time(header))
+
+
 @contextmanager
 def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot]:
     """Make one extract readable: sort what is out of order, cut a history at a date.

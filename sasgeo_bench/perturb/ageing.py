@@ -35,7 +35,7 @@ _CLEARED: Final = {"building": ("green", "farmland"), "parking": ("green", "farm
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rates:
-    """Yearly rates of one class: of vanishing per thing there is, of appearing per thing there is; 1/year."""
+    """Yearly rates of one class: of vanishing per thing there is, of appearing per thing there is by then; 1/year."""
 
     vanish_per_year: float
     appear_per_year: float
@@ -123,9 +123,10 @@ class Ageing:
     Notes
     -----
     A thing is a connected component; lines, which all connect, go and come in pieces of about 40 m. A thing vanishes
-    with probability 1 - exp(-vanish * years); as many appear as a Poisson draw of mean appear * years * things says,
-    each a turned copy of one of its class, set down nearby where no building, water, road or railway is. One that
-    finds no free place in twelve tries is left out, so dense places grow less than asked.
+    with probability 1 - exp(-vanish * years). As many appear as a Poisson draw of mean
+    (exp(appear * years) - 1) * things says, which is what measured rates of appearing mean, each a turned copy of one of its class, set down nearby where
+    no building, water, road or railway is. One that finds no free place in twelve tries is left out, so dense places
+    grow less than asked.
 
     Examples
     --------
@@ -185,7 +186,7 @@ class Ageing:
     ) -> None:
         """Set new things down in place, and clear what grew there."""
         usable = np.flatnonzero(found.areas_cells <= _LARGEST_SHARE * found.labels.size)
-        mean = self.rates.classes[name].appear_per_year * self.years * len(found.areas_cells)
+        mean = np.expm1(self.rates.classes[name].appear_per_year * self.years) * len(found.areas_cells)
         count = min(int(rng.poisson(mean)), _MOST_NEW)
         if not count or not len(usable):
             return

@@ -52,7 +52,8 @@ class GrowthSuite(Suite):
 
 def growth(new_per_old: float) -> Ageing:
     """Ageing in which so many buildings appear for each that is there, and nothing else happens."""
-    rates = AgeingRates(classes={"building": Rates(vanish_per_year=0.0, appear_per_year=new_per_old)}, places=())
+    building = Rates(vanish_per_year=0.0, appear_per_year=float(np.log1p(new_per_old)))
+    rates = AgeingRates(classes={"building": building}, places=())
     return Ageing(years=1.0, rates=rates, place="-")
 
 

@@ -4,7 +4,10 @@
 from dataclasses import replace
 from typing import Final
 
-from sasgeo_bench.perturb.ageing import Ageing
+import numpy as np
+
+from sasgeo_bench.ageing.ratebook import PooledRates
+from sasgeo_bench.perturb.ageing import Ageing, AgeingRates, Rates
 from sasgeo_bench.suites.base import (
     VIEW_CELLS,
     Draft,
@@ -20,8 +23,10 @@ from sasgeo_bench.suites.base import (
     perceived,
 )
 
-YEARS: Final = (2.0, 5.0, 10.0, 30.0)
+YEARS: Final = (2.0, 5.0, 10.0, 20.0)
 REDRAWN_WITHIN_YEARS: Final = 10.0  # the span that the share of redrawn things in a scene's ageing stands for
+_SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
+_MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
 
 
 class SyntheticAgeSuite(Suite):
@@ -45,6 +50,32 @@ class SyntheticAgeSuite(Suite):
         )
 
 
+def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
+    """Ageing by measured rates of other places; no year has passed yet.
+
+    What is drawn anew, and how far off, are medians over the classes whose centre moves because they were drawn anew
+    and not because they grew.
+    """
+    told = [pooled.classes[name] for name in _SHIFTED if name in pooled.classes]
+    shares = [
+        1 - (1 - item.redrawn_share) ** (REDRAWN_WITHIN_YEARS / item.years)
+        for item in told
+        if item.redrawn_share is not None
+    ]
+    shifts_m = [item.shift_median_m for item in told if item.shift_median_m is not None]
+    classes = {
+        name: Rates(vanish_per_year=item.vanish_per_year, appear_per_year=item.appear_per_year)
+        for name, item in pooled.classes.items()
+    }
+    return Ageing(
+        years=0.0,
+        rates=AgeingRates(classes=classes, places=pooled.places),
+        place=place,
+        redrawn=float(np.median(shares)) if shares else 0.0,
+        shift_m=float(np.median(shifts_m)) / _MEDIAN_OF_SHIFT if shifts_m else 0.0,
+    )
+
+
 def after(ageing: Ageing, years: float) -> Ageing:
     """Ageing by so many years; the share that was drawn anew grows with them.
 
@@ -64,7 +95,7 @@ SUITE: Final = SyntheticAgeSuite(
         name="synthetic-age",
         version=1,
         title="Synthetic ageing",
-        what="Things vanish, appear and are drawn anew for 2 to 30 years, at the rates measured in other places.",
+        what="Things vanish, appear and are drawn anew for 2 to 20 years, at the rates measured in other places.",
         separates="Stability from uniform weights where no second date is there; to be read beside real-age.",
         falsifier="No year has passed: scores as in the control.",
         strength_unit="years between map and world",

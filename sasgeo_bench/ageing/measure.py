@@ -1,0 +1,422 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A history of dated states -> one row per class and pair of dates: shares, shifts, rates, and what tags explain."""
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.ageing.pairing import (
+    COVER_SHARE,
+    NEAR_M,
+    REDRAWN_M,
+    Areas,
+    Floats,
+    Geometries,
+    Ints,
+    Pieces,
+    Verdict,
+    compare_areas,
+    compare_pieces,
+    covered_share,
+    cut_to,
+    distance_m,
+    make_areas,
+    make_pieces,
+    polygons_of,
+    replaced_share,
+)
+from sasgeo_bench.ageing.rates import Rate, bootstrap_rate, seeded_rng
+from sasgeo_bench.extract.history import History, State
+from sasgeo_bench.extract.lifecycle import Lifecycle, ObjectKey
+from sasgeo_bench.taxonomy import Kind, load_taxonomy
+
+BLOCK_M: Final = 1000.0
+DAYS_PER_YEAR: Final = 365.25
+LEAST_DAYS: Final = 30  # a yearly rate out of a shorter time would be one day's accident times 365
+UNITS: Final[dict[Kind, str]] = {"area": "m2", "line": "m"}
+_DECIMALS: Final = 6
+_REASONS: Final = ("world", "catch_up", "retagged")
+
+# Column -> pandas dtype. Shares lie within 0..1 and are NaN where nothing is left to share.
+DTYPES: Final = {
+    "place": "str",
+    "class": "str",
+    "unit": "str",
+    "span": "str",
+    "date_from": "datetime64[ms]",
+    "date_to": "datetime64[ms]",
+    "years": "float64",
+    "n_from": "int64",
+    "n_to": "int64",
+    "amount_from": "float64",
+    "amount_to": "float64",
+    "vanished_share": "float64",
+    "appeared_share": "float64",
+    "redrawn_share": "float64",
+    "retagged_share": "float64",
+    "ground_lost_share": "float64",
+    "ground_gained_share": "float64",
+    "shift_median_m": "float64",
+    "shift_p90_m": "float64",
+    "id_vanished_share": "float64",
+    "vanish_per_year": "float64",
+    "vanish_per_year_lo": "float64",
+    "vanish_per_year_hi": "float64",
+    "appear_per_year": "float64",
+    "appear_per_year_lo": "float64",
+    "appear_per_year_hi": "float64",
+    "vanished_world_share": "float64",
+    "vanished_retagged_share": "float64",
+    "vanished_untold_share": "float64",
+    "appeared_world_share": "float64",
+    "appeared_catch_up_share": "float64",
+    "appeared_retagged_share": "float64",
+    "appeared_untold_share": "float64",
+    "blocks": "int64",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Stock:
+    """One class in one state, cut to the common area; `hidden` is what of the class cannot be seen from above."""
+
+    things: Areas | Pieces
+    keys: list[ObjectKey]
+    hidden: Geometries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Why:
+    """Lost amount by what explains it: the world changed, the map caught up with it, or another class took over."""
+
+    world: float
+    catch_up: float
+    retagged: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Change:
+    """One class between two states: both verdicts, and what explains them."""
+
+    date_from: dt.date
+    date_to: dt.date
+    old: Verdict
+    new: Verdict
+    n_from: int
+    n_to: int
+    id_vanished_share: float
+    vanished: _Why
+    appeared: _Why
+
+    @property
+    def years(self) -> float:
+        """Time between the two states."""
+        return (self.date_to - self.date_from).days / DAYS_PER_YEAR
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ageing:
+    """What was measured of one place: a table with the columns of `DTYPES`, of which states, over what area."""
+
+    place: str
+    sources: tuple[str, ...]
+    area_km2: float
+    table: pd.DataFrame
+
+
+def measure_ageing(history: History, *, place: str) -> Ageing:
+    """Measure how each class changed between the states of a history.
+
+    Parameters
+    ----------
+    history : History
+        At least two states of one area.
+    place : str
+        Its name; with class and dates it seeds the bootstrap.
+
+    Returns
+    -------
+    Ageing
+        The table has the columns of `DTYPES`. `span` is "interval" for neighbouring dates, "whole" for the first
+        against the last, and "pooled" for the rates that explain all intervals together: no shares of a stock there.
+
+    Notes
+    -----
+    Only what is visible from above counts, as in the layers: a stream put into a culvert has vanished, and is counted
+    as retagged. `vanished_share` is of the older amount, `appeared_share` of the newer. Dates less than `LEAST_DAYS`
+    apart get shares but no rates.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.extract.lifecycle import no_lifecycle
+    >>> from sasgeo_bench.features import DTYPES as COLUMNS, make_features
+    >>> def state(year, houses):
+    ...     filler = {name: [0] * len(houses) for name in COLUMNS}
+    ...     text = {"osm_type": ["way"] * len(houses), "class": ["building"] * len(houses)}
+    ...     seen = {"osm_id": range(len(houses)), "is_visible": [True] * len(houses), "geometry": houses}
+    ...     table = make_features(filler | text | seen, epsg=32632)
+    ...     return State(source="", on=dt.date(year, 1, 1), features=table, lifecycle=no_lifecycle())
+    >>> old, new = state(2010, shapely.box([0, 50], 0, [9, 59], 9)), state(2020, shapely.box([0], 0, [9], 9))
+    >>> history = History(states=(old, new), area=shapely.box(-99, -99, 99, 99), epsg=32632)
+    >>> table = measure_ageing(history, place="field").table
+    >>> table["span"].tolist(), float(table["vanished_share"][0])
+    (['interval', 'whole', 'pooled'], 0.5)
+    """
+    kinds: dict[str, Kind] = {item.name: item.kind for item in load_taxonomy().classes}
+    stocks = [_stocks(state, history.area, kinds) for state in history.states]
+    changes = [_changes(history.states, stocks, pair, kinds) for pair in pairwise(range(len(history.states)))]
+    ends = (0, len(history.states) - 1)
+    changes.append(changes[0] if ends == (0, 1) else _changes(history.states, stocks, ends, kinds))
+    rows: list[dict[str, object]] = []
+    for name in kinds:
+        of_class = [change[name] for change in changes]
+        if not any(item.n_from or item.n_to for item in of_class):
+            continue
+        common = {"place": place, "class": name, "unit": UNITS[kinds[name]]}
+        rows += [common | _row(item, "interval", place=place, name=name) for item in of_class[:-1]]
+        rows.append(common | _row(of_class[-1], "whole", place=place, name=name))
+        rows.append(common | _pooled_row(of_class[:-1], place=place, name=name))
+    table = pd.DataFrame(rows, columns=list(DTYPES)).astype(dict(DTYPES))
+    numbers_only = [column for column, kind in DTYPES.items() if kind == "float64"]
+    table[numbers_only] = table[numbers_only].round(_DECIMALS)
+    return Ageing(
+        place=place,
+        sources=tuple(f"{state.source} of {state.on}" for state in history.states),
+        area_km2=round(float(shapely.area(history.area)) / 1e6, 3),
+        table=table,
+    )
+
+
+def _stocks(state: State, area: shapely.Geometry, kinds: dict[str, Kind]) -> dict[str, _Stock]:
+    features = state.features
+    shapes = cut_to(np.asarray(features.geometry.array, dtype=object), area)
+    classes, visible = features["class"].to_numpy(), features["is_visible"].to_numpy()
+    found = {}
+    for name, kind in kinds.items():
+        rows = np.flatnonzero((classes == name) & visible)
+        things = make_areas(shapes[rows]) if kind == "area" else make_pieces(shapes[rows])
+        hidden = shapes[(classes == name) & ~visible]
+        found[name] = _Stock(
+            things=things, keys=_keys(features, rows[things.rows]), hidden=hidden[~shapely.is_empty(hidden)]
+        )
+    return found
+
+
+def _keys(features: gpd.GeoDataFrame, rows: Ints) -> list[ObjectKey]:
+    types, ids = features["osm_type"].to_numpy()[rows], features["osm_id"].to_numpy()[rows]
+    return [ObjectKey(*pair) for pair in zip(types.tolist(), ids.tolist(), strict=True)]
+
+
+def _changes(
+    states: Sequence[State], stocks: Sequence[dict[str, _Stock]], pair: tuple[int, int], kinds: dict[str, Kind]
+) -> dict[str, _Change]:
+    """Compare every class of two states; what takes the place of what is known only when all are compared."""
+    before, after = (states[index] for index in pair)
+    old, new = (stocks[index] for index in pair)
+    gone = {name: _verdict(old[name], new[name]) for name in kinds}
+    come = {name: _verdict(new[name], old[name]) for name in kinds}
+    left = {name: _lost_shapes(old[name], gone[name]) for name in kinds}
+    arrived = {name: _lost_shapes(new[name], come[name]) for name in kinds}
+    there = set(_keys(after.features, np.arange(len(after.features))))
+    hints = np.concatenate((after.lifecycle.gone, after.lifecycle.rising))
+    found = {}
+    for name, kind in kinds.items():
+        others = [other for other in kinds if other != name and kinds[other] == kind]
+        into = np.concatenate([new[name].hidden, *(arrived[other] for other in others)])
+        out_of = np.concatenate([old[name].hidden, *(left[other] for other in others)])
+        keys = old[name].keys
+        found[name] = _Change(
+            date_from=before.on,
+            date_to=after.on,
+            old=gone[name],
+            new=come[name],
+            n_from=len(keys),
+            n_to=len(new[name].keys),
+            id_vanished_share=_share(sum(key not in there for key in keys), len(keys)),
+            vanished=_why_vanished(old[name], gone[name], into, hints),
+            appeared=_why_appeared(new[name], come[name], out_of, after.lifecycle, before),
+        )
+    return found
+
+
+def _why_vanished(stock: _Stock, verdict: Verdict, into: Geometries, hints: Geometries) -> _Why:
+    retagged = _taken(stock, verdict, into)
+    world = (verdict.lost - retagged) @ _is_near(stock, verdict, hints)
+    return _Why(world=float(world), catch_up=0.0, retagged=float(retagged.sum()))
+
+
+def _why_appeared(stock: _Stock, verdict: Verdict, out_of: Geometries, hints: Lifecycle, before: State) -> _Why:
+    """A start date tells most; else what was another class was there; else it came where something was being built."""
+    spans = [hints.started.get(key) for key in stock.keys]
+    is_new = np.array([span is not None and span.first > before.on for span in spans], dtype=bool)[verdict.thing]
+    is_old = np.array([span is not None and span.last <= before.on for span in spans], dtype=bool)[verdict.thing]
+    retagged = np.where(is_new | is_old, 0.0, _taken(stock, verdict, out_of))
+    is_site = _is_near(stock, verdict, before.lifecycle.rising) & ~is_old
+    world = (verdict.lost - retagged) @ (is_new | is_site)
+    return _Why(world=float(world), catch_up=float(verdict.lost @ is_old), retagged=float(retagged.sum()))
+
+
+def _verdict(these: _Stock, others: _Stock) -> Verdict:
+    if isinstance(these.things, Areas) and isinstance(others.things, Areas):
+        return compare_areas(these.things, others.things)
+    if isinstance(these.things, Pieces) and isinstance(others.things, Pieces):
+        return compare_pieces(these.things, others.things)
+    raise TypeError  # a class has one kind in every state
+
+
+def _lost_shapes(stock: _Stock, verdict: Verdict) -> Geometries:
+    """Things, or pieces of lines as their middles, that the other state does not have."""
+    if isinstance(stock.things, Areas):
+        return stock.things.shapes[verdict.is_lost]
+    return np.asarray(shapely.points(stock.things.middles[verdict.is_lost]))
+
+
+def _taken(stock: _Stock, verdict: Verdict, others: Geometries) -> Floats:
+    """Lost amount of each unit whose place belongs to another class of the kind, or to the class out of sight."""
+    taken = np.zeros(len(verdict.lost))
+    units = np.flatnonzero(verdict.is_lost)
+    if isinstance(stock.things, Areas):
+        share = replaced_share(stock.things.shapes[units], polygons_of(others))
+        taken[units] = np.minimum(share * verdict.amount[units], verdict.lost[units])
+    else:
+        taken[units] = verdict.lost[units] * (distance_m(stock.things.middles[units], others) <= NEAR_M)
+    return taken
+
+
+def _is_near(stock: _Stock, verdict: Verdict, hints: Geometries) -> NDArray[np.bool_]:
+    """Which units, of those that lost anything, lie in a hinted place."""
+    near = np.zeros(len(verdict.lost), dtype=bool)
+    units = np.flatnonzero(verdict.lost > 0)
+    if isinstance(stock.things, Areas):
+        near[units] = covered_share(stock.things.shapes[units], hints) >= COVER_SHARE
+    else:
+        near[units] = distance_m(stock.things.middles[units], hints) <= NEAR_M
+    return near
+
+
+def _row(change: _Change, span: str, *, place: str, name: str) -> dict[str, object]:
+    old, new = change.old, change.new
+    amount_from, amount_to = float(old.amount.sum()), float(new.amount.sum())
+    moved, weight = _moved(old)
+    quantiles = _quantiles(moved, weight, (0.5, 0.9))
+    return _rates([change], span, place=place, name=name) | {
+        "n_from": change.n_from,
+        "n_to": change.n_to,
+        "amount_from": amount_from,
+        "amount_to": amount_to,
+        "vanished_share": _share(old.lost.sum(), amount_from),
+        "appeared_share": _share(new.lost.sum(), amount_to),
+        "redrawn_share": _share(weight.sum(), amount_from),
+        "retagged_share": _share(change.vanished.retagged, amount_from),
+        "ground_lost_share": _share(old.uncovered.sum(), amount_from),
+        "ground_gained_share": _share(new.uncovered.sum(), amount_to),
+        "shift_median_m": quantiles[0],
+        "shift_p90_m": quantiles[1],
+        "id_vanished_share": change.id_vanished_share,
+    }
+
+
+def _pooled_row(changes: Sequence[_Change], *, place: str, name: str) -> dict[str, object]:
+    first, last = changes[0], changes[-1]
+    return _rates(changes, "pooled", place=place, name=name) | {
+        "n_from": first.n_from,
+        "n_to": last.n_to,
+        "amount_from": float(first.old.amount.sum()),
+        "amount_to": float(last.new.amount.sum()),
+    }
+
+
+def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> dict[str, object]:
+    """Dates, rates, explanations and number of blocks: what rows of one interval and of all together share."""
+    years = np.array([change.years for change in changes])
+    first, last = changes[0].date_from, changes[-1].date_to
+    tables = _block_tables(changes)
+    if (last - first).days >= LEAST_DAYS:
+        vanish = bootstrap_rate(
+            *tables[:2],
+            years,
+            things=sum(change.n_from for change in changes),
+            rng=seeded_rng(place, name, span, first, last, "vanish"),
+        )
+        appear = bootstrap_rate(
+            *tables[2:],
+            years,
+            things=sum(change.n_to for change in changes),
+            rng=seeded_rng(place, name, span, first, last, "appear"),
+        )
+    else:
+        vanish = appear = Rate(per_year=np.nan, lo=np.nan, hi=np.nan)
+    return {
+        "span": span,
+        "date_from": pd.Timestamp(first),
+        "date_to": pd.Timestamp(last),
+        "years": float(years.sum()),
+        **_named("vanish_per_year", vanish),
+        **_named("appear_per_year", appear),
+        **_explained("vanished", [(change.old, change.vanished) for change in changes]),
+        **_explained("appeared", [(change.new, change.appeared) for change in changes]),
+        "blocks": len(tables[0]),
+    }
+
+
+def _explained(what: str, sides: Sequence[tuple[Verdict, _Why]]) -> dict[str, float]:
+    """Shares of the lost amount by explanation; together they are 1."""
+    lost = float(sum(verdict.lost.sum() for verdict, _ in sides))
+    shares = {name: _share(sum(getattr(why, name) for _, why in sides), lost) for name in _REASONS}
+    shares["untold"] = max(1.0 - sum(shares.values()), 0.0) if lost > 0 else np.nan
+    return {f"{what}_{name}_share": shares[name] for name in shares if f"{what}_{name}_share" in DTYPES}
+
+
+def _named(name: str, rate: Rate) -> dict[str, object]:
+    return {name: rate.per_year, f"{name}_lo": rate.lo, f"{name}_hi": rate.hi}
+
+
+def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Lost and whole amount of the older state, then of the newer; each of shape (blocks, intervals)."""
+    verdicts = [(change.old, change.new) for change in changes]
+    cells = [_cells(verdict.xy_m) for pair in verdicts for verdict in pair]
+    blocks, number = np.unique(np.concatenate(cells), return_inverse=True)
+    parts = np.split(number, np.cumsum([len(cell) for cell in cells])[:-1])
+    tables = np.zeros((4, len(blocks), len(changes)))
+    for column, pair in enumerate(verdicts):
+        for side, verdict in enumerate(pair):
+            of_unit = parts[2 * column + side]
+            tables[2 * side, :, column] = np.bincount(of_unit, weights=verdict.lost, minlength=len(blocks))
+            tables[2 * side + 1, :, column] = np.bincount(of_unit, weights=verdict.amount, minlength=len(blocks))
+    return tables[0], tables[1], tables[2], tables[3]
+
+
+def _cells(xy_m: Floats) -> Ints:
+    """One number for the block around each point."""
+    cells = np.floor(xy_m / BLOCK_M).astype(np.int64).reshape(-1, 2)
+    return np.asarray(cells[:, 0] * 2**32 + cells[:, 1])
+
+
+def _moved(verdict: Verdict) -> tuple[Floats, Floats]:
+    """Shift of each re-drawn thing, and what is kept of it."""
+    left = verdict.amount - verdict.lost
+    kept = np.bincount(verdict.thing, weights=left, minlength=len(verdict.shift_m)).astype(np.float64)
+    is_redrawn = np.nan_to_num(verdict.shift_m) > REDRAWN_M
+    return verdict.shift_m[is_redrawn], kept[is_redrawn]
+
+
+def _quantiles(values: Floats, weights: Floats, levels: tuple[float, ...]) -> list[float]:
+    """Weighted quantiles; NaN for no values."""
+    if len(values) == 0:
+        return [float("nan")] * len(levels)
+    order = np.argsort(values, kind="stable")
+    passed = np.cumsum(weights[order])
+    places = np.searchsorted(passed, np.array(levels) * passed[-1])
+    return [float(values[order][min(place, len(values) - 1)]) for place in places.tolist()]
+
+
+def _share(part: float, whole: float) -> float:
+    return float(part / whole) if whole > 0 else float("nan")

@@ -1,0 +1,362 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two states of one class -> what of the one is not in the other, by geometry and never by id.
+
+An id says who drew a thing, not whether it stands: a bulk redraw replaces ids and nothing on the ground.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+MATCH_IOU: Final = 0.3  # two areas that share so much are one thing
+NEAR_M: Final = 5.0  # roads in OSM lie within about 6 m of the truth, so re-drawn ones within as much of each other
+REDRAWN_M: Final = 1.0  # below this a shift is rounding or a tidied corner
+COVER_SHARE: Final = 0.5  # an area that another class or a hint covers by so much is explained by it
+STEP_M: Final = 5.0  # lines are compared in pieces no longer than this
+_CENTIMETRES: Final = 100.0
+_LEAST_M2: Final = 1e-6
+_POLYGONAL: Final = (3, 6)
+_LINEAR: Final = (1, 2, 5)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+Geometries = NDArray[np.object_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Areas:
+    """Area things of one class in one state: valid polygons, shape (N,), and the row of the table each comes from."""
+
+    rows: Ints
+    shapes: Geometries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pieces:
+    """Line things of one class in one state, cut into pieces no longer than `STEP_M`, shape (P,).
+
+    `things` numbers the things 0..T-1, `rows` (T,) gives the row of the table each comes from; `keys` tells equal
+    segments apart, whichever way they run; `segments` are the lines that other states measure their distance to, with
+    whole areas of the class (squares), which lend support but have no length.
+    """
+
+    rows: Ints
+    things: Ints
+    middles: Floats
+    lengths_m: Floats
+    keys: NDArray[np.uint64]
+    segments: Geometries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What of one state is missing in another, by unit: an area thing or a piece of a line, shape (U,).
+
+    `amount` and `lost` in m2 or m; `uncovered` is the amount that no thing of the class covers exactly, whatever the
+    pairing says; `xy_m` (U, 2) is where the unit lies; `thing` (U,) numbers its thing, and `shift_m` (T,) is how far
+    each matched thing has moved, NaN where none is known.
+    """
+
+    amount: Floats
+    lost: Floats
+    uncovered: Floats
+    xy_m: Floats
+    thing: Ints
+    shift_m: Floats
+
+    @property
+    def is_lost(self) -> Flags:
+        """Units of which more is lost than kept."""
+        return np.asarray(self.lost > COVER_SHARE * self.amount)
+
+
+def cut_to(shapes: Geometries, area: shapely.Geometry) -> Geometries:
+    """Cut geometries to an area; those wholly within are returned as they are.
+
+    Examples
+    --------
+    >>> row = shapely.box([0, 4], 0, [2, 6], 1)
+    >>> shapely.area(cut_to(row, shapely.box(0, 0, 5, 5))).tolist()
+    [2.0, 1.0]
+    """
+    shapely.prepare(area)
+    cut = shapes.copy()
+    crosses = ~shapely.contains_properly(area, shapes)
+    cut[crosses] = shapely.intersection(shapely.make_valid(shapes[crosses]), area)
+    return np.asarray(cut)
+
+
+def polygons_of(shapes: Geometries) -> Geometries:
+    """Valid polygons or multipolygons; what has no area becomes empty.
+
+    Examples
+    --------
+    >>> shapely.area(polygons_of(np.array([shapely.Point(0, 0), shapely.box(0, 0, 1, 1)]))).tolist()
+    [0.0, 1.0]
+    """
+    valid = shapes.copy()
+    broken = ~shapely.is_valid(shapes)
+    valid[broken] = shapely.make_valid(shapes[broken])
+    for index in np.flatnonzero(~np.isin(shapely.get_type_id(valid), _POLYGONAL)):
+        parts = shapely.get_parts(shapely.get_parts(valid[index]))
+        valid[index] = shapely.multipolygons(parts[shapely.get_type_id(parts) == _POLYGONAL[0]])
+    return np.asarray(valid)
+
+
+def make_areas(shapes: Geometries) -> Areas:
+    """Area things of a table's rows; rows without an area are left out.
+
+    Examples
+    --------
+    >>> make_areas(np.array([shapely.Point(0, 0), shapely.box(0, 0, 1, 1)])).rows.tolist()
+    [1]
+    """
+    valid = polygons_of(shapes)
+    rows = np.flatnonzero(shapely.area(valid) > _LEAST_M2)
+    return Areas(rows=rows, shapes=valid[rows])
+
+
+def make_pieces(shapes: Geometries) -> Pieces:
+    """Line things of a table's rows, in pieces; areas among them lend support only.
+
+    Examples
+    --------
+    >>> pieces = make_pieces(np.array([shapely.LineString([(0, 0), (12, 0)]), shapely.box(0, 0, 1, 1)]))
+    >>> pieces.lengths_m.tolist(), len(pieces.segments)
+    ([4.0, 4.0, 4.0], 2)
+    """
+    kinds = shapely.get_type_id(shapes)
+    squares = shapes[np.isin(kinds, _POLYGONAL)]
+    rows = np.flatnonzero(~np.isin(kinds, _POLYGONAL) & (shapely.length(shapes) > 0))
+    parts, owner = _linear_parts(shapes[rows])
+    points, part = shapely.get_coordinates(parts, return_index=True)
+    joined = np.flatnonzero(part[:-1] == part[1:]) if len(part) else np.zeros(0, dtype=np.int64)
+    starts, ends = points[joined], points[joined + 1]
+    lengths = np.hypot(*(ends - starts).T) if len(joined) else np.zeros(0)
+    real = lengths > 0
+    starts, ends, lengths, joined = starts[real], ends[real], lengths[real], joined[real]
+    count = np.ceil(lengths / STEP_M).astype(np.int64)
+    segment = np.repeat(np.arange(len(lengths)), count)
+    order = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count)
+    along = ((order + 0.5) / count[segment])[:, None]
+    lines = shapely.linestrings(np.stack((starts, ends), axis=1)) if len(lengths) else np.array([], dtype=object)
+    return Pieces(
+        rows=rows,
+        things=owner[part[joined]][segment],
+        middles=starts[segment] + along * (ends - starts)[segment],
+        lengths_m=(lengths / np.maximum(count, 1))[segment],
+        keys=_segment_keys(starts, ends)[segment],
+        segments=np.concatenate((lines, squares)),
+    )
+
+
+def _linear_parts(shapes: Geometries) -> tuple[Geometries, Ints]:
+    """The plain lines within geometries, and which geometry each comes from."""
+    parts, owner = shapely.get_parts(shapes, return_index=True)
+    deeper, inner = shapely.get_parts(parts, return_index=True)
+    is_line = np.isin(shapely.get_type_id(deeper), _LINEAR)
+    return deeper[is_line], owner[inner[is_line]]
+
+
+def _segment_keys(starts: Floats, ends: Floats) -> NDArray[np.uint64]:
+    """One number for each segment, the same for both of its directions, rounded to a centimetre as OSM is."""
+    first, last = (np.round(points * _CENTIMETRES).astype(np.int64).reshape(-1, 2) for points in (starts, ends))
+    turned = (first[:, 0] > last[:, 0]) | ((first[:, 0] == last[:, 0]) & (first[:, 1] > last[:, 1]))
+    low, high = np.where(turned[:, None], last, first), np.where(turned[:, None], first, last)
+    hashed = pd.util.hash_pandas_object(pd.DataFrame(np.hstack((low, high))), index=False)
+    return np.asarray(hashed.to_numpy(), dtype=np.uint64)
+
+
+def compare_areas(these: Areas, others: Areas) -> Verdict:
+    """Find which areas of one state have no counterpart in another.
+
+    Parameters
+    ----------
+    these, others : Areas
+        One class in two states.
+
+    Returns
+    -------
+    Verdict
+        Areas with a counterpart of IoU above `MATCH_IOU` lose nothing; the rest, split, merged or gone, lose what no
+        area of the other state covers. Shifts are those of the centroids.
+
+    Examples
+    --------
+    >>> old = make_areas(shapely.box([0, 50], 0, [10, 60], 10))
+    >>> new = make_areas(shapely.box([2], 0, [12], 10))
+    >>> found = compare_areas(old, new)
+    >>> found.lost.tolist(), found.shift_m.tolist()
+    ([0.0, 100.0], [2.0, nan])
+    """
+    amount = shapely.area(these.shapes)
+    lost, uncovered, shift = np.zeros(len(amount)), np.zeros(len(amount)), np.zeros(len(amount))
+    changed = np.flatnonzero(~_is_among(these.shapes, others.shapes))
+    overlap = _overlap(these.shapes[changed], others.shapes)
+    rest = np.maximum(amount[changed] - overlap.covered, 0.0)
+    rest[rest < _LEAST_M2 * amount[changed]] = 0.0
+    is_matched = overlap.best_iou > MATCH_IOU
+    lost[changed], uncovered[changed] = np.where(is_matched, 0.0, rest), rest
+    centres = shapely.get_coordinates(shapely.centroid(these.shapes)).reshape(-1, 2)
+    shift[changed] = np.nan
+    matched = changed[is_matched]
+    there = shapely.get_coordinates(shapely.centroid(others.shapes[overlap.best[is_matched]])).reshape(-1, 2)
+    shift[matched] = np.hypot(*(centres[matched] - there).T)
+    things = np.arange(len(amount))
+    return Verdict(amount=amount, lost=lost, uncovered=uncovered, xy_m=centres, thing=things, shift_m=shift)
+
+
+def _is_among(these: Geometries, others: Geometries) -> Flags:
+    """Which geometries are there bit by bit in the other state: most are, and need no look at their neighbours."""
+    known = pd.Index(shapely.to_wkb(shapely.normalize(others)))
+    return np.asarray(pd.Index(shapely.to_wkb(shapely.normalize(these))).isin(known))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Overlap:
+    """For each area: the IoU and number of its best counterpart, and how much of it all counterparts cover, m2."""
+
+    best: Ints
+    best_iou: Floats
+    covered: Floats
+
+
+def _overlap(these: Geometries, others: Geometries) -> _Overlap:
+    tree = shapely.STRtree(others)
+    mine, theirs = tree.query(these, predicate="intersects")
+    order = np.lexsort((theirs, mine))
+    mine, theirs = mine[order], theirs[order]
+    shared = shapely.intersection(these[mine], others[theirs])
+    shared_m2 = shapely.area(shared)
+    real = shared_m2 > _LEAST_M2
+    mine, theirs, shared, shared_m2 = mine[real], theirs[real], shared[real], shared_m2[real]
+    iou = shared_m2 / (shapely.area(these)[mine] + shapely.area(others)[theirs] - shared_m2)
+    best, best_iou = np.zeros(len(these), dtype=np.int64), np.zeros(len(these))
+    ascending = np.argsort(iou, kind="stable")
+    best[mine[ascending]], best_iou[mine[ascending]] = theirs[ascending], iou[ascending]
+    return _Overlap(best=best, best_iou=best_iou, covered=_covered_m2(mine, shared, shared_m2, count=len(these)))
+
+
+def _covered_m2(mine: Ints, shared: Geometries, shared_m2: Floats, *, count: int) -> Floats:
+    """Area of each union of shared pieces: a plain sum where there is one piece, as nearly everywhere."""
+    covered = np.bincount(mine, weights=shared_m2, minlength=count).astype(np.float64)
+    pieces = np.bincount(mine, minlength=count)
+    starts = np.cumsum(pieces) - pieces
+    for index in np.flatnonzero(pieces > 1):
+        part = slice(starts[index], starts[index] + pieces[index])
+        covered[index] = shapely.area(shapely.union_all(shared[part]))
+    return covered
+
+
+def compare_pieces(these: Pieces, others: Pieces) -> Verdict:
+    """Find which pieces of line have no line of the other state within `NEAR_M`.
+
+    Parameters
+    ----------
+    these, others : Pieces
+        One class in two states.
+
+    Returns
+    -------
+    Verdict
+        A piece is lost whole or not at all. The shift of a thing is the median over its kept length of the distance
+        to the other state.
+
+    Examples
+    --------
+    >>> old = make_pieces(np.array([shapely.LineString([(0, 0), (20, 0)])]))
+    >>> new = make_pieces(np.array([shapely.LineString([(0, 2), (10, 2)])]))
+    >>> float(compare_pieces(old, new).lost.sum())
+    5.0
+    """
+    distance = np.zeros(len(these.keys))
+    changed = np.flatnonzero(~np.isin(these.keys, others.keys))
+    distance[changed] = distance_m(these.middles[changed], others.segments)
+    kept = distance <= NEAR_M
+    lost = np.where(kept, 0.0, these.lengths_m)
+    shift = np.full(len(these.rows), np.nan)
+    things, medians = _medians(these.things[kept], distance[kept], these.lengths_m[kept])
+    shift[things] = medians
+    return Verdict(
+        amount=these.lengths_m, lost=lost, uncovered=lost, xy_m=these.middles, thing=these.things, shift_m=shift
+    )
+
+
+def distance_m(points_m: Floats, targets: Geometries, *, reach_m: float = NEAR_M) -> Floats:
+    """Distance from points, shape (N, 2), to the nearest target; infinite beyond `reach_m`.
+
+    Examples
+    --------
+    >>> distance_m(np.array([[0.0, 3.0], [0.0, 9.0]]), np.array([shapely.Point(0, 0)])).tolist()
+    [3.0, inf]
+    """
+    found = np.full(len(points_m), np.inf)
+    if len(targets) == 0 or len(points_m) == 0:
+        return found
+    tree = shapely.STRtree(targets)
+    (mine, _), distance = tree.query_nearest(
+        shapely.points(points_m), max_distance=reach_m, return_distance=True, all_matches=False
+    )
+    found[mine] = distance
+    return found
+
+
+def _medians(things: Ints, values: Floats, weights: Floats) -> tuple[Ints, Floats]:
+    """Numbers of the things that are there, ascending, and the weighted median of each one's values."""
+    order = np.lexsort((values, things))
+    things, values, weights = things[order], values[order], weights[order]
+    present, starts = np.unique(things, return_index=True)
+    if len(present) == 0:
+        return present, np.zeros(0)
+    total = np.add.reduceat(weights, starts)
+    before = np.cumsum(weights) - weights
+    within = before - np.repeat(before[starts], np.diff(np.append(starts, len(things))))
+    passed = within + weights >= np.repeat(total, np.diff(np.append(starts, len(things)))) / 2 - _LEAST_M2
+    first = np.flatnonzero(passed)
+    _, chosen = np.unique(things[first], return_index=True)
+    return present, values[first[chosen]]
+
+
+def covered_share(shapes: Geometries, covers: Geometries) -> Floats:
+    """Share of each area that other areas cover together; lines and points among the covers cover nothing.
+
+    Examples
+    --------
+    >>> covered_share(shapely.box([0], 0, [10], 10), shapely.box([0, 0], 0, [5, 5], 10)).tolist()
+    [0.5]
+    """
+    areas = covers[np.isin(shapely.get_type_id(covers), _POLYGONAL)] if len(covers) else covers
+    if len(shapes) == 0 or len(areas) == 0:
+        return np.zeros(len(shapes))
+    return np.asarray(_overlap(shapes, areas).covered / shapely.area(shapes))
+
+
+def replaced_share(shapes: Geometries, newcomers: Geometries) -> Floats:
+    """Share of each area taken over by newcomers: those it is paired with, and those that lie mostly within it.
+
+    A forest that grows over a house takes the ground, not the place of the house; a car park on its footprint does.
+
+    Examples
+    --------
+    >>> house = shapely.box([0], 0, [10], 10)
+    >>> replaced_share(house, shapely.box([-500], -500, [500], 500)).tolist()
+    [0.0]
+    >>> replaced_share(house, shapely.box([0], 0, [10], 8)).tolist()
+    [0.8]
+    """
+    if len(shapes) == 0 or len(newcomers) == 0:
+        return np.zeros(len(shapes))
+    mine, theirs = shapely.STRtree(newcomers).query(shapes, predicate="intersects")
+    order = np.lexsort((theirs, mine))
+    mine, theirs = mine[order], theirs[order]
+    shared = shapely.intersection(shapes[mine], newcomers[theirs])
+    shared_m2, theirs_m2 = shapely.area(shared), shapely.area(newcomers)[theirs]
+    iou = shared_m2 / (shapely.area(shapes)[mine] + theirs_m2 - shared_m2)
+    real = (shared_m2 > _LEAST_M2) & ((iou > MATCH_IOU) | (shared_m2 > COVER_SHARE * theirs_m2))
+    covered = _covered_m2(mine[real], shared[real], shared_m2[real], count=len(shapes))
+    return np.asarray(covered / shapely.area(shapes))

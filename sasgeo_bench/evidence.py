@@ -156,7 +156,10 @@ def pack(cells: NDArray[np.uint8]) -> bytes:
     """
     flat = np.zeros(-(-cells.size // _CELLS_PER_BYTE) * _CELLS_PER_BYTE, dtype=np.uint8)
     flat[: cells.size] = cells.ravel()
-    return bytes(np.bitwise_or.reduce(flat.reshape(-1, _CELLS_PER_BYTE) << _SHIFTS, axis=1))
+    packed = np.zeros(len(flat) // _CELLS_PER_BYTE, dtype=np.uint8)
+    for first, shift in enumerate(_SHIFTS):
+        packed |= flat[first::_CELLS_PER_BYTE] << shift
+    return packed.tobytes()
 
 
 def unpack(packed: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:

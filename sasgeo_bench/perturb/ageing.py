@@ -124,9 +124,9 @@ class Ageing:
     -----
     A thing is a connected component; lines, which all connect, go and come in pieces of about 40 m. A thing vanishes
     with probability 1 - exp(-vanish * years). As many appear as a Poisson draw of mean
-    (exp(appear * years) - 1) * things says, which is what measured rates of appearing mean, each a turned copy of one of its class, set down nearby where
-    no building, water, road or railway is. One that finds no free place in twelve tries is left out, so dense places
-    grow less than asked.
+    (exp(appear * years) - 1) * things says, which is what measured rates of appearing mean, each a turned copy of one
+    of its class, set down nearby where no building, water, road or railway is. One that finds no free place in twelve
+    tries is left out, so dense places grow less than asked.
 
     Examples
     --------

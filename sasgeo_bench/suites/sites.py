@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,8 +25,8 @@ _ANCHOR_SPREAD: Final = 0.2  # of the view's side: how far a site lies from what
 class _Sums:
     """Sums over squares in constant time: an integral image of what is known and one of what is drawn."""
 
-    known: NDArray[np.int64]
-    drawn: NDArray[np.int64]
+    known: NDArray[np.int32]
+    drawn: NDArray[np.int32]
 
     def shares(self, row: int, col: int, half: int) -> tuple[float, float]:
         """Shares of known and of drawn cells in the square around a cell; beyond the map nothing is known."""
@@ -42,10 +43,8 @@ class _Sums:
         return (known, drawn)
 
 
-def _integral(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    table = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), dtype=np.int64)
-    np.cumsum(np.cumsum(mask, axis=0, dtype=np.int64), axis=1, out=table[1:, 1:])
-    return table
+def _integral(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+    return np.asarray(cv2.integral(mask.view(np.uint8)), dtype=np.int32)
 
 
 def choose_sites(

@@ -4,7 +4,6 @@
 import datetime as dt
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,11 +16,13 @@ from rich.table import Table
 from sasgeo_bench.ageing.measure import measure_ageing
 from sasgeo_bench.build import BuildPlan, build_region, plan_build
 from sasgeo_bench.doctor import examine
+from sasgeo_bench.duplicates import constellations, search_split
 from sasgeo_bench.errors import ConfigError, SasgeoError
 from sasgeo_bench.extract.history import MARGIN_M, date_extracts, read_history
 from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.region import Manifest
+from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.split import make_split
 from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
 from sasgeo_bench.store.catalog import (
@@ -33,12 +34,12 @@ from sasgeo_bench.store.catalog import (
     read_split_file,
 )
 from sasgeo_bench.store.ratebookfile import write_ratebook
-from sasgeo_bench.store.regiondir import differing_files, read_manifest
+from sasgeo_bench.store.regiondir import differing_files, read_features, read_manifest
 from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
 from sasgeo_bench.store.taskdir import TASK, read_task
 from sasgeo_bench.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.tasks import Request, default_suites, make_tasks, panels, wrong_place
+from sasgeo_bench.tasks import check_task, make_tasks, panels
 
 EXIT_USER: Final = 2
 EXIT_INTERRUPTED: Final = 130
@@ -196,7 +197,10 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
         list[str] | None, typer.Option(help="name from list-suites; may be repeated; default: all")
     ] = None,
     regions: Annotated[
-        list[str] | None, typer.Option("--regions", help="id from list-regions or own file; may be repeated")
+        list[str] | None,
+        typer.Option(
+            "--regions", help="id from list-regions, or own file; may be repeated; default: all that can be built"
+        ),
     ] = None,
     split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8,
@@ -215,13 +219,19 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
     jobs: Annotated[int, typer.Option(min=1, help="regions at once")] = 1,
 ) -> None:
     """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
-    requests = _requests(
-        suite or list(default_suites()), regions, split, n=n, seed=seed, out=out, folders=region_folders or []
+    wanted = Wanted(
+        suites=tuple(suite or SUITES),
+        regions=tuple(regions or ()),
+        split=split,
+        count=n,
+        seed=seed,
+        group=PriorGroup.parse(prior) if prior else None,
+        extract_folders=tuple(extracts or ()),
+        region_folders=tuple(region_folders or ()),
+        out=out,
+        may_be_fewer=up_to,
     )
-    group = PriorGroup.parse(prior) if prior else None
-    requests = [
-        replace(item, group=group, may_be_fewer=up_to, extract_folders=tuple(extracts or ())) for item in requests
-    ]
+    requests = plan_requests(wanted, tell=_tell)
     if dry_run:
         for item in requests:
             per_site = len(find_suite(item.suite).variants) * len(find_suite(item.suite).card.tracks)
@@ -251,37 +261,6 @@ def _make_all(requests: list[Request], *, skip: bool) -> None:
             if not skip:
                 raise
             _tell(f"{request.suite} on {request.region.id}: passed over, {error}")
-
-
-def _requests(
-    suites: list[str], regions: list[str] | None, split: str, *, n: int, seed: int, out: Path, folders: list[Path]
-) -> list[Request]:
-    """One request for every suite and region; everything is checked before anything is made."""
-    known = {name: read_region_file(path) for name, path in list_region_files(folders=folders).items()}
-    if n < 1:
-        message = f"--n must be at least 1, got {n}"
-        raise ConfigError(message)
-    if not regions:
-        message = "name the regions: --regions vaduz --regions monaco (list-regions shows all)"
-        raise ConfigError(message)
-    specs = [read_region_file(find_region_file(name, folders=folders)) for name in dict.fromkeys(regions)]
-    known |= {spec.id: spec for spec in specs}
-    for name in suites:
-        find_suite(name)
-    checked = make_split(read_split_file(find_split_file(split)), {name: item.grid() for name, item in known.items()})
-    return [
-        Request(
-            suite=name,
-            region=spec,
-            split=checked,
-            count=n,
-            seed=seed,
-            out=out,
-            elsewhere=wrong_place(checked, spec, known),
-        )
-        for spec in specs
-        for name in suites
-    ]
 
 
 @app.command("inspect")
@@ -375,14 +354,47 @@ def _reasons(manifest: Manifest) -> Table:
 
 
 @app.command("verify")
-def verify_command(folder: Annotated[Path, typer.Argument(help="a built region's folder")]) -> None:
-    """Hash every file of a region again and name each one that differs from the manifest."""
-    differing = differing_files(folder)
-    for line in differing:
+def verify_command(
+    target: Annotated[str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one")],
+    region_folders: RegionFolders = None,
+    out: Out = Path("out"),
+) -> None:
+    """Hold a region or a task against its hashes; search the parts of a split for ground they share."""
+    task_folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
+    if (task_folder / TASK).is_file():
+        faults, good = (
+            check_task(task_folder, out=out),
+            "all files are as task.json says, and every query has its truth",
+        )
+    elif target.endswith(".toml") or target in list_split_files():
+        faults, good = _shared_ground(target, out, region_folders or [])
+    else:
+        folder = Path(target) if Path(target).is_dir() else out / "regions" / target
+        faults, good = differing_files(folder), "all files are as the manifest says"
+    for line in faults:
         typer.echo(line)
-    if differing:
+    if faults:
         raise typer.Exit(EXIT_USER)
-    typer.echo(f"{folder}: all files are as the manifest says")
+    typer.echo(f"{target}: {good}")
+
+
+def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[str], str]:
+    """Ground that parts of a split share, and what was searched."""
+    grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
+    split = make_split(read_split_file(find_split_file(target)), grids)
+    built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]
+    missing = [region for region in split.spec.region_ids if region not in built]
+    if missing:
+        _tell(f"{len(missing)} regions are not built and not searched: {', '.join(missing)}")
+    if not built:
+        message = f"no region of split {split.spec.id!r} is built in {out / 'regions'}: build-region them first"
+        raise ConfigError(message)
+    maps = {region: constellations(read_features(out / "regions" / region)) for region in built}
+    faults = [
+        f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
+        for item in search_split(split, maps)
+    ]
+    return faults, f"no two parts share ground, {len(built)} regions searched"
 
 
 @app.command("doctor")

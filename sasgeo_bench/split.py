@@ -61,7 +61,7 @@ class SplitFile(Document):
     kind: Literal["holdout", "crossfit"]
     buffer_m: Annotated[float, Field(ge=0, le=1e6)]
     block_m: Annotated[float, Field(ge=100, le=20_000)] = 1000.0
-    reach_m: Annotated[float, Field(ge=0, le=5000)] = 300.0
+    reach_m: Annotated[float, Field(ge=0, le=5000)] = 360.0
     place: Annotated[list[Place], Field(min_length=2)]
 
     @model_validator(mode="after")
@@ -169,6 +169,10 @@ class Split:
         found = [block for blocks in self.blocks.values() for block in blocks if block.region == region]
         return tuple(sorted(found, key=lambda block: (block.row, block.col)))
 
+    def part_of(self, place: str) -> str:
+        """What must not meet another such: the part in a hold-out, each place by itself in a cross-fit."""
+        return place if self.spec.kind == "crossfit" else self.folds[0].part_of[place]
+
     def part_in_task(self, block: Block) -> str:
         """What a query in a block is for: a part of a hold-out; "crossfit" where every place is test in its fold."""
         return "crossfit" if self.spec.kind == "crossfit" else self.folds[0].part_of[self.place_of[block.id]]
@@ -267,15 +271,10 @@ def nearest_pair(split: Split, *, within_m: float = math.inf) -> Pair | None:
     In a cross-fit every place is a part of its own. Distances are taken on the real outlines: on the ellipsoid between
     far regions, in the CRS of the first where they are near.
     """
-    part = (
-        {place.name: place.part or "" for place in split.spec.place}
-        if split.spec.kind == "holdout"
-        else {place.name: place.name for place in split.spec.place}
-    )
     groups: dict[tuple[str, str], list[Block]] = {}
     for place, blocks in split.blocks.items():
         for block in blocks:
-            groups.setdefault((part[place], block.region), []).append(block)
+            groups.setdefault((split.part_of(place), block.region), []).append(block)
     pairs = sorted(_group_pairs(groups), key=lambda item: item[0])
     best: Pair | None = None
     for least_m, first, second in pairs:

@@ -1,86 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A suite, a region, a split and a seed -> queries and truths on disk: the order of the steps."""
+"""A request -> queries and truths on disk: the order of the steps; and what was made, looked at again."""
 
 import datetime as dt
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
-from numpy.typing import NDArray
 
 from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
-from sasgeo_bench.errors import ConfigError, ExtractError, SasgeoError, StoreError
+from sasgeo_bench.draw import CANDIDATES, Drawer, Job
+from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
 from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import TASK_VERSION, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
-from sasgeo_bench.split import Block, Split
+from sasgeo_bench.request import Request, Tell, aged_dates, check_count, check_roots
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sheet import Panel
-from sasgeo_bench.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
-from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, mine
-from sasgeo_bench.suites.sites import choose_sites
+from sasgeo_bench.suites.all_suites import find_suite
+from sasgeo_bench.suites.base import Scene, Seeds, Site, State, Suite, changed_share
+from sasgeo_bench.suites.mining import describe, mine
+from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.suites.synthetic_age import ageing_of
 from sasgeo_bench.twin import paste
-
-CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
-AGES_YEARS: Final = (2.0, 5.0, 10.0)
-_DAYS_PER_YEAR: Final = 365.25
-_TWIN_CLEAR: Final = 1.0  # half sides around a twin in which no other candidate lies
-_JITTER_M: Final = STRIDE_M / 2
-
-Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """What is asked for: one suite on one region.
-
-    Parameters
-    ----------
-    suite : str
-        Its name.
-    region : RegionFile
-        Where.
-    split : Split
-        Says the blocks and their parts.
-    count : int
-        Sites; each carries all the variants of the suite.
-    seed : int
-        Root of all chance.
-    out : Path
-        Root of what is built.
-    group : PriorGroup, optional
-        Priors; those of the suite unless given.
-    elsewhere : RegionFile, optional
-        Where views of a wrong place are taken.
-    extract_folders : sequence of Path
-        For regions that are not built yet.
-    may_be_fewer : bool
-        Whether as many sites as the region holds will do.
-    """
-
-    suite: str
-    region: RegionFile
-    split: Split
-    count: int
-    seed: int
-    out: Path
-    group: PriorGroup | None = None
-    elsewhere: RegionFile | None = None
-    extract_folders: tuple[Path, ...] = ()
-    may_be_fewer: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +66,8 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
         sites; nothing is written.
     """
     suite = find_suite(request.suite)
-    if request.count < 1:
-        message = f"--n must be at least 1, got {request.count}"
-        raise ConfigError(message)
+    check_count(request.count)
+    check_roots(request.out)
     scene, base = _scene(request, suite, tell)
     reason = suite.lack(scene)
     if reason is not None:
@@ -128,18 +79,17 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
     _check_reach(scene, suite, group)
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     scene, sites = _edited(request, suite, scene, base, sites, seeds)
-    drawer = _Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split)
+    drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split)
     return tuple(_write(request, drawer, sites, tell))
 
 
 def _check_reach(scene: Scene, suite: Suite, group: PriorGroup) -> None:
     """Refuse views whose footprint may reach farther beyond a block than the split allows for."""
     largest_m = max(variant.side_m for variant in suite.variants)
-    reach_m = largest_m / 2 * float(np.sqrt(2)) * (1 + 2 * group.scale_sigma)
-    # A scale of two sigma with weak priors needs more than the plain half diagonal: the split says how much there is.
-    if largest_m / 2 * float(np.sqrt(2)) > scene.reach_m:
+    reach_m = largest_m / 2 * float(np.sqrt(2)) * largest_scale(group)
+    if reach_m > scene.reach_m:
         message = (
-            f"views of {largest_m:g} m reach {reach_m:.0f} m beyond a block, the split allows {scene.reach_m:g} m: "
+            f"views of {largest_m:g} m reach up to {reach_m:.0f} m beyond a block, the split {scene.reach_m:g} m: "
             "use a split with a larger reach_m"
         )
         raise ConfigError(message)
@@ -191,23 +141,6 @@ def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell)
     return regiondir.read_region(plan.folder)
 
 
-def aged_dates(spec: RegionFile) -> tuple[dt.date, ...]:
-    """Dates of the older maps for real ageing: for each age the nearest there is, oldest first.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.store.catalog import find_region_file, read_region_file
-    >>> [str(date) for date in aged_dates(read_region_file(find_region_file("dreieich")))]
-    ['2013-07-19']
-    """
-    newest = spec.pick(None).date
-    older = sorted(extract.date for extract in spec.extract if extract.date < newest)
-    if not older:
-        return ()
-    ages_years = np.array([(newest - date).days / _DAYS_PER_YEAR for date in older])
-    return tuple(sorted({older[int(np.argmin(np.abs(np.log(ages_years / years))))] for years in AGES_YEARS}))
-
-
 def _edited(
     request: Request, suite: Suite, scene: Scene, base: Region, sites: tuple[Site, ...], seeds: Seeds
 ) -> tuple[Scene, tuple[Site, ...]]:
@@ -216,9 +149,12 @@ def _edited(
     if edit is None:
         return scene, sites
     kept = tuple(site for site in sites if edit.twins.get(site.index))
-    if not kept or (len(kept) < len(sites) and not request.may_be_fewer):
+    if not kept:
+        message = f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs"
+        raise ConfigError(message)
+    if len(kept) < len(sites) and not request.may_be_fewer:
         message = (
-            f"{request.region.id} has room for the twins of {len(kept)} of {len(sites)} sites of suite "
+            f"{request.region.id} has room for the copies of {len(kept)} of {len(sites)} sites of suite "
             f"{suite.card.name!r}: lower --n or pass --up-to"
         )
         raise ConfigError(message)
@@ -251,204 +187,13 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Job:
-    """One query to be drawn; its id is known before it is."""
-
-    query_id: str
-    site: Site
-    variant: Variant
-    track: Track
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Drawer:
-    """Draws the queries of one suite on one region.
-
-    `windows` and `mined` keep what a map and a size of view share.
-    """
-
-    suite: Suite
-    scene: Scene
-    seeds: Seeds
-    group: PriorGroup
-    split: Split
-    windows: dict[tuple[str, float], Windows] = field(default_factory=dict)
-    mined: dict[tuple[str, float, int], Decoys] = field(default_factory=dict)
-
-    def jobs(self, sites: Sequence[Site]) -> list[_Job]:
-        """All queries, in the order of their ids: neighbours in the table have nothing in common."""
-        jobs = [
-            _Job(
-                query_id=self._site_seeds(site).digest("query", variant.name, track).hex()[:24],
-                site=site,
-                variant=variant,
-                track=track,
-            )
-            for site in sites
-            for variant in self.suite.variants
-            for track in self.suite.card.tracks
-        ]
-        return sorted(jobs, key=lambda job: job.query_id)
-
-    def _site_seeds(self, site: Site) -> Seeds:
-        return self.seeds.under("site", site.index)
-
-    def can_draw(self, job: _Job) -> bool:
-        """Whether there are enough decoys: with a handful of candidates a retrieval query decides nothing."""
-        if job.track != "retrieval":
-            return True
-        state = self.scene.state(self.suite.map_region(self.scene, job.variant))
-        return len(self._mined(state, job.site, job.variant.side_m).points_m) >= min(CANDIDATES) - 1
-
-    def draw(self, job: _Job) -> tuple[Query, Truth]:
-        """Draw one query and its truth."""
-        site, seeds = job.site, self._site_seeds(job.site)
-        draft = self.suite.draw(self.scene, site, job.variant, seeds)
-        group = draft.group or self.group
-        state = self.scene.state(self.suite.map_region(self.scene, job.variant))
-        prior = make_prior(site.pose, group, away_m=draft.away_m, rng=seeds.rng("prior", group.name, draft.away_m))
-        decoys = self._mined(state, site, job.variant.side_m)
-        places: tuple[Pose, ...] = ()
-        right = -1
-        if job.track == "retrieval":
-            places, right = self._candidates(job, draft, decoys, prior)
-        query = Query(
-            query_id=job.query_id,
-            track=job.track,
-            suite=self.suite.card.name,
-            suite_version=self.suite.card.version,
-            part=self.split.part_in_task(self._block(site)),
-            region=state.region,
-            evidence=draft.evidence,
-            observed_on=self.scene.world.date,
-            season=draft.season,
-            prior=prior,
-            prior_group=group.name,
-            candidates=places,
-            vectors=draft.vectors,
-        )
-        return query, self._truth(job, draft, state, decoys, right)
-
-    def _block(self, site: Site) -> Block:
-        return next(block for block in self.scene.blocks if block.id == site.block)
-
-    def _truth(self, job: _Job, draft: Draft, state: State, decoys: Decoys, right: int) -> Truth:
-        site, variant = job.site, job.variant
-        changed = draft.changed_share
-        if changed is None:
-            same = state is self.scene.world
-            cells, cell_m = variant.view_cells, variant.cell_size_m
-            views = (place.view(site.pose, size_cells=cells, cell_size_m=cell_m) for place in (self.scene.world, state))
-            changed = 0.0 if same else changed_share(*views)
-        return Truth(
-            query_id=job.query_id,
-            is_present=draft.is_present,
-            pose=site.pose if draft.has_pose else None,
-            candidate=right,
-            pair_id=self._site_seeds(site).digest("pair", job.track).hex()[:16],
-            role=variant.role,
-            kind=variant.kind,
-            strength=variant.strength,
-            strength_unit=self.suite.card.strength_unit,
-            unknown_share=draft.evidence.unknown_share,
-            changed_share=changed,
-            feature_density=site.density,
-            alias_index=decoys.alias_index,
-            block=site.block,
-            scene=",".join(self.scene.scenes),
-            measured=draft.measured,
-        )
-
-    def _mined(self, state: State, site: Site, side_m: float) -> Decoys:
-        center_m = (site.pose.easting_m, site.pose.northing_m)
-        key = (state.region, side_m)
-        if key not in self.windows:
-            self.windows[key] = describe(state, side_m=side_m)
-        if (*key, site.index) not in self.mined:
-            self.mined[*key, site.index] = mine(self.windows[key], center_m, count=max(CANDIDATES) - 1)
-        return self.mined[*key, site.index]
-
-    def _candidates(self, job: _Job, draft: Draft, decoys: Decoys, prior: Prior) -> tuple[tuple[Pose, ...], int]:
-        """The true place, its twins, and the best decoys, shuffled; every one jittered alike."""
-        site = job.site
-        truth = (site.pose.easting_m, site.pose.northing_m)
-        total = CANDIDATES[site.index % len(CANDIDATES)]
-        twins = np.array(self.scene.twins.get(site.index, ())).reshape(-1, 2)
-        points = decoys.points_m
-        for twin in twins:
-            points = points[np.hypot(*(points - twin).T) > _TWIN_CLEAR * job.variant.side_m / 2]
-        if draft.has_twins:
-            points = np.vstack((twins, points))
-        seeds = self._site_seeds(site)
-        rng = seeds.rng("candidates", job.variant.view_cells, job.variant.kind if draft.neighbours_m else "")
-        yaw_deg = prior.yaw_deg if prior.yaw_deg is not None else 0.0
-        if draft.neighbours_m:
-            return _clusters(truth, points[: total // 5 - 1], draft.neighbours_m, yaw_deg=yaw_deg, rng=rng)
-        own = None if draft.is_removed else truth
-        return candidates(own, points[: total - 1], yaw_deg=yaw_deg, jitter_m=_JITTER_M, rng=rng)
-
-
-def _clusters(
-    truth: tuple[float, float],
-    decoys_m: NDArray[np.float64],
-    cluster_m: Sequence[tuple[float, float]],
-    *,
-    yaw_deg: float,
-    rng: np.random.Generator,
-) -> tuple[tuple[Pose, ...], int]:
-    """A cluster of neighbours around every place; which of its cluster the truth is, is chance, as for decoys."""
-    shape = np.array(cluster_m)
-    at = int(np.argmin(np.hypot(*shape.T)))
-    centres = decoys_m + rng.uniform(-_JITTER_M, _JITTER_M, decoys_m.shape)
-    moved = [np.array(truth) + shape, *(centre + shape - shape[rng.integers(len(shape))] for centre in centres)]
-    points = np.concatenate(moved)
-    order = rng.permutation(len(points))
-    poses = tuple(
-        Pose(easting_m=round(float(x), 2), northing_m=round(float(y), 2), yaw_deg=yaw_deg) for x, y in points[order]
-    )
-    return poses, int(np.flatnonzero(order == at)[0])
-
-
-def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.Generator) -> Prior:
-    """Draw what is known before: a disc in which the truth lies anywhere, a heading and a scale off by their sigmas.
-
-    With `away_m` the disc lies so far off that its edge is that far from the truth.
-
-    Examples
-    --------
-    >>> pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=10.0)
-    >>> group = PriorGroup(radius_m=500.0, yaw="unknown", scale_sigma=0.03)
-    >>> prior = make_prior(pose, group, away_m=0.0, rng=np.random.default_rng(1))
-    >>> bool(np.hypot(*prior.center_m) <= 500), prior.yaw_deg is None
-    (True, True)
-    """
-    turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
-    center_m = None
-    if group.radius_m is not None:
-        apart_m = group.radius_m * radius_share if away_m == 0 else group.radius_m + away_m
-        center_m = (
-            round(float(pose.easting_m + apart_m * np.sin(turn)), 1),
-            round(float(pose.northing_m + apart_m * np.cos(turn)), 1),
-        )
-    sigma_deg = YAW_SIGMA_DEG[group.yaw]
-    yaw_deg = None if sigma_deg is None else round(float((pose.yaw_deg + sigma_deg * yaw_noise) % 360), 1)
-    return Prior(
-        center_m=center_m,
-        radius_m=group.radius_m,
-        yaw_deg=yaw_deg,
-        yaw_sigma_deg=sigma_deg,
-        scale_sigma=group.scale_sigma,
-    )
-
-
-def _write(request: Request, drawer: _Drawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
+def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
     """Write one task for every map that is searched."""
     jobs = drawer.jobs(sites)
     left = [job for job in jobs if drawer.can_draw(job)]
     if len(left) < len(jobs):
         tell(f"{len(jobs) - len(left)} retrieval queries left out: the map has fewer than {min(CANDIDATES) - 1} decoys")
-    by_map: dict[str, list[_Job]] = {}
+    by_map: dict[str, list[Job]] = {}
     if not left:
         message = f"{request.region.id} is too small for suite {drawer.suite.card.name!r}: no decoys far enough away"
         raise ConfigError(message)
@@ -478,9 +223,7 @@ def _write(request: Request, drawer: _Drawer, sites: Sequence[Site], tell: Tell)
         yield Made(folder=task_folder, queries=total, sites=len(sites))
 
 
-def _about(
-    request: Request, drawer: _Drawer, region: str, sites: Sequence[Site], jobs: Sequence[_Job]
-) -> dict[str, Any]:
+def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]) -> dict[str, Any]:
     """What `task.json` says of how the queries came to be; nothing of where they lie."""
     card = drawer.suite.card
     state = drawer.scene.state(region)
@@ -507,36 +250,14 @@ def _about(
     }
 
 
-def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile]) -> RegionFile | None:
-    """The region where views of a wrong place are taken: the next place of the split, town for town and real for real.
-
-    It depends on the split alone, so that asking for more regions changes no query.
-    """
-    places = [[name for name in place.regions if name in known] for place in split.spec.place]
-    at = next((index for index, names in enumerate(places) if region.id in names), None)
-    if at is None:
-        return None
-    is_town = region.pick(None).town is not None
-    for step in range(1, len(places)):
-        for name in places[(at + step) % len(places)]:
-            if (known[name].pick(None).town is not None) == is_town:
-                return known[name]
-    return None
-
-
-def default_suites() -> tuple[str, ...]:
-    """Names of all suites."""
-    return tuple(SUITES)
-
-
-def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -> bool:
-    """Whether a region is a town, or its newest extract is on this machine."""
-    offline = spec.model_copy(update={"extract": [item.model_copy(update={"urls": ()}) for item in spec.extract]})
-    try:
-        plan_build(offline, out=out, extract_folders=request_folders)
-    except ExtractError:
-        return False
-    return True
+def check_task(task_folder: Path, *, out: Path) -> list[str]:
+    """Hold a task against its hashes, its truths and the map it is to be searched in; a line for each fault."""
+    about = taskdir.read_task(task_folder)
+    faults = taskdir.task_faults(task_folder, out / "truth" / about["suite"] / about["region"])
+    manifest = regiondir.read_manifest(out / "regions" / about["region"])
+    if manifest.fingerprint != about["map_fingerprint"]:
+        faults.append(f"{about['region']} was built anew since: make the queries again")
+    return faults
 
 
 def panels(

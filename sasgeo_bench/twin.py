@@ -26,13 +26,15 @@ _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 class Paste:
     """One copy: what lies within a disc around `source_m` takes the place of what lies around `target_m`.
 
-    `change` edits the copy before it is moved, in the coordinates of the source; None copies it as it is.
+    `change` edits the copy before it is moved, in the coordinates of the source; None copies it as it is. Around the
+    disc a ring of `ring_m` is cleared: where the source is pasted onto itself, both places end alike.
     """
 
     source_m: tuple[float, float]
     target_m: tuple[float, float]
     radius_m: float
     change: Change | None = None
+    ring_m: float = 0.0
 
 
 def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFrame:
@@ -61,7 +63,7 @@ def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFra
     """
     if not pastes:
         return features
-    discs = [_disc(item.target_m, item.radius_m) for item in pastes]
+    discs = [_disc(item.target_m, item.radius_m + item.ring_m) for item in pastes]
     kept = _cut(features, shapely.union_all(discs), keep_inside=False)
     copies = [_copy(features, item) for item in pastes]
     table = pd.concat([kept, *copies], ignore_index=True)

@@ -53,6 +53,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "query": None,
     "split": None,
     "trajectory": None,
+    "duplicates": None,
     "twin": None,
     "suites": (
         *("base", "sites", "mining", "vectors", "twins"),
@@ -67,6 +68,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("preview", "sheet", "splitmap", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,
+    "request": None,
+    "draw": None,
     "tasks": None,
     "doctor": None,
     "sasgeo": ("weights", "raster", "graph", "temporal", "joint", "integrity"),

@@ -120,7 +120,6 @@ def read_region(folder: Path) -> Region:
     """
     manifest = read_manifest(folder)
     try:
-        features = gpd.read_parquet(folder / FEATURES)
         graph = MapGraph(nodes=gpd.read_parquet(folder / NODES), edges=pd.read_parquet(folder / EDGES))
     except (OSError, ValueError) as error:
         message = f"{folder} is damaged ({' '.join(str(error).split())[:200]}): build the region again"
@@ -128,10 +127,26 @@ def read_region(folder: Path) -> Region:
     return Region(
         manifest=manifest,
         layers=read_layers(folder / LAYERS),
-        features=check_features(features),
+        features=read_features(folder),
         graph=graph,
         coverage=shapely.from_wkt(manifest.coverage.wkt),
     )
+
+
+def read_features(folder: Path) -> gpd.GeoDataFrame:
+    """Read a region's features alone.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no region, or the file cannot be read.
+    """
+    read_manifest(folder)
+    try:
+        return check_features(gpd.read_parquet(folder / FEATURES))
+    except (OSError, ValueError) as error:
+        message = f"{folder} is damaged ({' '.join(str(error).split())[:200]}): build the region again"
+        raise StoreError(message) from error
 
 
 def differing_files(folder: Path) -> list[str]:
@@ -159,7 +174,7 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        tell(f"{folder.name}: another build of this region is under way, waiting for it")
+        tell(f"{folder} is being written by another run, waiting for it")
         lock.acquire()
     try:
         yield

@@ -287,6 +287,43 @@ def read_task(folder: Path) -> dict[str, Any]:
     return dict(content)
 
 
+def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
+    """Hold a task against its `task.json` and its truths; a line for each fault.
+
+    Parameters
+    ----------
+    task_folder, truth_folder : Path
+        A task, and where its truths are; without truths only the task itself is looked at.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no task, or a file cannot be read.
+    """
+    about = read_task(task_folder)
+    faults = []
+    path, said = task_folder / QUERIES, about["files"][QUERIES]
+    if not path.is_file():
+        return [f"{QUERIES}: missing"]
+    found = file_record(path)
+    if found.model_dump() != said:
+        faults.append(f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {said['sha256']}")
+    known = {task_folder / TASK, path}
+    faults += [f"{other.name}: not part of a task" for other in sorted(task_folder.rglob("*")) if other not in known]
+    counts: dict[str, int] = {}
+    names = []
+    for query in read_queries(task_folder):
+        counts[query.track] = counts.get(query.track, 0) + 1
+        names.append(query.query_id)
+    if counts != about["counts"]:
+        faults.append(f"{QUERIES}: holds {counts}, {TASK} says {about['counts']}")
+    if (truth_folder / TRUTH).is_file():
+        answered = [truth.query_id for truth in read_truths(truth_folder)]
+        if answered != names:
+            faults.append(f"{TRUTH}: {len(answered)} truths that are not those of the {len(names)} queries, in order")
+    return faults
+
+
 def read_queries(folder: Path) -> Iterator[Query]:
     """Queries of a task in the order of their ids, a row group in memory at a time."""
     for row in _rows(folder / QUERIES):

@@ -207,6 +207,16 @@ class Suite:
         del variant
         return scene.map.region
 
+    @property
+    def main_side_m(self) -> float:
+        """Side of the view that most variants share."""
+        sides_m = [variant.side_m for variant in self.variants]
+        return max(set(sides_m), key=lambda side_m: (sides_m.count(side_m), -side_m))
+
+    def spacing_m(self) -> float:
+        """Least distance between two sites."""
+        return self.main_side_m
+
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
         """Easting and northing of places the sites must be centred near, shape (N, 2); None for anywhere."""
         del scene

@@ -21,7 +21,7 @@ from sasgeo_bench.suites.base import (
 )
 
 AGES_YEARS: Final = (2.0, 5.0, 10.0)
-_DAYS_PER_YEAR: Final = 365.25
+DAYS_PER_YEAR: Final = 365.25
 _NEAR_ENOUGH: Final = 0.6  # of the age asked for: a date farther off does not stand for it
 
 
@@ -62,7 +62,7 @@ class RealAgeSuite(Suite):
 
 def age_years(old: State, new: State) -> float:
     """Years between two states."""
-    return (new.date - old.date).days / _DAYS_PER_YEAR
+    return (new.date - old.date).days / DAYS_PER_YEAR
 
 
 def map_of_age(scene: Scene, years: float) -> State:

@@ -70,7 +70,7 @@ def choose_sites(
     Returns
     -------
     tuple of Site
-        The first `count` of one long sequence: a larger count only adds to it. Centres are at least one main view
+        The first `count` of one long sequence: a larger count only adds to it. Centres are at least the suite's spacing
         apart.
 
     Raises
@@ -80,11 +80,11 @@ def choose_sites(
     """
     sums = _Sums(known=_integral(scene.map.known), drawn=_integral(scene.map.drawn))
     anchors = suite.anchors(scene)
-    side_m = max(variant.side_m for variant in suite.variants if variant.view_cells <= _main_cells(suite))
+    spacing_m = suite.spacing_m()
     found: list[Site] = []
     centres: list[tuple[float, float]] = []
     streams = [
-        _places(scene, suite, block, anchors, seeds.under("block", block.row, block.col), sums, centres, side_m)
+        _places(scene, suite, block, anchors, seeds.under("block", block.row, block.col), sums, centres, spacing_m)
         for block in scene.blocks
     ]
     while streams and len(found) < count:
@@ -97,19 +97,18 @@ def choose_sites(
             centres.append((place.easting_m, place.northing_m))
             if len(found) == count:
                 break
-    if not found or (len(found) < count and not may_be_fewer):
+    if not found:
+        message = (
+            f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn there"
+        )
+        raise ConfigError(message)
+    if len(found) < count and not may_be_fewer:
         message = (
             f"{scene.map.region} holds {len(found)} places for suite {suite.card.name!r} that do not overlap, "
             f"{count} were asked for: lower --n or pass --up-to"
         )
         raise ConfigError(message)
     return tuple(found)
-
-
-def _main_cells(suite: Suite) -> int:
-    """The view most variants share."""
-    sizes = [variant.view_cells for variant in suite.variants]
-    return max(set(sizes), key=lambda size: (sizes.count(size), -size))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +127,7 @@ def _places(  # noqa: PLR0913, PLR0917 - one loop over what a place must hold to
     seeds: Seeds,
     sums: _Sums,
     centres: list[tuple[float, float]],
-    side_m: float,
+    spacing_m: float,
 ) -> Iterator[_Place]:
     """Draw places of one block that the suite can use, none near `centres`, until too many draws in a row failed."""
     rng = seeds.rng("places")
@@ -140,7 +139,7 @@ def _places(  # noqa: PLR0913, PLR0917 - one loop over what a place must hold to
         if len(near) == 0:
             return
     largest_m = max(variant.side_m for variant in suite.variants)
-    main_m = _main_cells(suite) * suite.variants[0].cell_size_m
+    main_m = suite.main_side_m
     failed = 0
     while failed < _TRIES:
         point = rng.uniform((west, south), (east, north))
@@ -149,7 +148,7 @@ def _places(  # noqa: PLR0913, PLR0917 - one loop over what a place must hold to
         place = (float(point[0]), float(point[1]))
         is_within = west <= place[0] < east and south <= place[1] < north
         density = _density(scene, point, sums, largest_m=largest_m, main_m=main_m) if is_within else None
-        if density is None or density < suite.card.min_density or not _is_free(place, centres, side_m):
+        if density is None or density < suite.card.min_density or not _is_free(place, centres, spacing_m):
             failed += 1
             continue
         failed = 0
@@ -166,11 +165,22 @@ def _density(scene: Scene, point: NDArray[np.float64], sums: _Sums, *, largest_m
     return sums.shares(row, col, max(1, round(main_m / 2 / cell_m)))[1]
 
 
-def _is_free(place: tuple[float, float], centres: list[tuple[float, float]], side_m: float) -> bool:
+def _is_free(place: tuple[float, float], centres: list[tuple[float, float]], spacing_m: float) -> bool:
     if not centres:
         return True
     apart = np.hypot(*(np.array(centres) - place).T)
-    return bool(apart.min() >= side_m)
+    return bool(apart.min() >= spacing_m)
+
+
+def largest_scale(group: PriorGroup) -> float:
+    """Largest scale that a view of a prior group can have.
+
+    Examples
+    --------
+    >>> largest_scale(PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15))
+    1.3
+    """
+    return 1.0 + _SCALE_CUT * group.scale_sigma
 
 
 def _site(place: _Place, index: int, seeds: Seeds, group: PriorGroup) -> Site:

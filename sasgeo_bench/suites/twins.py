@@ -18,6 +18,7 @@ from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.twin import Change, Paste
 
 LATTICE_M: Final = 16.0
+RING_M: Final = 12.0  # cleared around a site and its twins: a cut rim must not tell the copy from the place
 _APART: Final = 3.0  # radii between a site and its twin, as for every decoy
 _TRIES: Final = 60
 
@@ -71,10 +72,14 @@ class TwinSuite(Suite):
         """Of the discs that are copied: the half diagonal of the largest view, and a little for its scale."""
         return max(variant.side_m for variant in self.variants) / 2 * float(np.sqrt(2)) * 1.08
 
+    def spacing_m(self) -> float:
+        """So that the discs of two sites, which are cut out of the map, do not meet."""
+        return 2 * (self.radius_m() + RING_M)
+
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
         """Find a place for every twin and say what is copied where."""
         radius_m = self.radius_m()
-        targets = find_targets(scene.map, sites, radius_m=radius_m, copies=self.copies, seeds=seeds)
+        targets = find_targets(scene.map, sites, radius_m=radius_m + RING_M, copies=self.copies, seeds=seeds)
         pastes: list[Paste] = []
         for site in sites:
             if site.index not in targets:
@@ -82,12 +87,10 @@ class TwinSuite(Suite):
             center_m = (site.pose.easting_m, site.pose.northing_m)
             change = self.change_of(scene, site, seeds.rng("twin", *_key(site))) if self.change_of else None
             swapped = self.is_swapped and site.index % 2 == 1
-            if swapped:
-                pastes.append(Paste(source_m=center_m, target_m=center_m, radius_m=radius_m, change=change))
-            twin_change = None if swapped else change
+            plain = Paste(source_m=center_m, target_m=center_m, radius_m=radius_m, ring_m=RING_M)
+            pastes.append(replace(plain, change=change if swapped else None))
             pastes += [
-                Paste(source_m=center_m, target_m=target, radius_m=radius_m, change=twin_change)
-                for target in targets[site.index]
+                replace(plain, target_m=target, change=None if swapped else change) for target in targets[site.index]
             ]
         return Edit(map_pastes=tuple(pastes), world_pastes=None, twins=targets)
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, SuiteCard, Variant, changed_share, perceived
 from sasgeo_bench.suites.twins import TWIN_GROUP, TwinSuite
-from sasgeo_bench.twin import Paste, mirror
+from sasgeo_bench.twin import mirror
 
 VOLATILE: Final = ("farmland", "parking", "field_boundary", "building", "green")
 STABLE: Final = ("road_major", "road_minor", "path_track", "railway", "water", "waterway", "coastline", "bridge")
@@ -24,22 +24,14 @@ class VolatileLure(TwinSuite):
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
         """Change the world at the sites, and paste the lures into the map."""
         plain = super().edit(scene, sites, seeds)
-        lures, world = [], []
-        for paste in plain.map_pastes:
-            center_m = paste.source_m
-            change = partial(mirror, classes=(*VOLATILE, *STABLE), center_m=center_m)
-            lures.append(replace(paste, change=change))
-        for index in plain.twins:
-            center_m = (sites[index].pose.easting_m, sites[index].pose.northing_m)
-            world.append(
-                Paste(
-                    source_m=center_m,
-                    target_m=center_m,
-                    radius_m=self.radius_m(),
-                    change=partial(mirror, classes=VOLATILE, center_m=center_m),
-                )
-            )
-        return Edit(map_pastes=tuple(lures), world_pastes=tuple(world), twins=plain.twins)
+        own = [item for item in plain.map_pastes if item.source_m == item.target_m]
+        lures = [
+            replace(item, change=partial(mirror, classes=(*VOLATILE, *STABLE), center_m=item.source_m))
+            for item in plain.map_pastes
+            if item not in own
+        ]
+        world = [replace(item, change=partial(mirror, classes=VOLATILE, center_m=item.source_m)) for item in own]
+        return Edit(map_pastes=(*own, *lures), world_pastes=tuple(world), twins=plain.twins)
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """The control and the falsifier see the map as it is, the stress the changed world."""

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The queries and truths of a suite at its sites: ids, priors, candidates and strata are the same for all suites."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.query import YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
+from sasgeo_bench.split import Block, Split
+from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
+from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, mine
+
+CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
+_TWIN_CLEAR: Final = 1.0  # half sides around a twin in which no other candidate lies
+_JITTER_M: Final = STRIDE_M / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One query to be drawn; its id is known before it is."""
+
+    query_id: str
+    site: Site
+    variant: Variant
+    track: Track
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawer:
+    """Draws the queries of one suite on one region.
+
+    `windows` and `mined` keep what a map and a size of view share.
+    """
+
+    suite: Suite
+    scene: Scene
+    seeds: Seeds
+    group: PriorGroup
+    split: Split
+    windows: dict[tuple[str, float], Windows] = field(default_factory=dict)
+    mined: dict[tuple[str, float, int], Decoys] = field(default_factory=dict)
+
+    def jobs(self, sites: Sequence[Site]) -> list[Job]:
+        """All queries, in the order of their ids: neighbours in the table have nothing in common."""
+        jobs = [
+            Job(
+                query_id=self._site_seeds(site).digest("query", variant.name, track).hex()[:24],
+                site=site,
+                variant=variant,
+                track=track,
+            )
+            for site in sites
+            for variant in self.suite.variants
+            for track in self.suite.card.tracks
+        ]
+        return sorted(jobs, key=lambda job: job.query_id)
+
+    def _site_seeds(self, site: Site) -> Seeds:
+        return self.seeds.under("site", site.index)
+
+    def can_draw(self, job: Job) -> bool:
+        """Whether there are enough decoys: with a handful of candidates a retrieval query decides nothing."""
+        if job.track != "retrieval":
+            return True
+        state = self.scene.state(self.suite.map_region(self.scene, job.variant))
+        return len(self._mined(state, job.site, job.variant.side_m).points_m) >= min(CANDIDATES)
+
+    def draw(self, job: Job) -> tuple[Query, Truth]:
+        """Draw one query and its truth."""
+        site, seeds = job.site, self._site_seeds(job.site)
+        draft = self.suite.draw(self.scene, site, job.variant, seeds)
+        group = draft.group or self.group
+        if job.track == "retrieval":  # the candidates say where; a disc around the truth would tell which of them
+            group = replace(group, radius_m=None)
+        state = self.scene.state(self.suite.map_region(self.scene, job.variant))
+        prior = make_prior(site.pose, group, away_m=draft.away_m, rng=seeds.rng("prior", group.name, draft.away_m))
+        decoys = self._mined(state, site, job.variant.side_m)
+        places: tuple[Pose, ...] = ()
+        right = -1
+        if job.track == "retrieval":
+            places, right = self._candidates(job, draft, decoys, prior)
+        query = Query(
+            query_id=job.query_id,
+            track=job.track,
+            suite=self.suite.card.name,
+            suite_version=self.suite.card.version,
+            part=self.split.part_in_task(self._block(site)),
+            region=state.region,
+            evidence=draft.evidence,
+            observed_on=self.scene.world.date,
+            season=draft.season,
+            prior=prior,
+            prior_group=group.name,
+            candidates=places,
+            vectors=draft.vectors,
+        )
+        return query, self._truth(job, draft, state, decoys, right)
+
+    def _block(self, site: Site) -> Block:
+        return next(block for block in self.scene.blocks if block.id == site.block)
+
+    def _truth(self, job: Job, draft: Draft, state: State, decoys: Decoys, right: int) -> Truth:
+        site, variant = job.site, job.variant
+        changed = draft.changed_share
+        if changed is None:
+            same = state is self.scene.world
+            cells, cell_m = variant.view_cells, variant.cell_size_m
+            views = (place.view(site.pose, size_cells=cells, cell_size_m=cell_m) for place in (self.scene.world, state))
+            changed = 0.0 if same else changed_share(*views)
+        return Truth(
+            query_id=job.query_id,
+            is_present=draft.is_present,
+            pose=site.pose if draft.has_pose else None,
+            candidate=right,
+            pair_id=self._site_seeds(site).digest("pair", job.track).hex()[:16],
+            role=variant.role,
+            kind=variant.kind,
+            strength=variant.strength,
+            strength_unit=self.suite.card.strength_unit,
+            unknown_share=draft.evidence.unknown_share,
+            changed_share=changed,
+            feature_density=site.density,
+            alias_index=decoys.alias_index,
+            block=site.block,
+            scene=",".join(self.scene.scenes),
+            measured=draft.measured,
+        )
+
+    def _mined(self, state: State, site: Site, side_m: float) -> Decoys:
+        center_m = (site.pose.easting_m, site.pose.northing_m)
+        key = (state.region, side_m)
+        if key not in self.windows:
+            self.windows[key] = describe(state, side_m=side_m)
+        if (*key, site.index) not in self.mined:
+            self.mined[*key, site.index] = mine(self.windows[key], center_m, count=max(CANDIDATES))
+        return self.mined[*key, site.index]
+
+    def _candidates(self, job: Job, draft: Draft, decoys: Decoys, prior: Prior) -> tuple[tuple[Pose, ...], int]:
+        """The true place, its twins, and the best decoys, shuffled; every one jittered alike."""
+        site = job.site
+        truth = (site.pose.easting_m, site.pose.northing_m)
+        twins = np.array(self.scene.twins.get(site.index, ())).reshape(-1, 2)
+        points = decoys.points_m
+        for twin in twins:
+            points = points[np.hypot(*(points - twin).T) > _TWIN_CLEAR * job.variant.side_m / 2]
+        if draft.has_twins:
+            points = np.vstack((twins, points))
+        # As many with the truth as without it: their number must not say whether it is among them.
+        total = min(CANDIDATES[site.index % len(CANDIDATES)], len(points))
+        rng = self._site_seeds(site).rng(
+            "candidates", job.variant.view_cells, job.variant.kind if draft.neighbours_m else ""
+        )
+        yaw_deg = prior.yaw_deg if prior.yaw_deg is not None else 0.0
+        if draft.neighbours_m:
+            centres = points[: max(1, total // len(draft.neighbours_m)) - 1]
+            return _clusters(truth, centres, draft.neighbours_m, yaw_deg=yaw_deg, rng=rng)
+        own = None if draft.is_removed else truth
+        decoys_m = points[: total - (own is not None)]
+        return candidates(own, decoys_m, yaw_deg=yaw_deg, jitter_m=_JITTER_M, rng=rng)
+
+
+def _clusters(
+    truth: tuple[float, float],
+    decoys_m: NDArray[np.float64],
+    cluster_m: Sequence[tuple[float, float]],
+    *,
+    yaw_deg: float,
+    rng: np.random.Generator,
+) -> tuple[tuple[Pose, ...], int]:
+    """A cluster of neighbours around every place; which of its cluster the truth is, is chance, as for decoys."""
+    shape = np.array(cluster_m)
+    at = int(np.argmin(np.hypot(*shape.T)))
+    centres = decoys_m + rng.uniform(-_JITTER_M, _JITTER_M, decoys_m.shape)
+    moved = [np.array(truth) + shape, *(centre + shape - shape[rng.integers(len(shape))] for centre in centres)]
+    points = np.concatenate(moved)
+    order = rng.permutation(len(points))
+    poses = tuple(
+        Pose(easting_m=round(float(x), 2), northing_m=round(float(y), 2), yaw_deg=yaw_deg) for x, y in points[order]
+    )
+    return poses, int(np.flatnonzero(order == at)[0])
+
+
+def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.Generator) -> Prior:
+    """Draw what is known before: a disc in which the truth lies anywhere, a heading and a scale off by their sigmas.
+
+    With `away_m` the disc lies so far off that its edge is that far from the truth.
+
+    Examples
+    --------
+    >>> pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=10.0)
+    >>> group = PriorGroup(radius_m=500.0, yaw="unknown", scale_sigma=0.03)
+    >>> prior = make_prior(pose, group, away_m=0.0, rng=np.random.default_rng(1))
+    >>> bool(np.hypot(*prior.center_m) <= 500), prior.yaw_deg is None
+    (True, True)
+    """
+    turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
+    center_m = None
+    if group.radius_m is not None:
+        apart_m = group.radius_m * radius_share if away_m == 0 else group.radius_m + away_m
+        center_m = (
+            round(float(pose.easting_m + apart_m * np.sin(turn)), 1),
+            round(float(pose.northing_m + apart_m * np.cos(turn)), 1),
+        )
+    sigma_deg = YAW_SIGMA_DEG[group.yaw]
+    yaw_deg = None if sigma_deg is None else round(float((pose.yaw_deg + sigma_deg * yaw_noise) % 360), 1)
+    return Prior(
+        center_m=center_m,
+        radius_m=group.radius_m,
+        yaw_deg=yaw_deg,
+        yaw_sigma_deg=sigma_deg,
+        scale_sigma=group.scale_sigma,
+    )

@@ -99,7 +99,7 @@ def choose_sites(
                 break
     if not found:
         message = (
-            f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn there"
+            f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
         )
         raise ConfigError(message)
     if len(found) < count and not may_be_fewer:

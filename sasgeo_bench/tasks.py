@@ -15,7 +15,7 @@ from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
 from sasgeo_bench.draw import CANDIDATES, Drawer, Job
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
-from sasgeo_bench.evidence import LayerBits
+from sasgeo_bench.evidence import Evidence, LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
@@ -28,7 +28,7 @@ from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sheet import Panel
 from sasgeo_bench.suites.all_suites import find_suite
-from sasgeo_bench.suites.base import Scene, Seeds, Site, State, Suite, changed_share
+from sasgeo_bench.suites.base import DRAWN_CLASSES, Scene, Seeds, Site, State, Suite, changed_share
 from sasgeo_bench.suites.mining import describe, mine
 from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.suites.synthetic_age import ageing_of
@@ -342,5 +342,12 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Sequence[Pose]) -> 
         state.view(replace(truth.pose, easting_m=x, northing_m=y), size_cells=size, cell_size_m=cell_m)
         for x, y in places
     ]
-    hardest = min(views, key=lambda view: changed_share(at_truth, view), default=None)
+    hardest = min(views, key=lambda view: changed_share(_drawn(at_truth), _drawn(view)), default=None)
     return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=hardest)
+
+
+def _drawn(evidence: Evidence) -> Evidence:
+    """What a person looks at: roads, buildings and water, not the ground cover that fills most of a view."""
+    chosen = [index for index, name in enumerate(evidence.classes) if name in (*DRAWN_CLASSES, "water", "bridge")]
+    names = tuple(evidence.classes[index] for index in chosen)
+    return Evidence(classes=names, cells=evidence.cells[chosen], cell_size_m=evidence.cell_size_m)

@@ -23,6 +23,7 @@ _UNDER_LEAVES: Final = ("path_track", "road_minor", "waterway", "field_boundary"
 _SNOWED_UNDER: Final = ("path_track", "field_boundary")
 _WHITE: Final = ("farmland", "green", "parking")
 _RETREAT_M: Final = 12.0  # of the waterline at strength 1, from a gentle bank
+_LARGEST_MEADOW: Final = 0.25  # of the view
 _REGROWN: Final = 0.3  # of the share of fields that look like green, the share of green that looks like a field
 
 
@@ -102,7 +103,8 @@ class Season:
         boundary = _of(layers, "field_boundary")
         farmland, green = _of(layers, "farmland"), _of(layers, "green")
         mown = _some_parcels(farmland, boundary, self.strength, rng)
-        grown = _some_parcels(green & ~farmland, boundary, self.strength * _REGROWN, rng)
+        # Green that fills the view is a wood or a mountain side, and no field.
+        grown = _some_parcels(green & ~farmland, boundary, self.strength * _REGROWN, rng, most=_LARGEST_MEADOW)
         for name, gained, lost in (("green", mown, grown), ("farmland", grown, mown)):
             if name in layers:
                 layers[name][lost] = ABSENT
@@ -129,8 +131,12 @@ def _strongest(noise: Field, mask: Mask, share: float) -> Mask:
     return mask & (noise >= highest(noise[mask], share * np.count_nonzero(mask)))
 
 
-def _some_parcels(mask: Mask, boundary: Mask, share: float, rng: np.random.Generator) -> Mask:
-    """Parcels between boundaries, each chosen with probability `share`, with the boundary cells that belong to them."""
+def _some_parcels(mask: Mask, boundary: Mask, share: float, rng: np.random.Generator, *, most: float = 1.0) -> Mask:
+    """Parcels between boundaries, each chosen with probability `share`, with the boundary cells that belong to them.
+
+    One that covers more than `most` of the view stays.
+    """
     parcels = find_objects(mask & ~boundary)
-    chosen = parcels.mask_of(rng.random(len(parcels.areas_cells)) < share)
+    is_chosen = (rng.random(len(parcels.areas_cells)) < share) & (parcels.areas_cells <= most * mask.size)
+    chosen = parcels.mask_of(is_chosen)
     return dilated(chosen, 1.5) & mask & (chosen | boundary)

@@ -25,6 +25,7 @@ from sasgeo_bench.suites.base import (
 
 YEARS: Final = (2.0, 5.0, 10.0, 20.0)
 REDRAWN_WITHIN_YEARS: Final = 10.0  # the span that the share of redrawn things in a scene's ageing stands for
+_MOST_NEW_PER_OLD: Final = 1.0
 _SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
 _MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
 
@@ -79,6 +80,9 @@ def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
 def after(ageing: Ageing, years: float) -> Ageing:
     """Ageing by so many years; the share that was drawn anew grows with them.
 
+    A class no more than doubles: rates of appearing were measured on maps that were being filled, and one that is full
+    has not as much to catch up on.
+
     Examples
     --------
     >>> from sasgeo_bench.perturb.ageing import AgeingRates
@@ -87,7 +91,12 @@ def after(ageing: Ageing, years: float) -> Ageing:
     0.2
     """
     kept = (1 - ageing.redrawn) ** (years / REDRAWN_WITHIN_YEARS)
-    return replace(ageing, years=years, redrawn=1 - kept)
+    most = float(np.log1p(_MOST_NEW_PER_OLD)) / years if years > 0 else np.inf
+    classes = {
+        name: replace(rates, appear_per_year=min(rates.appear_per_year, most))
+        for name, rates in ageing.rates.classes.items()
+    }
+    return replace(ageing, years=years, redrawn=1 - kept, rates=replace(ageing.rates, classes=classes))
 
 
 SUITE: Final = SyntheticAgeSuite(

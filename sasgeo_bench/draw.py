@@ -77,7 +77,9 @@ class Drawer:
         if job.track == "retrieval":  # the candidates say where; a disc around the truth would tell which of them
             group = replace(group, radius_m=None)
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))
-        prior = make_prior(site.pose, group, away_m=draft.away_m, rng=seeds.rng("prior", group.name, draft.away_m))
+        prior = make_prior(
+            draft.pose or site.pose, group, away_m=draft.away_m, rng=seeds.rng("prior", group.name, draft.away_m)
+        )
         decoys = self._mined(state, site, job.variant.side_m)
         places: tuple[Pose, ...] = ()
         right = -1
@@ -114,7 +116,7 @@ class Drawer:
         return Truth(
             query_id=job.query_id,
             is_present=draft.is_present,
-            pose=site.pose if draft.has_pose else None,
+            pose=(draft.pose or site.pose) if draft.has_pose else None,
             candidate=right,
             pair_id=self._site_seeds(site).digest("pair", job.track).hex()[:16],
             role=variant.role,

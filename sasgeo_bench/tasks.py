@@ -3,7 +3,7 @@
 
 import datetime as dt
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -301,12 +301,8 @@ def panels(
         if query.query_id in wanted:
             queries[query.query_id] = query
         if query.candidates and truth.pose in poses and truth.pose is not None:
-            others = tuple(pose for at, pose in enumerate(query.candidates) if at != truth.candidate)
-            rivals.setdefault(truth.pose, others)
-    return tuple(
-        _panel(queries[truth.query_id], truth, state, rivals.get(truth.pose, ()) if truth.pose else ())
-        for truth in chosen
-    )
+            rivals.setdefault(truth.pose, _others(query, truth))
+    return tuple(_panel(queries[truth.query_id], truth, state, rivals) for truth in chosen)
 
 
 def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
@@ -327,13 +323,21 @@ def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
     return (chosen + rest)[:count]
 
 
-def _panel(query: Query, truth: Truth, state: State, rivals: Sequence[Pose]) -> Panel:
-    """What the map shows at the truth, and at the candidate that overlaps most with it; mined where there is none."""
+def _others(query: Query, truth: Truth) -> tuple[Pose, ...]:
+    return tuple(pose for at, pose in enumerate(query.candidates) if at != truth.candidate)
+
+
+def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple[Pose, ...]]) -> Panel:
+    """What the map shows at the truth, and at the candidate that overlaps most with it.
+
+    A query without candidates takes those of another one at the same place, or what is mined where there is none.
+    """
     if truth.pose is None:
         return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
     size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
     at_truth = state.view(truth.pose, size_cells=size, cell_size_m=cell_m)
-    places = [(pose.easting_m, pose.northing_m) for pose in rivals]
+    near = _others(query, truth) or rivals.get(truth.pose, ())
+    places = [(pose.easting_m, pose.northing_m) for pose in near]
     if not places:
         center_m = (truth.pose.easting_m, truth.pose.northing_m)
         mined = mine(describe(state, side_m=size * cell_m), center_m, count=1).points_m

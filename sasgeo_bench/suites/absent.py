@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `absent`: views whose place cannot be found, each kind apart."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from sasgeo_bench.evidence import Evidence
+from sasgeo_bench.pose import Pose
 from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, Suite, SuiteCard, Variant, controls, perceived
 
 PATCH_CELLS: Final = 24
 _TURNS: Final = 4
+_TRIES: Final = 64
+_MOST_DRAWN: Final = 0.003  # of a feature-poor view
 
 
 class AbsentSuite(Suite):
-    """Outside the searched map, feature-poor, another town, or a corrupted view; the control is present."""
+    """Outside the searched map, feature-poor, another town, or a corrupted view; the control is as everywhere."""
 
     def lack(self, scene: Scene) -> str | None:
         """A place to take a wrong view from is needed."""
@@ -30,9 +34,7 @@ class AbsentSuite(Suite):
                 evidence=seen, is_present=False, away_m=2 * variant.side_m, measured={"away_m": 2 * variant.side_m}
             )
         if variant.kind == "feature-poor":
-            poor = strip(seen)
-            left = float((poor.cells == 1).sum() / max(1, (seen.cells == 1).sum()))
-            return Draft(evidence=poor, is_present=False, measured={"present_left": left})
+            return _feature_poor(scene, site, variant, seeds)
         if variant.kind == "wrong place" and scene.elsewhere is not None:
             other = _same_place_elsewhere(scene, site, seeds)
             return Draft(
@@ -46,6 +48,35 @@ class AbsentSuite(Suite):
             moved = float((broken.cells != seen.cells).mean())
             return Draft(evidence=broken, is_present=False, measured={"cells_changed": moved})
         return Draft(evidence=seen)
+
+
+def _feature_poor(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+    """A place of the same block with nearly nothing drawn on it; the site's own view without its things if none is.
+
+    The place is on the map, so an answer may be right; but there is next to nothing to tell it by.
+    """
+    poor = _poor_place(scene, site, variant, seeds)
+    if poor is not None:
+        there = replace(site, pose=poor)
+        return Draft(evidence=perceived(scene.world, there, variant, seeds), pose=poor, measured={"is_real_place": 1.0})
+    seen = perceived(scene.world, site, variant, seeds)
+    return Draft(evidence=strip(seen), measured={"is_real_place": 0.0})
+
+
+def _poor_place(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Pose | None:
+    """A place in the site's block whose square is mapped and holds hardly anything drawn."""
+    block = next(item for item in scene.blocks if item.id == site.block)
+    west, south, east, north = block.bounds_m
+    state, rng = scene.map, seeds.rng("feature-poor")
+    half = round(variant.side_m / 2 / state.grid.cell_size_m)
+    for _ in range(_TRIES):
+        easting_m, northing_m = (float(value) for value in rng.uniform((west, south), (east, north)))
+        row, col = state.grid.to_cells(np.array([[easting_m, northing_m]]))[0].tolist()
+        window = (slice(max(0, row - half), row + half), slice(max(0, col - half), col + half))
+        is_mapped = state.known[window].size == (2 * half) ** 2 and state.known[window].all()
+        if is_mapped and state.drawn[window].mean() <= _MOST_DRAWN:
+            return replace(site.pose, easting_m=easting_m, northing_m=northing_m)
+    return None
 
 
 def strip(evidence: Evidence) -> Evidence:
@@ -81,7 +112,7 @@ def _same_place_elsewhere(scene: Scene, site: Site, seeds: Seeds) -> Site:
     west, south, east, north = other.grid.bounds_m
     best: tuple[float, Site] | None = None
     margin_m = 0.5 * min(east - west, north - south, 400.0)
-    for _ in range(64):
+    for _ in range(_TRIES):
         x, y = rng.uniform((west + margin_m, south + margin_m), (east - margin_m + 1e-6, north - margin_m + 1e-6))
         row, col = other.grid.to_cells(np.array([[x, y]]))[0].tolist()
         half = round(margin_m / other.grid.cell_size_m / 2)
@@ -89,9 +120,7 @@ def _same_place_elsewhere(scene: Scene, site: Site, seeds: Seeds) -> Site:
         if not other.known[window].all():
             continue
         density = float(other.drawn[window].mean())
-        pose = type(site.pose)(
-            easting_m=float(x), northing_m=float(y), yaw_deg=site.pose.yaw_deg, scale=site.pose.scale
-        )
+        pose = Pose(easting_m=float(x), northing_m=float(y), yaw_deg=site.pose.yaw_deg, scale=site.pose.scale)
         found = Site(index=site.index, pose=pose, block=site.block, density=density)
         if best is None or abs(density - site.density) < best[0]:
             best = (abs(density - site.density), found)
@@ -103,11 +132,11 @@ SUITE: Final = AbsentSuite(
         name="absent",
         version=1,
         title="Absent places",
-        what="The true place is not in the searched map, nothing is left to hold on to, the view is of another town, "
-        "or it is corrupted.",
+        what="The true place is not in the searched map, it has next to nothing to tell it by, the view is of another "
+        "town, or it is corrupted.",
         separates="Rejection: a matcher that answers here makes a false fix.",
         falsifier="The control of each site is present and must not be withheld more often than elsewhere.",
-        strength_unit="1 where absent",
+        strength_unit="1 where it cannot be found",
     ),
     variants=(
         *controls(),

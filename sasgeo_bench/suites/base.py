@@ -134,15 +134,16 @@ class Site:
 class Draft:
     """What a suite made of a site and a variant, before ids, priors and candidates are added.
 
-    `vectors` lie in the view's frame. `has_pose` is False where the view was not taken in this map. For retrieval,
-    `is_removed` leaves the true place out of the candidates, `neighbours_m` puts a cluster of places in place of each,
-    and `has_twins` says whether the site's twins are among them. `away_m` puts the searched disc so far from the truth
-    that it lies outside. `group` overrides the prior group.
+    `vectors` lie in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
+    where it was not taken in this map. For retrieval, `is_removed` leaves the true place out of the candidates,
+    `neighbours_m` puts a cluster of places in place of each, and `has_twins` says whether the site's twins are among
+    them. `away_m` puts the searched disc so far from the truth that it lies outside. `group` overrides the prior group.
     """
 
     evidence: Evidence
     is_present: bool = True
     has_pose: bool = True
+    pose: Pose | None = None
     vectors: gpd.GeoDataFrame | None = None
     is_removed: bool = False
     neighbours_m: tuple[tuple[float, float], ...] = ()

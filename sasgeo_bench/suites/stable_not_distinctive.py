@@ -13,7 +13,7 @@ from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, Suite, SuiteCard, Variant, perceived
 
 STABLE: Final = ("road_major", "railway", "waterway")
-VOLATILE: Final = ("farmland", "parking", "field_boundary", "building", "green")
+VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building")  # in this order they change
 MOST_ALIASES: Final = 8
 
 _STEP_M: Final = 40.0

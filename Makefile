@@ -15,12 +15,12 @@ SOURCES := sasgeo_bench baselines benchmarks tests
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region test check bench ageing docs lock clean
+.PHONY: help install demo list-regions build-region queries test check bench ageing docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@printf '\nVariables: REGION=<id> DATE=<yyyy-mm-dd> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
+	@printf '\nVariables: REGION=<id> DATE=<yyyy-mm-dd> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
 
 # Rebuilt when the lock or the packages' own metadata change; otherwise nothing runs, so a second call is quick.
 $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
@@ -46,6 +46,10 @@ build-region: $(STAMP) ## build one region: REGION=vaduz, and DATE=2021-10-28 fo
 	@test -n "$(REGION)" || { echo "name the region: make build-region REGION=vaduz (make list-regions shows all)" >&2; exit 2; }
 	$(SASGEO) build-region $(REGION) $(if $(DATE),--date $(DATE)) --out $(OUT) $(ARGS)
 
+queries: $(STAMP) ## draw every suite on the towns, and on each real region whose extract is here: N=8 sites each, SEED=0
+	$(SASGEO) make-queries --up-to --skip $(if $(N),--n $(N)) $(if $(SEED),--seed $(SEED)) \
+	  $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
+
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(ARGS)
 
@@ -56,6 +60,7 @@ check: $(STAMP) ## ruff and mypy, as CI runs them
 
 bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, never a test
 	$(VENV_PYTHON) benchmarks/perturb.py
+	$(VENV_PYTHON) benchmarks/make_queries.py
 	$(VENV_PYTHON) benchmarks/build_region.py $(ARGS)
 
 ageing: $(STAMP) ## measure docs/ageing anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS

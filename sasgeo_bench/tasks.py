@@ -68,7 +68,7 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
-    scene, base = _scene(request, suite, tell)
+    scene, base = read_scene(request, suite, tell)
     reason = suite.lack(scene)
     if reason is not None:
         message = f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason}"
@@ -95,7 +95,7 @@ def _check_reach(scene: Scene, suite: Suite, group: PriorGroup) -> None:
         raise ConfigError(message)
 
 
-def _scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
+def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
     """Build what is missing and read what the suite draws from."""
     base = _built(request, request.region, None, tell)
     blocks = request.split.blocks_in(request.region.id)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -220,6 +221,7 @@ def write_task(
     """
     counts: dict[str, int] = {}
     total = 0
+    frozen = hashlib.sha256()
     with ExitStack() as stack:
         queries, truths = (
             stack.enter_context(pq.ParquetWriter(path, schema, compression="zstd", compression_level=9))
@@ -230,6 +232,7 @@ def write_task(
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
             for query, _ in part:
                 counts[query.track] = counts.get(query.track, 0) + 1
+                frozen.update(query.query_id.encode() + _candidate_bytes(query))
             total += len(part)
     record = file_record(task_folder / QUERIES)
     content = {
@@ -237,12 +240,19 @@ def write_task(
         "task_version": TASK_VERSION,
         **about,
         "counts": counts,
+        "candidates_sha256": frozen.hexdigest(),
         "files": {QUERIES: record.model_dump()},
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
     }
     (task_folder / TASK).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return total
+
+
+def _candidate_bytes(query: Query) -> bytes:
+    """Poses of the candidates in their order, four little-endian doubles each: what the task's hash of them is of."""
+    rows = [(pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale) for pose in query.candidates]
+    return np.array(rows, dtype="<f8").tobytes()
 
 
 def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Query, Truth]]]:

@@ -11,6 +11,7 @@ from typing import Any
 import geopandas as gpd
 import numpy as np
 
+from sasgeo_bench import __version__
 from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
 from sasgeo_bench.draw import CANDIDATES, Drawer, Job
@@ -20,7 +21,7 @@ from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import TASK_VERSION, PriorGroup, Query, Truth
+from sasgeo_bench.query import PriorGroup, Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_count, check_roots
@@ -192,7 +193,7 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     jobs = drawer.jobs(sites)
     left = [job for job in jobs if drawer.can_draw(job)]
     if len(left) < len(jobs):
-        tell(f"{len(jobs) - len(left)} retrieval queries left out: the map has fewer than {min(CANDIDATES) - 1} decoys")
+        tell(f"{len(jobs) - len(left)} retrieval queries left out: the map has fewer than {min(CANDIDATES)} decoys")
     by_map: dict[str, list[Job]] = {}
     if not left:
         message = f"{request.region.id} is too small for suite {drawer.suite.card.name!r}: no decoys far enough away"
@@ -246,7 +247,7 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
         "sites": len(sites),
         "views_cells": sorted({job.variant.view_cells for job in jobs}),
         "prior_group": (request.group or card.group).name,
-        "made_from": {"task_version": TASK_VERSION},
+        "made_by": f"sasgeo-bench {__version__}",
     }
 
 

@@ -3,6 +3,7 @@
 
 import datetime as dt
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -188,7 +189,7 @@ class Edit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Suite:
+class Suite(ABC):
     """Region + sites + seed -> queries and truths; a child says how one query is drawn."""
 
     card: SuiteCard
@@ -228,9 +229,9 @@ class Suite:
         del scene, sites, seeds
         return None
 
+    @abstractmethod
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: "Seeds") -> Draft:
         """Make one query's evidence and truth."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

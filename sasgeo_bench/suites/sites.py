@@ -79,14 +79,10 @@ def choose_sites(
         If the region holds fewer.
     """
     sums = _Sums(known=_integral(scene.map.known), drawn=_integral(scene.map.drawn))
-    anchors = suite.anchors(scene)
-    spacing_m = suite.spacing_m()
+    ground = _Ground(scene=scene, suite=suite, anchors=suite.anchors(scene), sums=sums)
     found: list[Site] = []
     centres: list[tuple[float, float]] = []
-    streams = [
-        _places(scene, suite, block, anchors, seeds.under("block", block.row, block.col), sums, centres, spacing_m)
-        for block in scene.blocks
-    ]
+    streams = [ground.places(block, seeds.under("block", block.row, block.col), centres) for block in scene.blocks]
     while streams and len(found) < count:
         for stream in list(streams):
             place = next(stream, None)
@@ -117,50 +113,54 @@ class _Place:
     density: float
 
 
-def _places(  # noqa: PLR0913, PLR0917 - one loop over what a place must hold to
-    scene: Scene,
-    suite: Suite,
-    block: Block,
-    anchors: NDArray[np.float64] | None,
-    seeds: Seeds,
-    sums: _Sums,
-    centres: list[tuple[float, float]],
-    spacing_m: float,
-) -> Iterator[_Place]:
-    """Draw places of one block that the suite can use, none near `centres`, until too many draws in a row failed."""
-    rng = seeds.rng("places")
-    west, south, east, north = block.bounds_m
-    near: NDArray[np.float64] | None = None
-    if anchors is not None:
-        inside = (anchors[:, 0] >= west) & (anchors[:, 0] < east) & (anchors[:, 1] >= south) & (anchors[:, 1] < north)
-        near = anchors[inside]
-        if len(near) == 0:
+@dataclass(frozen=True, kw_only=True)
+class _Ground:
+    """What a place must hold to, whatever the block."""
+
+    scene: Scene
+    suite: Suite
+    anchors: NDArray[np.float64] | None
+    sums: _Sums
+
+    def places(self, block: Block, seeds: Seeds, centres: list[tuple[float, float]]) -> Iterator[_Place]:
+        """Draw places of one block that the suite can use, none near `centres`, until too many draws failed in a row."""
+        rng = seeds.rng("places")
+        west, south, east, north = block.bounds_m
+        near = self._near(block)
+        if near is not None and len(near) == 0:
             return
-    largest_m = max(variant.side_m for variant in suite.variants)
-    main_m = suite.main_side_m
-    failed = 0
-    while failed < _TRIES:
-        point = rng.uniform((west, south), (east, north))
-        if near is not None:
-            point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * _ANCHOR_SPREAD * main_m
-        place = (float(point[0]), float(point[1]))
-        is_within = west <= place[0] < east and south <= place[1] < north
-        density = _density(scene, point, sums, largest_m=largest_m, main_m=main_m) if is_within else None
-        if density is None or density < suite.card.min_density or not _is_free(place, centres, spacing_m):
-            failed += 1
-            continue
+        spacing_m, spread_m = self.suite.spacing_m(), _ANCHOR_SPREAD * self.suite.main_side_m
         failed = 0
-        yield _Place(easting_m=place[0], northing_m=place[1], block=block.id, density=density)
+        while failed < _TRIES:
+            point = rng.uniform((west, south), (east, north))
+            if near is not None:
+                point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * spread_m
+            place = (float(point[0]), float(point[1]))
+            is_within = west <= place[0] < east and south <= place[1] < north
+            density = self._density(point) if is_within else None
+            if density is None or density < self.suite.card.min_density or not _is_free(place, centres, spacing_m):
+                failed += 1
+                continue
+            failed = 0
+            yield _Place(easting_m=place[0], northing_m=place[1], block=block.id, density=density)
 
+    def _near(self, block: Block) -> NDArray[np.float64] | None:
+        """Anchors in a block."""
+        if self.anchors is None:
+            return None
+        west, south, east, north = block.bounds_m
+        x, y = self.anchors.T
+        return self.anchors[(x >= west) & (x < east) & (y >= south) & (y < north)]
 
-def _density(scene: Scene, point: NDArray[np.float64], sums: _Sums, *, largest_m: float, main_m: float) -> float | None:
-    """Share of drawn cells in the main view, or None where the largest view is not mapped enough."""
-    row, col = scene.map.grid.to_cells(point[None, :])[0].tolist()
-    cell_m = scene.map.grid.cell_size_m
-    known, _ = sums.shares(row, col, max(1, round(largest_m / 2 / cell_m)))
-    if known < LEAST_KNOWN:
-        return None
-    return sums.shares(row, col, max(1, round(main_m / 2 / cell_m)))[1]
+    def _density(self, point: NDArray[np.float64]) -> float | None:
+        """Share of drawn cells in the main view, or None where the largest view is not mapped enough."""
+        grid = self.scene.map.grid
+        row, col = grid.to_cells(point[None, :])[0].tolist()
+        largest_m = max(variant.side_m for variant in self.suite.variants)
+        known, _ = self.sums.shares(row, col, max(1, round(largest_m / 2 / grid.cell_size_m)))
+        if known < LEAST_KNOWN:
+            return None
+        return self.sums.shares(row, col, max(1, round(self.suite.main_side_m / 2 / grid.cell_size_m)))[1]
 
 
 def _is_free(place: tuple[float, float], centres: list[tuple[float, float]], spacing_m: float) -> bool:

@@ -123,7 +123,7 @@ class _Ground:
     sums: _Sums
 
     def places(self, block: Block, seeds: Seeds, centres: list[tuple[float, float]]) -> Iterator[_Place]:
-        """Draw places of one block that the suite can use, none near `centres`, until too many draws failed in a row."""
+        """Draw places of one block that the suite can use, none near `centres`, until too many draws failed."""
         rng = seeds.rng("places")
         west, south, east, north = block.bounds_m
         near = self._near(block)
@@ -150,7 +150,7 @@ class _Ground:
             return None
         west, south, east, north = block.bounds_m
         x, y = self.anchors.T
-        return self.anchors[(x >= west) & (x < east) & (y >= south) & (y < north)]
+        return np.asarray(self.anchors[(x >= west) & (x < east) & (y >= south) & (y < north)])
 
     def _density(self, point: NDArray[np.float64]) -> float | None:
         """Share of drawn cells in the main view, or None where the largest view is not mapped enough."""

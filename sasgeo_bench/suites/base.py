@@ -311,19 +311,26 @@ def changed_share(first: Evidence, second: Evidence) -> float:
 
 
 def ladder(
-    kind: str, strengths: tuple[float, ...], *, views: tuple[int, ...] = (MAIN_VIEW_CELLS,), middle: float | None = None
+    kind: str,
+    strengths: tuple[float, ...],
+    *,
+    small: tuple[float, ...] = (),
+    large: tuple[float, ...] = (),
 ) -> tuple[Variant, ...]:
-    """Stress variants: every strength at the main view, the middle strength at the other views.
+    """Stress variants: strengths at the main view, and those of the views half and twice as wide.
+
+    A plain matcher should fail somewhere on the ladder and succeed somewhere else: what is stressed little in a large
+    view is found by all, and what is stressed much in a small one by none.
 
     Examples
     --------
-    >>> [(item.strength, item.view_cells) for item in ladder("U1", (0.2, 0.4), views=(96, 192), middle=0.4)]
+    >>> [(item.strength, item.view_cells) for item in ladder("U1", (0.2, 0.4), small=(0.4,))]
     [(0.2, 192), (0.4, 192), (0.4, 96)]
     """
-    main = tuple(Variant(role="stress", kind=kind, strength=strength) for strength in strengths)
-    at = middle if middle is not None else strengths[len(strengths) // 2]
-    return main + tuple(
-        Variant(role="stress", kind=kind, strength=at, view_cells=cells) for cells in views if cells != MAIN_VIEW_CELLS
+    return tuple(
+        Variant(role="stress", kind=kind, strength=strength, view_cells=cells)
+        for cells, listed in ((MAIN_VIEW_CELLS, strengths), (min(VIEW_CELLS), small), (max(VIEW_CELLS), large))
+        for strength in listed
     )
 
 

@@ -13,14 +13,16 @@ from sasgeo_bench.suites.base import (
     SuiteCard,
     Variant,
     controls,
+    ladder,
     perceived,
 )
 
-ERROR_FACTORS: Final = (0.5, 1.0, 1.5, 2.0)
+ERROR_FACTORS: Final = (0.5, 1.0, 2.0, 3.0, 4.0)
+SMALL_FACTORS: Final = (1.0, 2.0, 3.0)
 
 
 class CleanSuite(PlainSuite):
-    """Perception from twice as good as in its own domain to twice as bad; the control is free of noise."""
+    """Perception from twice as good as in its own domain to four times as bad; the control is free of noise."""
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """See the world with as much error as the variant says; controls and falsifiers without any."""
@@ -43,8 +45,7 @@ SUITE: Final = CleanSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *(Variant(role="stress", kind="perception", strength=factor) for factor in ERROR_FACTORS),
-        *(Variant(role="stress", kind="perception", strength=1.0, view_cells=cells) for cells in (96, 384)),
+        *ladder("perception", ERROR_FACTORS, small=SMALL_FACTORS, large=(1.0, 3.0)),
     ),
     change=lambda variant, evidence, rng: evidence,  # noqa: ARG005 - `draw` does it all
 )

@@ -18,7 +18,7 @@ SUITE: Final = PlainSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *ladder("U5", (0.15, 0.3, 0.45, 0.6), views=VIEW_CELLS, middle=0.45),
+        *ladder("U5", (0.15, 0.3, 0.6, 0.8, 0.9), small=(0.3, 0.6, 0.8), large=(0.6, 0.9)),
         Variant(role="falsifier", kind="none"),
     ),
     change=lambda variant, evidence, rng: FalseUnknown(share=variant.strength)(evidence, rng),

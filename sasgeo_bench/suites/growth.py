@@ -24,7 +24,7 @@ from sasgeo_bench.suites.base import (
 )
 from sasgeo_bench.suites.twins import nodes_of, places_of
 
-NEW_PER_OLD: Final = (0.25, 0.5, 1.0, 2.0)
+NEW_PER_OLD: Final = (0.5, 1.0, 2.0, 4.0)
 
 
 class GrowthSuite(Suite):
@@ -67,7 +67,7 @@ SUITE: Final = GrowthSuite(
         name="growth",
         version=1,
         title="Growth (S3)",
-        what="For each building on the map 0.25 to 2 others have appeared nearby, on free ground.",
+        what="For each building on the map 0.5 to 4 others have appeared nearby, on free ground.",
         separates="Matchers that weigh what is seen and not mapped by its class from those that punish it alike.",
         falsifier="Nothing has appeared: scores as in the control.",
         strength_unit="new buildings for each on the map",
@@ -75,7 +75,7 @@ SUITE: Final = GrowthSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *ladder("S3", NEW_PER_OLD, views=VIEW_CELLS, middle=1.0),
+        *ladder("S3", NEW_PER_OLD, small=NEW_PER_OLD, large=(2.0,)),
         Variant(role="falsifier", kind="no growth"),
     ),
 )

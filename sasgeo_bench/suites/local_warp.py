@@ -77,7 +77,7 @@ SUITE: Final = LocalWarpSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *ladder("G1", RMS_M, views=VIEW_CELLS, middle=10.0),
+        *ladder("G1", RMS_M, small=RMS_M, large=(15.0,)),
         Variant(role="falsifier", kind="no warp"),
     ),
 )

@@ -17,6 +17,7 @@ from sasgeo_bench.perturb.wedge import TiltWedge
 from sasgeo_bench.suites.base import VIEW_CELLS, PlainSuite, SuiteCard, Variant, controls, ladder
 
 SHARES: Final = (0.15, 0.3, 0.45, 0.6)
+SMALL_SHARES: Final = (0.3, 0.6)
 ALL_UNKNOWN: Final = "all unknown"
 
 
@@ -53,12 +54,12 @@ SUITE: Final = PlainSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *ladder("U1 rectangles", SHARES, views=VIEW_CELLS, middle=0.45),
-        *ladder("U2 border", (0.3, 0.6)),
-        *ladder("U2 wedge", (0.3, 0.6)),
-        *ladder("U2 glare", (0.3, 0.6)),
-        *ladder("U3 canopy and shadow", (0.5, 1.0)),
-        *ladder("U4 adversarial", (0.3, 0.6)),
+        *ladder("U1 rectangles", SHARES, small=SMALL_SHARES, large=(0.6,)),
+        *ladder("U2 border", (0.3, 0.6), small=SMALL_SHARES),
+        *ladder("U2 wedge", (0.3, 0.6), small=SMALL_SHARES),
+        *ladder("U2 glare", (0.3, 0.6), small=SMALL_SHARES),
+        *ladder("U3 canopy and shadow", (0.5, 1.0), small=(0.5, 1.0)),
+        *ladder("U4 adversarial", (0.3, 0.6), small=SMALL_SHARES),
         Variant(role="falsifier", kind="none"),
         Variant(role="falsifier", kind=ALL_UNKNOWN, strength=1.0),
     ),

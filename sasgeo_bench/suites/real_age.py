@@ -90,5 +90,5 @@ SUITE: Final = RealAgeSuite(
         falsifier="The same views against the map of the same day.",
         strength_unit="years between map and world",
     ),
-    variants=(*controls(views=(96, 192, 384)), *ladder("S1", AGES_YEARS, views=(96, 384), middle=10.0)),
+    variants=(*controls(views=(96, 192, 384)), *ladder("S1", AGES_YEARS, small=AGES_YEARS, large=(10.0,))),
 )

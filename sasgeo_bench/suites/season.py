@@ -19,6 +19,7 @@ from sasgeo_bench.suites.base import (
 )
 
 STRENGTHS: Final = (0.3, 0.6, 0.9)
+SMALL_STRENGTHS: Final = (0.6, 0.9)
 NEEDS: Final = {"leaf_on": ("green",), "snow": (), "low_water": ("water", "waterway"), "harvest": ("farmland",)}
 _LEAST_SHARE: Final = 0.003  # of the mapped cells, for a season to have anything to change
 
@@ -61,12 +62,7 @@ SUITE: Final = SeasonSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *(variant for kind in NEEDS for variant in ladder(kind, STRENGTHS)),
-        *(
-            Variant(role="stress", kind=kind, strength=0.6, view_cells=cells)
-            for kind in ("leaf_on", "snow")
-            for cells in (96, 384)
-        ),
+        *(variant for kind in NEEDS for variant in ladder(kind, STRENGTHS, small=SMALL_STRENGTHS)),
         *(Variant(role="falsifier", kind=kind) for kind in NEEDS),
     ),
 )

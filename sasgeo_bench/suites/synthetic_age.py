@@ -23,7 +23,7 @@ from sasgeo_bench.suites.base import (
     perceived,
 )
 
-YEARS: Final = (2.0, 5.0, 10.0, 20.0)
+YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
 REDRAWN_WITHIN_YEARS: Final = 10.0  # the span that the share of redrawn things in a scene's ageing stands for
 _MOST_NEW_PER_OLD: Final = 1.0
 _SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
@@ -104,14 +104,14 @@ SUITE: Final = SyntheticAgeSuite(
         name="synthetic-age",
         version=1,
         title="Synthetic ageing",
-        what="Things vanish, appear and are drawn anew for 2 to 20 years, at the rates measured in other places.",
+        what="Things vanish, appear and are drawn anew for 2 to 40 years, at the rates measured in other places.",
         separates="Stability from uniform weights where no second date is there; to be read beside real-age.",
         falsifier="No year has passed: scores as in the control.",
         strength_unit="years between map and world",
     ),
     variants=(
         *controls(views=VIEW_CELLS),
-        *ladder("aged", YEARS, views=VIEW_CELLS, middle=10.0),
+        *ladder("aged", YEARS, small=(5.0, 10.0, 20.0, 40.0), large=(10.0, 40.0)),
         Variant(role="falsifier", kind="no year"),
     ),
 )

@@ -150,7 +150,7 @@ def _row_of_houses(shape: shapely.Geometry, piece_m: float) -> list[shapely.Geom
     sides = corners[[1, 2]] - corners[[0, 1]]
     long_first = bool(np.hypot(*sides[0]) >= np.hypot(*sides[1]))
     along, across = (sides[0], sides[1]) if long_first else (sides[1], sides[0])
-    start = corners[0] if long_first else corners[1]
+    start = corners[0]  # both sides leave from it: the rectangle's far side is parallel to the near one
     count = max(1, round(float(np.hypot(*along)) / piece_m))
     if count == 1:
         return [shape]

@@ -15,7 +15,6 @@ from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.split import Block
 from sasgeo_bench.suites.base import Scene, Seeds, Site, Suite
 
-LEAST_KNOWN: Final = 0.95  # of the footprint's square
 _TRIES: Final = 400  # draws in a block before it counts as full
 _SCALE_CUT: Final = 2.0  # sigmas: a scale farther off is not drawn
 _ANCHOR_SPREAD: Final = 0.2  # of the view's side: how far a site lies from what it is about
@@ -98,9 +97,7 @@ def choose_sites(
             if len(found) == count:
                 break
     if not found:
-        message = (
-            f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
-        )
+        message = f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
         raise ConfigError(message)
     if len(found) < count and not may_be_fewer:
         message = (
@@ -138,16 +135,14 @@ def _places(  # noqa: PLR0913, PLR0917 - one loop over what a place must hold to
         near = anchors[inside]
         if len(near) == 0:
             return
-    largest_m = max(variant.side_m for variant in suite.variants)
-    main_m = suite.main_side_m
     failed = 0
     while failed < _TRIES:
         point = rng.uniform((west, south), (east, north))
         if near is not None:
-            point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * _ANCHOR_SPREAD * main_m
+            point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * _ANCHOR_SPREAD * suite.main_side_m
         place = (float(point[0]), float(point[1]))
         is_within = west <= place[0] < east and south <= place[1] < north
-        density = _density(scene, point, sums, largest_m=largest_m, main_m=main_m) if is_within else None
+        density = _density(scene, suite, point, sums) if is_within else None
         if density is None or density < suite.card.min_density or not _is_free(place, centres, spacing_m):
             failed += 1
             continue
@@ -155,14 +150,14 @@ def _places(  # noqa: PLR0913, PLR0917 - one loop over what a place must hold to
         yield _Place(easting_m=place[0], northing_m=place[1], block=block.id, density=density)
 
 
-def _density(scene: Scene, point: NDArray[np.float64], sums: _Sums, *, largest_m: float, main_m: float) -> float | None:
-    """Share of drawn cells in the main view, or None where the largest view is not mapped enough."""
+def _density(scene: Scene, suite: Suite, point: NDArray[np.float64], sums: _Sums) -> float | None:
+    """Share of drawn cells in the main view, or None where too little is mapped around it."""
     row, col = scene.map.grid.to_cells(point[None, :])[0].tolist()
     cell_m = scene.map.grid.cell_size_m
-    known, _ = sums.shares(row, col, max(1, round(largest_m / 2 / cell_m)))
-    if known < LEAST_KNOWN:
+    known, _ = sums.shares(row, col, max(1, round(suite.mapped_m() / 2 / cell_m)))
+    if known < suite.least_known():
         return None
-    return sums.shares(row, col, max(1, round(main_m / 2 / cell_m)))[1]
+    return sums.shares(row, col, max(1, round(suite.main_side_m / 2 / cell_m)))[1]
 
 
 def _is_free(place: tuple[float, float], centres: list[tuple[float, float]], spacing_m: float) -> bool:

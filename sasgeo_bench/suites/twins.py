@@ -76,6 +76,14 @@ class TwinSuite(Suite):
         """So that the discs of two sites, which are cut out of the map, do not meet."""
         return 2 * (self.radius_m() + RING_M)
 
+    def mapped_m(self) -> float:
+        """All that is copied: what is unknown at the site and known at its twin would tell them apart."""
+        return 2 * self.radius_m()
+
+    def least_known(self) -> float:
+        """The whole of it."""
+        return 1.0
+
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
         """Find a place for every twin and say what is copied where."""
         radius_m = self.radius_m()

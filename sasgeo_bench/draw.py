@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.split import Block, Split
@@ -189,6 +190,11 @@ def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.G
 
     With `away_m` the disc lies so far off that its edge is that far from the truth.
 
+    Raises
+    ------
+    ConfigError
+        If the truth should lie outside a disc and the group has none: it would lie within what is searched.
+
     Examples
     --------
     >>> pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=10.0)
@@ -197,6 +203,9 @@ def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.G
     >>> bool(np.hypot(*prior.center_m) <= 500), prior.yaw_deg is None
     (True, True)
     """
+    if away_m > 0 and group.radius_m is None:
+        message = f"prior group {group.name} searches the whole map, so no place on it is outside: name one with a disc"
+        raise ConfigError(message)
     turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
     center_m = None
     if group.radius_m is not None:

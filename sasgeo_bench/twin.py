@@ -115,8 +115,8 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
     for at, shape in enumerate(shapes):
         parts = shapely.get_parts(shapely.get_parts(shape))
         parts = [part for part in parts if shapely.get_dimensions(part) == wanted[at] and not shapely.is_empty(part)]
-        gathered = shapely.multipolygons(parts) if wanted[at] == 2 else shapely.multilinestrings(parts)  # noqa: PLR2004
-        found[at] = parts[0] if len(parts) == 1 else gathered
+        gather = shapely.MultiPolygon if wanted[at] == 2 else shapely.MultiLineString  # noqa: PLR2004
+        found[at] = parts[0] if len(parts) == 1 else gather(parts)  # of none it makes an empty one
     return found
 
 

@@ -148,10 +148,10 @@ class Drawer:
         points = decoys.points_m
         for twin in twins:
             points = points[np.hypot(*(points - twin).T) > _TWIN_CLEAR * job.variant.side_m / 2]
+        # As many with the truth or twins as without: their number must not say whether they are among them.
+        total = min(CANDIDATES[site.index % len(CANDIDATES)], len(points))
         if draft.has_twins:
             points = np.vstack((twins, points))
-        # As many with the truth as without it: their number must not say whether it is among them.
-        total = min(CANDIDATES[site.index % len(CANDIDATES)], len(points))
         rng = self._site_seeds(site).rng(
             "candidates", job.variant.view_cells, job.variant.kind if draft.neighbours_m else ""
         )

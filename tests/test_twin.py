@@ -165,9 +165,10 @@ def test_mirroring_keeps_areas_and_lengths_and_what_it_is_not_asked_for(center_m
 )
 def test_a_row_of_houses_is_the_hall_it_was_cell_by_cell(turn_deg, size_m, start, is_angled):
     width_m, depth_m = size_m
-    hall = shapely.box(100, 100, 100 + width_m, 100 + depth_m)
+    west, south = 100.137, 100.0713  # off the lattice, so that no edge runs through the middles of cells
+    hall = shapely.box(west, south, west + width_m, south + depth_m)
     if is_angled:
-        hall = hall.difference(shapely.box(100, 100, 100 + width_m / 2, 100 + depth_m / 2))
+        hall = hall.difference(shapely.box(west, south, west + width_m / 2, south + depth_m / 2))
     hall = affinity.rotate(hall, turn_deg)
     ring = shapely.get_coordinates(hall)[:-1]
     hall = shapely.Polygon(np.roll(ring, start, axis=0))  # from whichever corner it was drawn

@@ -17,6 +17,7 @@ Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
 
 _ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
+_FINE_DECIMALS: Final = 6  # of a copy: a wall cut into a hall stays on its edge, so that the mask stays cell by cell
 _AT_M: Final = 0.1  # a road this near to a junction meets it
 _OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
 _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
@@ -84,7 +85,7 @@ def _copy(features: gpd.GeoDataFrame, item: Paste) -> gpd.GeoDataFrame:
     if item.change is not None:
         piece = item.change(piece)
     shift = np.subtract(item.target_m, item.source_m)
-    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_DECIMALS))
+    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_FINE_DECIMALS))
     return piece.set_geometry(gpd.GeoSeries(moved, index=piece.index, crs=features.crs))
 
 

@@ -185,6 +185,22 @@ def test_a_row_of_houses_is_the_hall_it_was_cell_by_cell(turn_deg, size_m, start
     np.testing.assert_array_equal(*masks)
 
 
+@given(turn_deg=st.floats(0, 360), shift_m=st.tuples(st.integers(-5000, 5000), st.integers(200, 5000)))
+def test_a_pasted_row_of_houses_has_the_outline_of_the_hall(turn_deg, shift_m):
+    hall = affinity.rotate(shapely.box(-20.137, -9.071, 23.4, 8.2), turn_deg)
+    features = table(row("building", shapely.transform(hall, lambda at: at.round(3))))
+    item = Paste(
+        source_m=(0.3, 0.7),
+        target_m=(0.3 + shift_m[0], 0.7 + shift_m[1]),
+        radius_m=60.0,
+        change=lambda piece: split_long(piece, piece_m=7.0, least_area_m2=160.0),
+    )
+    houses = of_class(paste(features, [item]), "building")[1:]
+    assert len(houses) == 6
+    back = shapely.transform(shapely.union_all(houses), lambda at: at - np.array(shift_m))
+    assert shapely.symmetric_difference(back, features.geometry.iloc[0]).area < 1e-3
+
+
 def test_only_large_buildings_are_split_and_into_pieces_as_long_as_asked():
     features = table(
         row("building", shapely.box(0, 0, 35, 10), osm_id=7),

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.split import Block, Split
@@ -149,10 +150,10 @@ class Drawer:
         points = decoys.points_m
         for twin in twins:
             points = points[np.hypot(*(points - twin).T) > _TWIN_CLEAR * job.variant.side_m / 2]
+        # As many with the truth or twins as without: their number must not say whether they are among them.
+        total = min(CANDIDATES[site.index % len(CANDIDATES)], len(points))
         if draft.has_twins:
             points = np.vstack((twins, points))
-        # As many with the truth as without it: their number must not say whether it is among them.
-        total = min(CANDIDATES[site.index % len(CANDIDATES)], len(points))
         rng = self._site_seeds(site).rng(
             "candidates", job.variant.view_cells, job.variant.kind if draft.neighbours_m else ""
         )
@@ -191,6 +192,11 @@ def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.G
 
     With `away_m` the disc lies so far off that its edge is that far from the truth.
 
+    Raises
+    ------
+    ConfigError
+        If the truth should lie outside a disc and the group has none: it would lie within what is searched.
+
     Examples
     --------
     >>> pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=10.0)
@@ -199,6 +205,9 @@ def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.G
     >>> bool(np.hypot(*prior.center_m) <= 500), prior.yaw_deg is None
     (True, True)
     """
+    if away_m > 0 and group.radius_m is None:
+        message = f"prior group {group.name} searches the whole map, so no place on it is outside: name one with a disc"
+        raise ConfigError(message)
     turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
     center_m = None
     if group.radius_m is not None:

@@ -17,6 +17,7 @@ Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
 
 _ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
+_FINE_DECIMALS: Final = 6  # of a copy: a wall cut into a hall stays on its edge, so that the mask stays cell by cell
 _AT_M: Final = 0.1  # a road this near to a junction meets it
 _OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
 _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
@@ -84,7 +85,7 @@ def _copy(features: gpd.GeoDataFrame, item: Paste) -> gpd.GeoDataFrame:
     if item.change is not None:
         piece = item.change(piece)
     shift = np.subtract(item.target_m, item.source_m)
-    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_DECIMALS))
+    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_FINE_DECIMALS))
     return piece.set_geometry(gpd.GeoSeries(moved, index=piece.index, crs=features.crs))
 
 
@@ -115,8 +116,8 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
     for at, shape in enumerate(shapes):
         parts = shapely.get_parts(shapely.get_parts(shape))
         parts = [part for part in parts if shapely.get_dimensions(part) == wanted[at] and not shapely.is_empty(part)]
-        gathered = shapely.multipolygons(parts) if wanted[at] == 2 else shapely.multilinestrings(parts)  # noqa: PLR2004
-        found[at] = parts[0] if len(parts) == 1 else gathered
+        gather = shapely.MultiPolygon if wanted[at] == 2 else shapely.MultiLineString  # noqa: PLR2004
+        found[at] = parts[0] if len(parts) == 1 else gather(parts)  # of none it makes an empty one
     return found
 
 
@@ -150,7 +151,7 @@ def _row_of_houses(shape: shapely.Geometry, piece_m: float) -> list[shapely.Geom
     sides = corners[[1, 2]] - corners[[0, 1]]
     long_first = bool(np.hypot(*sides[0]) >= np.hypot(*sides[1]))
     along, across = (sides[0], sides[1]) if long_first else (sides[1], sides[0])
-    start = corners[0] if long_first else corners[1]
+    start = corners[0]  # both sides leave from it: the rectangle's far side is parallel to the near one
     count = max(1, round(float(np.hypot(*along)) / piece_m))
     if count == 1:
         return [shape]

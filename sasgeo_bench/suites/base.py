@@ -26,6 +26,7 @@ from sasgeo_bench.twin import Paste
 
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
+LEAST_KNOWN: Final = 0.95  # of the square around a site
 DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 
 
@@ -218,6 +219,14 @@ class Suite(ABC):
     def spacing_m(self) -> float:
         """Least distance between two sites."""
         return self.main_side_m
+
+    def mapped_m(self) -> float:
+        """Side of the square around a site of which `least_known` must be mapped."""
+        return max(variant.side_m for variant in self.variants)
+
+    def least_known(self) -> float:
+        """Share of that square."""
+        return LEAST_KNOWN
 
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
         """Easting and northing of places the sites must be centred near, shape (N, 2); None for anywhere."""

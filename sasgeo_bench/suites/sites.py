@@ -15,7 +15,6 @@ from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.split import Block
 from sasgeo_bench.suites.base import Scene, Seeds, Site, Suite
 
-LEAST_KNOWN: Final = 0.95  # of the footprint's square
 _TRIES: Final = 400  # draws in a block before it counts as full
 _SCALE_CUT: Final = 2.0  # sigmas: a scale farther off is not drawn
 _ANCHOR_SPREAD: Final = 0.2  # of the view's side: how far a site lies from what it is about

@@ -76,6 +76,14 @@ class TwinSuite(Suite):
         """So that the discs of two sites, which are cut out of the map, do not meet."""
         return 2 * (self.radius_m() + RING_M)
 
+    def mapped_m(self) -> float:
+        """All that is copied: what is unknown at the site and known at its twin would tell them apart."""
+        return 2 * self.radius_m()
+
+    def least_known(self) -> float:
+        """The whole of it."""
+        return 1.0
+
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
         """Find a place for every twin and say what is copied where."""
         radius_m = self.radius_m()
@@ -126,29 +134,31 @@ def find_targets(
 ) -> dict[int, tuple[tuple[float, float], ...]]:
     """Find free discs for the copies of every site: mapped, off every site and every other copy, 3 radii from its own.
 
-    Sites are served in turn; one that does not get all its copies gets none and is left out.
+    Sites are served in turn; one that does not get all its copies gets none and is left out. A copy lies a whole number
+    of cells from its site: moved by a part of one, its mask would differ at every edge, and tell it from the place.
     """
-    step = max(1, round(LATTICE_M / state.grid.cell_size_m))
+    cell_m = state.grid.cell_size_m
+    step = max(1, round(LATTICE_M / cell_m))
     reach = radius_m / LATTICE_M
     inside = np.pad(state.known[::step, ::step], 1)
     deep = ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > reach + 1
     cells = np.argwhere(deep) * step
     free = state.grid.to_centres_m(cells)
     for site in sites:
-        free = free[np.hypot(*(free - (site.pose.easting_m, site.pose.northing_m)).T) > 2 * radius_m]
+        free = free[np.hypot(*(free - (site.pose.easting_m, site.pose.northing_m)).T) > 2 * radius_m + cell_m]
     found: dict[int, tuple[tuple[float, float], ...]] = {}
     for site in sites:
         rng = seeds.rng("target", *_key(site))
-        own = (site.pose.easting_m, site.pose.northing_m)
+        own = np.array([site.pose.easting_m, site.pose.northing_m])
         taken: list[NDArray[np.float64]] = []
         left = free
         while len(taken) < copies:
-            far = left[np.hypot(*(left - own).T) > _APART * radius_m]
+            far = left[np.hypot(*(left - own).T) > _APART * radius_m + cell_m]
             if len(far) == 0:
                 break
-            picked = far[rng.integers(len(far))]
+            picked = own + np.rint((far[rng.integers(len(far))] - own) / cell_m) * cell_m
             taken.append(picked)
-            left = left[np.hypot(*(left - picked).T) > 2 * radius_m]
+            left = left[np.hypot(*(left - picked).T) > 2 * radius_m + 2 * cell_m]
         if len(taken) == copies:
             free = left
             found[site.index] = tuple((float(x), float(y)) for x, y in taken)

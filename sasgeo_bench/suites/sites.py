@@ -98,9 +98,7 @@ def choose_sites(
             if len(found) == count:
                 break
     if not found:
-        message = (
-            f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
-        )
+        message = f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
         raise ConfigError(message)
     if len(found) < count and not may_be_fewer:
         message = (

@@ -87,6 +87,8 @@ def test_another_seed_changes_every_query(tasks, own_out):
         for folder in (tasks / "tasks/absent" / RIVERSIDE, made.folder)
     ]
     assert not poses[0] & poses[1]
+    for name in ("easting_m", "northing_m", "yaw_deg", "scale"):
+        assert not {getattr(pose, name) for pose in poses[0]} & {getattr(pose, name) for pose in poses[1]}
 
 
 def rows(path: Path) -> dict[str, dict]:

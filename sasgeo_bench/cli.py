@@ -39,7 +39,7 @@ from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
 from sasgeo_bench.store.taskdir import TASK, read_task
 from sasgeo_bench.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.tasks import check_task, make_tasks, panels
+from sasgeo_bench.tasks import check_task, has_truths, make_tasks, panels
 
 EXIT_USER: Final = 2
 EXIT_INTERRUPTED: Final = 130
@@ -362,10 +362,8 @@ def verify_command(
     """Hold a region or a task against its hashes; search the parts of a split for ground they share."""
     task_folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
     if (task_folder / TASK).is_file():
-        faults, good = (
-            check_task(task_folder, out=out),
-            "all files are as task.json says, and every query has its truth",
-        )
+        with_truths = "every query has its truth" if has_truths(task_folder, out=out) else "its truths are not here"
+        faults, good = check_task(task_folder, out=out), f"all files are as task.json says, and {with_truths}"
     elif target.endswith(".toml") or target in list_split_files():
         faults, good = _shared_ground(target, out, region_folders or [])
     else:

@@ -18,6 +18,7 @@ from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, de
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
 _TWIN_CLEAR: Final = 1.0  # half sides around a twin in which no other candidate lies
 _JITTER_M: Final = STRIDE_M / 2
+_ROUNDED_M: Final = 0.1  # decimals of a disc's centre
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,13 +212,14 @@ def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.G
     turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
     center_m = None
     if group.radius_m is not None:
-        apart_m = group.radius_m * radius_share if away_m == 0 else group.radius_m + away_m
+        inside_m = group.radius_m - _ROUNDED_M  # so that rounding the centre does not put the truth outside
+        apart_m = inside_m * radius_share if away_m == 0 else group.radius_m + away_m
         center_m = (
             round(float(pose.easting_m + apart_m * np.sin(turn)), 1),
             round(float(pose.northing_m + apart_m * np.cos(turn)), 1),
         )
     sigma_deg = YAW_SIGMA_DEG[group.yaw]
-    yaw_deg = None if sigma_deg is None else round(float((pose.yaw_deg + sigma_deg * yaw_noise) % 360), 1)
+    yaw_deg = None if sigma_deg is None else round(round(float(pose.yaw_deg + sigma_deg * yaw_noise), 1) % 360, 1)
     return Prior(
         center_m=center_m,
         radius_m=group.radius_m,

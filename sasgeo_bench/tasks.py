@@ -257,8 +257,19 @@ def check_task(task_folder: Path, *, out: Path) -> list[str]:
     faults = taskdir.task_faults(task_folder, out / "truth" / about["suite"] / about["region"])
     manifest = regiondir.read_manifest(out / "regions" / about["region"])
     if manifest.fingerprint != about["map_fingerprint"]:
-        faults.append(f"{about['region']} was built anew since: make the queries again")
+        faults.append(_built_anew(about["region"]))
     return faults
+
+
+def has_truths(task_folder: Path, *, out: Path) -> bool:
+    """Whether the truths of a task are there too."""
+    about = taskdir.read_task(task_folder)
+    path: Path = out / "truth" / about["suite"] / about["region"] / taskdir.TRUTH
+    return path.is_file()
+
+
+def _built_anew(region: str) -> str:
+    return f"{region} was built anew since: make the queries again"
 
 
 def panels(
@@ -280,13 +291,17 @@ def panels(
     Raises
     ------
     StoreError
-        If a file is missing.
+        If a file is missing, the truths are those of other queries, or the map was built anew since.
     ConfigError
         If there is no such query.
     """
     about = taskdir.read_task(task_folder)
-    state = State.of(regiondir.read_region(out / "regions" / about["region"]), name=about["region"])
+    region = regiondir.read_region(out / "regions" / about["region"])
+    if region.manifest.fingerprint != about["map_fingerprint"]:
+        raise StoreError(_built_anew(about["region"]))
+    state = State.of(region, name=about["region"])
     truths = {truth.query_id: truth for truth in taskdir.read_truths(truth_folder)}
+    strangers = StoreError(f"{truth_folder} does not hold the truths of {task_folder}: make the queries again")
     chosen = _for_sheet(list(truths.values()), count)
     if query_id is not None:
         chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
@@ -298,11 +313,15 @@ def panels(
     rivals: dict[Pose, tuple[Pose, ...]] = {}
     poses = {truth.pose for truth in chosen}
     for query in taskdir.read_queries(task_folder):
-        truth = truths[query.query_id]
+        truth = truths.get(query.query_id)
+        if truth is None:
+            raise strangers
         if query.query_id in wanted:
             queries[query.query_id] = query
         if query.candidates and truth.pose in poses and truth.pose is not None:
             rivals.setdefault(truth.pose, _others(query, truth))
+    if wanted != set(queries):
+        raise strangers
     return tuple(_panel(queries[truth.query_id], truth, state, rivals) for truth in chosen)
 
 

@@ -66,7 +66,11 @@ def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFra
         return features
     discs = [_disc(item.target_m, item.radius_m + item.ring_m) for item in pastes]
     kept = _cut(features, shapely.union_all(discs), keep_inside=False)
-    copies = [_copy(features, item) for item in pastes]
+    # Neither the order of the rows nor the numbers of the ways say which place is the original.
+    copies, first_id = [], int(features["osm_id"].max()) + 1
+    for item in sorted(pastes, key=lambda paste: paste.target_m):
+        copies.append(_copy(features, item, first_id=first_id))
+        first_id += len(copies[-1])
     table = pd.concat([kept, *copies], ignore_index=True)
     return check_features(gpd.GeoDataFrame(table, geometry="geometry", crs=features.crs).astype(dict(_types(features))))
 
@@ -80,13 +84,14 @@ def around(features: gpd.GeoDataFrame, center_m: tuple[float, float], radius_m: 
     return _cut(features, _disc(center_m, radius_m), keep_inside=True)
 
 
-def _copy(features: gpd.GeoDataFrame, item: Paste) -> gpd.GeoDataFrame:
+def _copy(features: gpd.GeoDataFrame, item: Paste, *, first_id: int) -> gpd.GeoDataFrame:
     piece = around(features, item.source_m, item.radius_m)
     if item.change is not None:
         piece = item.change(piece)
     shift = np.subtract(item.target_m, item.source_m)
     moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_FINE_DECIMALS))
-    return piece.set_geometry(gpd.GeoSeries(moved, index=piece.index, crs=features.crs))
+    again = piece.set_geometry(gpd.GeoSeries(moved, index=piece.index, crs=features.crs))
+    return again.assign(osm_id=first_id + np.unique(again["osm_id"], return_inverse=True)[1])
 
 
 def _disc(center_m: tuple[float, float], radius_m: float) -> shapely.Polygon:

@@ -2,12 +2,18 @@
 """What every test shares: no network, reproducible hypothesis runs, and the folder of real extracts."""
 
 import os
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from sasgeo_bench.build import build_region, plan_build
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.store.catalog import find_region_file, read_region_file
+from sasgeo_bench.tasks import make_tasks
 
 # No test depends on how busy the machine is; CI draws the same examples each time, a person's runs go on searching.
 settings.register_profile(
@@ -39,6 +45,35 @@ def real_extracts() -> Path:
     if folder is None:
         pytest.skip("real extracts: SASGEO_EXTRACTS names no folder with *.osm.pbf files")
     return folder
+
+
+@pytest.fixture(scope="session")
+def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root of what is built, with two embedded towns in it; copy it before you write there."""
+    out = tmp_path_factory.mktemp("towns") / "out"
+    for name in ("town-riverside", "town-grid"):
+        plan = plan_build(read_region_file(find_region_file(name)), out=out)
+        build_region(plan, tell=lambda _: None, with_preview=False)
+    return out
+
+
+@pytest.fixture
+def own_out(towns: Path, tmp_path: Path) -> Path:
+    """A root of one's own to write to, with the two towns in it."""
+    return Path(shutil.copytree(towns, tmp_path / "out"))
+
+
+@pytest.fixture(scope="session")
+def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root with the towns and some tasks in them: `clean` at two sites, others at one; read it, do not write to it."""
+    out = Path(shutil.copytree(towns, tmp_path_factory.mktemp("tasks") / "out"))
+    made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-riverside"))
+    for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-grid")):
+        count = 2 if suite == "clean" else 1
+        wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
+        for request in plan_requests(wanted, tell=lambda _: None):
+            make_tasks(request, tell=lambda _: None)
+    return out
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -26,6 +26,7 @@ TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
 SCHEMA_VERSION: Final = 1
 _ROWS: Final = 128  # a row group; what is held in memory at once
+_SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
 
 _POSE: Final = pa.struct(
     [("easting_m", pa.float64()), ("northing_m", pa.float64()), ("yaw_deg", pa.float64()), ("scale", pa.float64())]
@@ -288,11 +289,15 @@ def read_task(folder: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content["schema_version"]
+        missing = [name for name in _SAID if name not in content] or [QUERIES][QUERIES in content["files"] :]
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         message = f"{path} is damaged ({error!r}): make the queries again"
         raise StoreError(message) from error
     if found != SCHEMA_VERSION:
         message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: make the queries again"
+        raise StoreError(message)
+    if missing:
+        message = f"{path} is damaged (it does not say {', '.join(missing)}): make the queries again"
         raise StoreError(message)
     return dict(content)
 
@@ -315,11 +320,11 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     path, said = task_folder / QUERIES, about["files"][QUERIES]
     if not path.is_file():
         return [f"{QUERIES}: missing"]
-    found = file_record(path)
-    if found.model_dump() != said:
-        faults.append(f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {said['sha256']}")
     known = {task_folder / TASK, path}
     faults += [f"{other.name}: not part of a task" for other in sorted(task_folder.rglob("*")) if other not in known]
+    found = file_record(path)
+    if found.model_dump() != said:  # what is in it is not worth a look
+        return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {said}", *faults]
     counts: dict[str, int] = {}
     names = []
     for query in read_queries(task_folder):
@@ -336,22 +341,32 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
 
 def read_queries(folder: Path) -> Iterator[Query]:
     """Queries of a task in the order of their ids, a row group in memory at a time."""
-    for row in _rows(folder / QUERIES):
+    for row in _rows(folder / QUERIES, QUERY_SCHEMA):
         yield query_of(row)
 
 
 def read_truths(folder: Path) -> Iterator[Truth]:
     """Truths of a task in the order of the query ids."""
-    for row in _rows(folder / TRUTH):
+    for row in _rows(folder / TRUTH, TRUTH_SCHEMA):
         yield truth_of(row)
 
 
-def _rows(path: Path) -> Iterator[dict[str, Any]]:
+def _check_columns(path: Path, found: Sequence[str], needed: Sequence[str]) -> None:
+    missing = [name for name in needed if name not in found]
+    if missing:
+        message = f"{path} lacks the columns {', '.join(missing)}: make the queries again"
+        raise StoreError(message)
+
+
+def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:
     try:
         with pq.ParquetFile(path) as source:
+            _check_columns(path, source.schema_arrow.names, schema.names)
             for batch in source.iter_batches(batch_size=_ROWS):
                 yield from batch.to_pylist()
-    except (OSError, pa.ArrowException) as error:
+    except StoreError:
+        raise
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         text = " ".join(str(error).split())[:200]
         message = f"{path} cannot be read ({text}): make the queries again"
         raise StoreError(message) from error

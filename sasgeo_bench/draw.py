@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The queries and truths of a suite at its sites: ids, priors, candidates and strata are the same for all suites."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -13,10 +14,13 @@ from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.split import Block, Split
 from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
-from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, mine
+from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, least_apart_m, mine
 
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
-_TWIN_CLEAR: Final = 1.0  # half sides around a twin in which no other candidate lies
+LEAST_CANDIDATES: Final = 4  # where a map holds fewer that keep their distance there is no retrieval
+_SAMPLES: Final = 256
+_GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # a turn that never comes back to itself: evenly spread points
+_TURNS: Final = 72
 _JITTER_M: Final = STRIDE_M / 2
 _ROUNDED_M: Final = 0.1  # decimals of a disc's centre
 
@@ -69,7 +73,7 @@ class Drawer:
         if job.track != "retrieval":
             return True
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))
-        return len(self._mined(state, job.site, job.variant.side_m).points_m) >= min(CANDIDATES)
+        return len(self._decoys(state, job)) >= LEAST_CANDIDATES
 
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""
@@ -79,14 +83,16 @@ class Drawer:
         if job.track == "retrieval":  # the candidates say where; a disc around the truth would tell which of them
             group = replace(group, radius_m=None)
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))
-        prior = make_prior(
-            draft.pose or site.pose, group, away_m=draft.away_m, rng=seeds.rng("prior", group.name, draft.away_m)
-        )
+        pose = draft.pose or site.pose
+        prior = make_prior(pose, group, rng=seeds.rng("prior", group.name))
+        if draft.away_m:
+            rng = seeds.rng("away", group.name, job.variant.name)
+            prior = away(prior, pose, away_m=draft.away_m, share_of=self._share_of_disc(state), rng=rng)
         decoys = self._mined(state, site, job.variant.side_m)
         places: tuple[Pose, ...] = ()
         right = -1
         if job.track == "retrieval":
-            places, right = self._candidates(job, draft, decoys, prior)
+            places, right = self._candidates(job, draft, state, prior)
         query = Query(
             query_id=job.query_id,
             track=job.track,
@@ -103,6 +109,21 @@ class Drawer:
             vectors=draft.vectors,
         )
         return query, self._truth(job, draft, state, decoys, right)
+
+    def _share_of_disc(self, state: State) -> Callable[[tuple[float, float], float], float]:
+        """A measure of how much of a disc is on the map."""
+        turns = np.arange(_SAMPLES) * _GOLDEN
+        spiral = np.sqrt((np.arange(_SAMPLES) + 0.5) / _SAMPLES)[:, None] * np.column_stack(
+            (np.sin(turns), np.cos(turns))
+        )
+
+        def share(center_m: tuple[float, float], radius_m: float) -> float:
+            """Share of points, spread evenly, that are mapped."""
+            row, col = state.grid.to_cells(center_m + radius_m * spiral).T
+            inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
+            return float(state.known[row[inside], col[inside]].sum()) / _SAMPLES
+
+        return share
 
     def _block(self, site: Site) -> Block:
         return next(block for block in self.scene.blocks if block.id == site.block)
@@ -138,26 +159,27 @@ class Drawer:
         center_m = (site.pose.easting_m, site.pose.northing_m)
         key = (state.region, side_m)
         if key not in self.windows:
-            self.windows[key] = describe(state, side_m=side_m)
+            self.windows[key] = describe(state, side_m=side_m, clear_m=self.suite.clear_m(self.scene))
         if (*key, site.index) not in self.mined:
             self.mined[*key, site.index] = mine(self.windows[key], center_m, count=max(CANDIDATES))
         return self.mined[*key, site.index]
 
-    def _candidates(self, job: Job, draft: Draft, decoys: Decoys, prior: Prior) -> tuple[tuple[Pose, ...], int]:
-        """The true place, its twins, and the best decoys, shuffled; every one jittered alike."""
-        site = job.site
+    def _decoys(self, state: State, job: Job) -> NDArray[np.float64]:
+        """Decoys as far from the site's twins as from the site, shape (N, 2)."""
+        points = self._mined(state, job.site, job.variant.side_m).points_m
+        for twin in self.scene.twins.get(job.site.index, ()):
+            points = points[np.hypot(*(points - twin).T) >= least_apart_m(job.variant.side_m / 2)]
+        return points
+
+    def _candidates(self, job: Job, draft: Draft, state: State, prior: Prior) -> tuple[tuple[Pose, ...], int]:
+        """The true place, its twins, and the best decoys, shuffled anew for each query; every one jittered alike."""
+        site, points = job.site, self._decoys(state, job)
         truth = (site.pose.easting_m, site.pose.northing_m)
-        twins = np.array(self.scene.twins.get(site.index, ())).reshape(-1, 2)
-        points = decoys.points_m
-        for twin in twins:
-            points = points[np.hypot(*(points - twin).T) > _TWIN_CLEAR * job.variant.side_m / 2]
         # As many with the truth or twins as without: their number must not say whether they are among them.
         total = min(CANDIDATES[site.index % len(CANDIDATES)], len(points))
         if draft.has_twins:
-            points = np.vstack((twins, points))
-        rng = self._site_seeds(site).rng(
-            "candidates", job.variant.view_cells, job.variant.kind if draft.neighbours_m else ""
-        )
+            points = np.vstack((np.array(self.scene.twins.get(site.index, ())).reshape(-1, 2), points))
+        rng = self._site_seeds(site).rng("candidates", job.variant.name)
         yaw_deg = prior.yaw_deg if prior.yaw_deg is not None else 0.0
         if draft.neighbours_m:
             centres = points[: max(1, total // len(draft.neighbours_m)) - 1]
@@ -188,36 +210,22 @@ def _clusters(
     return poses, int(np.flatnonzero(order == at)[0])
 
 
-def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.Generator) -> Prior:
+def make_prior(pose: Pose, group: PriorGroup, *, rng: np.random.Generator) -> Prior:
     """Draw what is known before: a disc in which the truth lies anywhere, a heading and a scale off by their sigmas.
-
-    With `away_m` the disc lies so far off that its edge is that far from the truth.
-
-    Raises
-    ------
-    ConfigError
-        If the truth should lie outside a disc and the group has none: it would lie within what is searched.
 
     Examples
     --------
     >>> pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=10.0)
     >>> group = PriorGroup(radius_m=500.0, yaw="unknown", scale_sigma=0.03)
-    >>> prior = make_prior(pose, group, away_m=0.0, rng=np.random.default_rng(1))
+    >>> prior = make_prior(pose, group, rng=np.random.default_rng(1))
     >>> bool(np.hypot(*prior.center_m) <= 500), prior.yaw_deg is None
     (True, True)
     """
-    if away_m > 0 and group.radius_m is None:
-        message = f"prior group {group.name} searches the whole map, so no place on it is outside: name one with a disc"
-        raise ConfigError(message)
     turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
     center_m = None
     if group.radius_m is not None:
-        inside_m = group.radius_m - _ROUNDED_M  # so that rounding the centre does not put the truth outside
-        apart_m = inside_m * radius_share if away_m == 0 else group.radius_m + away_m
-        center_m = (
-            round(float(pose.easting_m + apart_m * np.sin(turn)), 1),
-            round(float(pose.northing_m + apart_m * np.cos(turn)), 1),
-        )
+        # A little less than the radius, so that rounding the centre does not put the truth outside.
+        center_m = _around(pose, (group.radius_m - _ROUNDED_M) * radius_share, turn)
     sigma_deg = YAW_SIGMA_DEG[group.yaw]
     yaw_deg = None if sigma_deg is None else round(round(float(pose.yaw_deg + sigma_deg * yaw_noise), 1) % 360, 1)
     return Prior(
@@ -226,4 +234,52 @@ def make_prior(pose: Pose, group: PriorGroup, *, away_m: float, rng: np.random.G
         yaw_deg=yaw_deg,
         yaw_sigma_deg=sigma_deg,
         scale_sigma=group.scale_sigma,
+    )
+
+
+def away(
+    prior: Prior,
+    pose: Pose,
+    *,
+    away_m: float,
+    share_of: Callable[[tuple[float, float], float], float],
+    rng: np.random.Generator,
+) -> Prior:
+    """Move a prior's disc so that the truth lies outside of it, `away_m` or half as far again from its rim.
+
+    Parameters
+    ----------
+    prior : Prior
+        One with the truth inside.
+    pose : Pose
+        The truth.
+    away_m : float
+        Least distance between the truth and the disc.
+    share_of : callable
+        (centre, radius) -> share of a disc that is on the map. Of many ways to move the disc, that one is taken which
+        leaves as much of it on the map as before: a disc half off the map would tell that the truth is not in it.
+    rng : numpy.random.Generator
+        Chance.
+
+    Raises
+    ------
+    ConfigError
+        If the prior has no disc: then there is no place outside.
+    """
+    if prior.radius_m is None or prior.center_m is None:
+        message = "a prior group without a disc searches the whole map, and no place is outside: name one with a disc"
+        raise ConfigError(message)
+    radius_m = prior.radius_m
+    before = share_of(prior.center_m, radius_m)
+    turns = rng.uniform(0, 2 * np.pi, _TURNS)
+    apart_m = radius_m + away_m * rng.uniform(1.0, 1.5, _TURNS)
+    centres = [_around(pose, *pair) for pair in zip(apart_m.tolist(), turns.tolist(), strict=True)]
+    return replace(prior, center_m=min(centres, key=lambda center: abs(share_of(center, radius_m) - before)))
+
+
+def _around(pose: Pose, apart_m: float, turn: float) -> tuple[float, float]:
+    """A place at a distance from a pose, to a decimetre."""
+    return (
+        round(float(pose.easting_m + apart_m * np.sin(turn)), 1),
+        round(float(pose.northing_m + apart_m * np.cos(turn)), 1),
     )

@@ -106,6 +106,11 @@ class Block:
         """Region, row and column, as in "vaduz/0-3"."""
         return f"{self.region}/{self.row}-{self.col}"
 
+    def holds(self, en_m: tuple[float, float]) -> bool:
+        """Whether a place lies in it; of two blocks that touch, its south-western edges belong to it."""
+        west, south, east, north = self.bounds_m
+        return west <= en_m[0] < east and south <= en_m[1] < north
+
     def polygon(self) -> shapely.Polygon:
         """The rectangle in the region's CRS."""
         return shapely.box(*self.bounds_m)

@@ -14,14 +14,14 @@ import numpy as np
 from sasgeo_bench import __version__
 from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
-from sasgeo_bench.draw import CANDIDATES, Drawer, Job
+from sasgeo_bench.draw import LEAST_CANDIDATES, Drawer, Job
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
 from sasgeo_bench.evidence import Evidence, LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import PriorGroup, Query, Truth
+from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_count, check_roots
@@ -69,6 +69,12 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
+    # Held all the way: a second run of the same request would change the map that this one draws from.
+    with regiondir.locked(request.out / "tasks" / suite.card.name / f"{request.region.id}.request", tell=tell):
+        return _make_tasks(request, suite, tell)
+
+
+def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
     scene, base = read_scene(request, suite, tell)
     reason = suite.lack(scene)
     if reason is not None:
@@ -77,23 +83,24 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
     group = request.group or suite.card.group
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
     suite = replace(suite, variants=suite.usable(scene))
-    _check_reach(scene, suite, group)
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     scene, sites = _edited(request, suite, scene, base, sites, seeds)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split)
     return tuple(_write(request, drawer, sites, tell))
 
 
-def _check_reach(scene: Scene, suite: Suite, group: PriorGroup) -> None:
-    """Refuse views whose footprint may reach farther beyond a block than the split allows for."""
+def _view_reach_m(request: Request, suite: Suite) -> float:
+    """How far from its centre a view may show anything; refused where the split does not allow for it."""
     largest_m = max(variant.side_m for variant in suite.variants)
-    reach_m = largest_m / 2 * float(np.sqrt(2)) * largest_scale(group)
-    if reach_m > scene.reach_m:
+    reach_m = largest_m / 2 * float(np.sqrt(2)) * largest_scale(request.group or suite.card.group)
+    allowed_m = request.split.spec.reach_m
+    if reach_m > allowed_m:
         message = (
-            f"views of {largest_m:g} m reach up to {reach_m:.0f} m beyond a block, the split {scene.reach_m:g} m: "
+            f"views of {largest_m:g} m reach up to {reach_m:.0f} m beyond a block, the split {allowed_m:g} m: "
             "use a split with a larger reach_m"
         )
         raise ConfigError(message)
+    return reach_m
 
 
 def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
@@ -118,7 +125,7 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         map=state,
         world=state,
         blocks=blocks,
-        reach_m=request.split.spec.reach_m,
+        view_reach_m=_view_reach_m(request, suite),
         scenes=base.manifest.scenes,
         others=others,
         elsewhere=elsewhere,
@@ -147,30 +154,33 @@ def _edited(
 ) -> tuple[Scene, tuple[Site, ...]]:
     """Carry out what the suite does to the map and the world; sites it found no twin for are left out."""
     edit = suite.edit(scene, sites, seeds)
+    # Many sites leave no room for the copies of any.
+    while request.may_be_fewer and edit is not None and not edit.sites and len(sites) > 1:
+        sites = sites[: len(sites) // 2]
+        edit = suite.edit(scene, sites, seeds)
     if edit is None:
         return scene, sites
-    kept = tuple(site for site in sites if edit.twins.get(site.index))
-    if not kept:
+    if not edit.sites:
         message = f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs"
         raise ConfigError(message)
-    if len(kept) < len(sites) and not request.may_be_fewer:
+    if len(edit.sites) < request.count and not request.may_be_fewer:
         message = (
-            f"{request.region.id} has room for the copies of {len(kept)} of {len(sites)} sites of suite "
+            f"{request.region.id} has room for the copies of {len(edit.sites)} of {len(sites)} sites of suite "
             f"{suite.card.name!r}: lower --n or pass --up-to"
         )
         raise ConfigError(message)
     plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    twins = {site.index: edit.twins[site.index] for site in kept}
     world = scene.world
     if edit.world_pastes is not None:
         world = _state_of(base, paste(base.features, edit.world_pastes))
     if not edit.map_pastes:
-        return replace(scene, twins=twins), kept
+        return replace(scene, twins=edit.twins), edit.sites
     features = paste(base.features, edit.map_pastes)
-    note = f"edited: {len(edit.map_pastes)} parts pasted for suite {suite.card.name}, seed {request.seed}"
+    note = f"edited: {len(edit.map_pastes)} parts pasted for suite {suite.card.name}"
     folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
     edited = State.of(regiondir.read_region(folder))
-    return replace(scene, map=edited, world=world if edit.world_pastes is not None else edited, twins=twins), kept
+    world = edited if edit.world_pastes is None else world
+    return replace(scene, map=edited, world=world, twins=edit.twins), edit.sites
 
 
 def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
@@ -193,7 +203,8 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     jobs = drawer.jobs(sites)
     left = [job for job in jobs if drawer.can_draw(job)]
     if len(left) < len(jobs):
-        tell(f"{len(jobs) - len(left)} retrieval queries left out: the map has fewer than {min(CANDIDATES)} decoys")
+        where = f"{drawer.suite.card.name} on {request.region.id}"
+        tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} decoys")
     by_map: dict[str, list[Job]] = {}
     if not left:
         message = f"{request.region.id} is too small for suite {drawer.suite.card.name!r}: no decoys far enough away"
@@ -209,10 +220,12 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
             with (
                 regiondir.locked(task_folder, tell=tell),
                 regiondir.locked(truth_folder, tell=tell),
-                regiondir.fresh_folder(truth_folder) as truth_scratch,
                 regiondir.fresh_folder(task_folder) as task_scratch,
+                regiondir.fresh_folder(truth_folder) as truth_scratch,
             ):
-                total = taskdir.write_task(task_scratch, truth_scratch, map(drawer.draw, own), about)
+                # With the seed anyone could draw the truths again, so it is kept with them.
+                hidden = {"seed": request.seed}
+                total = taskdir.write_task(task_scratch, truth_scratch, map(drawer.draw, own), about, hidden)
         except SasgeoError:
             raise
         except OSError as error:
@@ -243,7 +256,6 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
         "map_fingerprint": manifest.fingerprint,
         "split": spec.id,
         "split_sha256": hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
-        "seed": request.seed,
         "sites": len(sites),
         "views_cells": sorted({job.variant.view_cells for job in jobs}),
         "prior_group": (request.group or card.group).name,
@@ -359,8 +371,8 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
     near = _others(query, truth) or rivals.get(truth.pose, ())
     places = [(pose.easting_m, pose.northing_m) for pose in near]
     if not places:
-        center_m = (truth.pose.easting_m, truth.pose.northing_m)
-        mined = mine(describe(state, side_m=size * cell_m), center_m, count=1).points_m
+        center_m, side_m = (truth.pose.easting_m, truth.pose.northing_m), size * cell_m
+        mined = mine(describe(state, side_m=side_m, clear_m=side_m * float(np.sqrt(0.5))), center_m, count=1).points_m
         places = [(float(x), float(y)) for x, y in mined]
     views = [
         state.view(replace(truth.pose, easting_m=x, northing_m=y), size_cells=size, cell_size_m=cell_m)

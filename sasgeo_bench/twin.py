@@ -19,6 +19,7 @@ _ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
 _FINE_DECIMALS: Final = 6  # of a copy: a wall cut into a hall stays on its edge, so that the mask stays cell by cell
 _AT_M: Final = 0.1  # a road this near to a junction meets it
+_BEND_M: Final = 10.0  # of a road whose junction is moved, what is bent to meet it
 _OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
 _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 
@@ -27,15 +28,13 @@ _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 class Paste:
     """One copy: what lies within a disc around `source_m` takes the place of what lies around `target_m`.
 
-    `change` edits the copy before it is moved, in the coordinates of the source; None copies it as it is. Around the
-    disc a ring of `ring_m` is cleared: where the source is pasted onto itself, both places end alike.
+    `change` edits the copy before it is moved, in the coordinates of the source; None copies it as it is.
     """
 
     source_m: tuple[float, float]
     target_m: tuple[float, float]
     radius_m: float
     change: Change | None = None
-    ring_m: float = 0.0
 
 
 def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFrame:
@@ -64,7 +63,7 @@ def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFra
     """
     if not pastes:
         return features
-    discs = [_disc(item.target_m, item.radius_m + item.ring_m) for item in pastes]
+    discs = [_disc(item.target_m, item.radius_m) for item in pastes]
     kept = _cut(features, shapely.union_all(discs), keep_inside=False)
     # Neither the order of the rows nor the numbers of the ways say which place is the original.
     copies, first_id = [], int(features["osm_id"].max()) + 1
@@ -274,13 +273,15 @@ def _arms(shapes: NDArray[np.object_], roads: NDArray[np.int64], point: NDArray[
 def _end_moved(
     line: shapely.Geometry, point: NDArray[np.float64], arm: _Arm, shift: NDArray[np.float64]
 ) -> shapely.Geometry:
-    """Move where an arm begins; a road that passed through the junction is in two parts then."""
+    """Bend the first metres of an arm to where it begins now; a road that passed the junction is in two parts then."""
     at = shapely.get_coordinates(line)
     moved = (point + shift).round(_DECIMALS)
+    length_m = float(np.hypot(*(at[arm.vertex + arm.step] - at[arm.vertex])))
+    bend = [] if length_m <= 1.5 * _BEND_M else [(at[arm.vertex] + _BEND_M * arm.direction).round(_DECIMALS)]
     if arm.step == 1:
-        parts = [at[: arm.vertex + 1], np.vstack((moved, at[arm.vertex + 1 :]))]
+        parts = [at[: arm.vertex + 1], np.vstack((moved, *bend, at[arm.vertex + 1 :]))]
     else:
-        parts = [np.vstack((at[: arm.vertex], moved)), at[arm.vertex :]]
+        parts = [np.vstack((at[: arm.vertex], *bend, moved)), at[arm.vertex :]]
     lines = [shapely.LineString(part) for part in parts if len(part) > 1]
     return lines[0] if len(lines) == 1 else shapely.multilinestrings(lines)
 

@@ -24,6 +24,7 @@ from sasgeo_bench.store.regiondir import file_record
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
+TRUTH_OF: Final = "truth.json"
 SCHEMA_VERSION: Final = 1
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
@@ -202,7 +203,11 @@ def truth_of(row: dict[str, Any]) -> Truth:
 
 
 def write_task(
-    task_folder: Path, truth_folder: Path, pairs: Iterable[tuple[Query, Truth]], about: dict[str, Any]
+    task_folder: Path,
+    truth_folder: Path,
+    pairs: Iterable[tuple[Query, Truth]],
+    about: dict[str, Any],
+    hidden: dict[str, Any] | None = None,
 ) -> int:
     """Write queries and truths, a row group at a time, then `task.json`, which makes the folder a task.
 
@@ -214,6 +219,8 @@ def write_task(
         In the order of the query ids, which says nothing about the answers.
     about : dict
         What `task.json` says besides the counts and hashes.
+    hidden : dict, optional
+        What `truth.json` says besides which queries the truths belong to.
 
     Returns
     -------
@@ -246,8 +253,13 @@ def write_task(
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
     }
-    (task_folder / TASK).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **(hidden or {})})
+    _write_json(task_folder / TASK, content)
     return total
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _candidate_bytes(query: Query) -> bytes:
@@ -333,10 +345,21 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     if counts != about["counts"]:
         faults.append(f"{QUERIES}: holds {counts}, {TASK} says {about['counts']}")
     if (truth_folder / TRUTH).is_file():
+        belongs = _belongs_to(truth_folder)
+        if belongs != found.sha256:
+            faults.append(f"{TRUTH_OF}: the truths are of other queries, SHA-256 {belongs}: make the queries again")
         answered = [truth.query_id for truth in read_truths(truth_folder)]
         if answered != names:
             faults.append(f"{TRUTH}: {len(answered)} truths that are not those of the {len(names)} queries, in order")
     return faults
+
+
+def _belongs_to(truth_folder: Path) -> str:
+    """SHA-256 of the queries that the truths of a folder are of; "unknown" where it does not say."""
+    try:
+        return str(json.loads((truth_folder / TRUTH_OF).read_text(encoding="utf-8"))["queries_sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "unknown"
 
 
 def read_queries(folder: Path) -> Iterator[Query]:

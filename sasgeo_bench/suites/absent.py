@@ -5,14 +5,16 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, Suite, SuiteCard, Variant, controls, perceived
+from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, SuiteCard, Variant, controls, perceived
 
 PATCH_CELLS: Final = 24
 _TURNS: Final = 4
-_TRIES: Final = 64
+_TRIES: Final = 256
 _MOST_DRAWN: Final = 0.003  # of a feature-poor view
 
 
@@ -36,7 +38,7 @@ class AbsentSuite(Suite):
         if variant.kind == "feature-poor":
             return _feature_poor(scene, site, variant, seeds)
         if variant.kind == "wrong place" and scene.elsewhere is not None:
-            other = _same_place_elsewhere(scene, site, seeds)
+            other = _same_place_elsewhere(scene, scene.elsewhere, site, variant, seeds)
             return Draft(
                 evidence=perceived(scene.elsewhere, other, variant, seeds),
                 is_present=False,
@@ -70,13 +72,16 @@ def _poor_place(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Pos
     state, rng = scene.map, seeds.rng("feature-poor")
     half = round(variant.side_m / 2 / state.grid.cell_size_m)
     for _ in range(_TRIES):
-        easting_m, northing_m = (float(value) for value in rng.uniform((west, south), (east, north)))
-        row, col = state.grid.to_cells(np.array([[easting_m, northing_m]]))[0].tolist()
-        window = (slice(max(0, row - half), row + half), slice(max(0, col - half), col + half))
-        is_mapped = state.known[window].size == (2 * half) ** 2 and state.known[window].all()
-        if is_mapped and state.drawn[window].mean() <= _MOST_DRAWN:
-            return replace(site.pose, easting_m=easting_m, northing_m=northing_m)
+        point = rng.uniform((west, south), (east, north))
+        if state.is_mapped(point, scene.view_reach_m) and _density(state, point, half) <= _MOST_DRAWN:
+            return replace(site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
     return None
+
+
+def _density(state: State, point: NDArray[np.float64], half: int) -> float:
+    """Share of drawn cells in a square that is mapped."""
+    row, col = state.grid.to_cells(point[None, :])[0].tolist()
+    return float(state.drawn[row - half : row + half, col - half : col + half].mean())
 
 
 def strip(evidence: Evidence) -> Evidence:
@@ -103,28 +108,23 @@ def shuffle_patches(evidence: Evidence, rng: np.random.Generator, *, patch_cells
     return evidence.replace(cells)
 
 
-def _same_place_elsewhere(scene: Scene, site: Site, seeds: Seeds) -> Site:
-    """A site of about the same density in the other region: an easy giveaway would be no test."""
-    other = scene.elsewhere
-    if other is None:
-        return site
+def _same_place_elsewhere(scene: Scene, other: State, site: Site, variant: Variant, seeds: Seeds) -> Site:
+    """Of many places in the other region, that with the density nearest to the site's: an easy giveaway is no test."""
     rng = seeds.rng("elsewhere")
     west, south, east, north = other.grid.bounds_m
-    best: tuple[float, Site] | None = None
-    margin_m = 0.5 * min(east - west, north - south, 400.0)
-    for _ in range(_TRIES):
-        x, y = rng.uniform((west + margin_m, south + margin_m), (east - margin_m + 1e-6, north - margin_m + 1e-6))
-        row, col = other.grid.to_cells(np.array([[x, y]]))[0].tolist()
-        half = round(margin_m / other.grid.cell_size_m / 2)
-        window = (slice(max(0, row - half), row + half + 1), slice(max(0, col - half), col + half + 1))
-        if not other.known[window].all():
-            continue
-        density = float(other.drawn[window].mean())
-        pose = Pose(easting_m=float(x), northing_m=float(y), yaw_deg=site.pose.yaw_deg, scale=site.pose.scale)
-        found = Site(index=site.index, pose=pose, block=site.block, density=density)
-        if best is None or abs(density - site.density) < best[0]:
-            best = (abs(density - site.density), found)
-    return best[1] if best else site
+    half = round(variant.side_m / 2 / other.grid.cell_size_m)
+    points = [
+        point
+        for point in rng.uniform((west, south), (east, north), (_TRIES, 2))
+        if other.is_mapped(point, scene.view_reach_m)
+    ]
+    if not points:
+        message = f"{other.region} is too small to take a view of a wrong place from: choose another split"
+        raise ConfigError(message)
+    densities = [_density(other, point, half) for point in points]
+    best = int(np.argmin(np.abs(np.array(densities) - site.density)))
+    pose = replace(site.pose, easting_m=float(points[best][0]), northing_m=float(points[best][1]))
+    return replace(site, pose=pose, density=densities[best])
 
 
 SUITE: Final = AbsentSuite(

@@ -13,7 +13,7 @@ COPIES: Final = 3
 
 
 class AliasSuite(TwinSuite):
-    """R1: the truth is not among the candidates. R2: neighbours 5 m apart. R3: strata pooled. R4: identical blocks."""
+    """R1: the truth is not among the candidates. R2: neighbours 5 m apart. R4: identical blocks."""
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """One view; the variant says what the candidates are."""
@@ -38,8 +38,8 @@ SUITE: Final = AliasSuite(
         name="alias",
         version=1,
         title="Aliases (R1-R4)",
-        what="The truth removed and its aliases left (R1), neighbours five metres apart (R2), town and country "
-        "pooled (R3), three exact copies of the place (R4).",
+        what="The truth removed and its aliases left (R1), neighbours five metres apart (R2), three exact copies of "
+        "the place (R4). R3 is no query of its own: the controls, pooled over town and country.",
         separates="Calibrated rejection from margins.",
         falsifier="The control has neither copies nor neighbours among its candidates.",
         strength_unit="1 where aliased",
@@ -50,7 +50,6 @@ SUITE: Final = AliasSuite(
         Variant(role="control", kind="no copies"),
         Variant(role="stress", kind="R1 truth removed", strength=1.0),
         Variant(role="stress", kind="R2 neighbours", strength=1.0),
-        Variant(role="stress", kind="R3 pooled", strength=1.0),
         Variant(role="stress", kind="R4 identical blocks", strength=1.0),
     ),
     change_of=None,

@@ -3,6 +3,7 @@
 
 import datetime as dt
 import hashlib
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +27,6 @@ from sasgeo_bench.twin import Paste
 
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
-LEAST_KNOWN: Final = 0.95  # of the square around a site
 DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 
 
@@ -65,6 +65,13 @@ class State:
         """Where the map says anything, shape (rows, cols)."""
         return np.asarray(self.bits.bits >> np.uint32(31) == 0)
 
+    def is_mapped(self, en_m: NDArray[np.float64], half_m: float) -> bool:
+        """Whether all of a square around a place is on the map."""
+        row, col = self.grid.to_cells(np.asarray(en_m)[None, :])[0].tolist()
+        half = math.ceil(half_m / self.grid.cell_size_m)
+        inside = half <= row < self.grid.rows - half and half <= col < self.grid.cols - half
+        return inside and bool(self.known[row - half : row + half + 1, col - half : col + half + 1].all())
+
     def has(self, class_name: str) -> NDArray[np.bool_]:
         """Where one class is present, shape (rows, cols)."""
         bit, unknown = 1 << self.classes.index(class_name), 1 << 31
@@ -81,15 +88,16 @@ class State:
 class Scene:
     """All that a suite draws from: the map to be searched, the world to be seen, and where queries may lie.
 
-    `others` are states of the same place at other dates, oldest first; `elsewhere` is another place, where one was
-    given; `scenes` are the tags of the region; `twins` are the places that look like each site; `ageing` has the rates
-    of other places.
+    `view_reach_m` is how far from its centre a view may show anything: half a diagonal at the largest scale. `others`
+    are states of the same place at other dates, oldest first; `elsewhere` is another place, where one was given;
+    `scenes` are the tags of the region; `twins` are the places that look like each site; `ageing` has the rates of
+    other places.
     """
 
     map: State
     world: State
     blocks: tuple[Block, ...]
-    reach_m: float
+    view_reach_m: float
     scenes: tuple[str, ...]
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
@@ -124,12 +132,13 @@ class Variant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """One place and heading where a control and its stresses are seen."""
+    """One place and heading where a control and its stresses are seen; `is_copy` where it is the copy of another."""
 
     index: int
     pose: Pose
     block: str
     density: float
+    is_copy: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,8 +190,11 @@ class Edit:
     """What a suite does to a map before queries are drawn.
 
     `map_pastes` make the map that is searched, `world_pastes` the world that is seen (None where it is the map itself);
-    `twins` gives the places that look like each site, by the site's index; sites that are not among them are left out.
+    `sites` are those that are left, some of them moved to a copy; `twins` are the places that look like each of them,
+    by its index.
     """
+
+    sites: tuple[Site, ...]
 
     map_pastes: tuple[Paste, ...]
     world_pastes: tuple[Paste, ...] | None
@@ -216,17 +228,14 @@ class Suite(ABC):
         sides_m = [variant.side_m for variant in self.variants]
         return max(set(sides_m), key=lambda side_m: (sides_m.count(side_m), -side_m))
 
-    def spacing_m(self) -> float:
+    def spacing_m(self, scene: Scene) -> float:
         """Least distance between two sites."""
+        del scene
         return self.main_side_m
 
-    def mapped_m(self) -> float:
-        """Side of the square around a site of which `least_known` must be mapped."""
-        return max(variant.side_m for variant in self.variants)
-
-    def least_known(self) -> float:
-        """Share of that square."""
-        return LEAST_KNOWN
+    def clear_m(self, scene: Scene) -> float:
+        """Half the side of the square around a site that must be mapped whole: what the largest view reaches."""
+        return scene.view_reach_m
 
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
         """Easting and northing of places the sites must be centred near, shape (N, 2); None for anywhere."""

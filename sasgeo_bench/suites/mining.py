@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoys: the places most like the true one by four unlike scorers, so that they favour no single method."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -12,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.suites.base import State
+from sasgeo_bench.suites.base import DRAWN_CLASSES, State
 
 SCORERS: Final = ("histogram", "rings", "distance", "graph")
 STRIDE_M: Final = 32.0
@@ -28,8 +29,6 @@ _NODE_KINDS: Final = (
     *("river_bend", "road_rail_crossing", "road_water_crossing"),
 )
 _SHORTLIST: Final = 400  # places whose best turn is looked for; the others are too unlike at any turn
-_LEAST_KNOWN: Final = 0.9
-
 Floats = NDArray[np.float32]
 
 
@@ -38,17 +37,19 @@ class Windows:
     """Every place on a lattice of a map, as four scorers describe it.
 
     `points_m` is easting and northing, shape (N, 2); `spacing_m` the lattice; each descriptor has shape (N, D), scaled
-    so that its columns have unit variance over the map, but `polar`: shape (N, D, sectors).
+    so that its columns have unit variance over the map, but `polar`, shape (N, D, sectors), and `shares`, shape (N, D),
+    of the drawn classes in rings, both 0..1.
     """
 
     points_m: NDArray[np.float64]
     radius_m: float
+    shares: Floats
     plain: dict[str, Floats]
     polar: Floats
     spectrum: Floats
 
 
-def describe(state: State, *, side_m: float) -> Windows:
+def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
     """Describe every place of a map that is mapped, for views of one size.
 
     Parameters
@@ -57,11 +58,14 @@ def describe(state: State, *, side_m: float) -> Windows:
         The map.
     side_m : float
         Side of the view.
+    clear_m : float
+        Half the side of the square that must be mapped whole, as around a site: nearer to the rim of the map a place
+        could not be the true one, and a matcher would know.
 
     Returns
     -------
     Windows
-        Places whose disc of half that side is mapped to nine tenths.
+        All such places on a lattice.
 
     Notes
     -----
@@ -77,7 +81,10 @@ def describe(state: State, *, side_m: float) -> Windows:
     rows, cols = np.meshgrid(
         np.arange(step // 2, grid.rows, step), np.arange(step // 2, grid.cols, step), indexing="ij"
     )
-    mapped = _filtered(known, _rings(radius, 1)[0])[rows, cols] >= _LEAST_KNOWN
+    square = np.ones((2 * math.ceil(clear_m / grid.cell_size_m) + 1,) * 2, dtype=np.uint8)
+    # Beyond the map nothing is known: the border counts as 0.
+    whole = (known >= 1).astype(np.uint8)
+    mapped = cv2.erode(whole, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)[rows, cols] == 1
     cells = np.column_stack((rows[mapped], cols[mapped])).astype(np.int64)
     rings = np.stack(
         [
@@ -87,11 +94,13 @@ def describe(state: State, *, side_m: float) -> Windows:
         ],
         axis=1,
     ).reshape(len(cells), len(state.classes), _RINGS)
+    drawn = [index for index, name in enumerate(state.classes) if name in (*DRAWN_CLASSES, "water")]
     areas = np.array([kernel.size for kernel in kernels], dtype=np.float32)
     polar = _polar(state, factor, cells, radius)
     return Windows(
         points_m=grid.to_centres_m(cells),
         radius_m=side_m / 2,
+        shares=rings[:, drawn].reshape(len(cells), -1),
         plain={
             "histogram": _scaled((rings * areas).sum(axis=2) / areas.sum()),
             "rings": _scaled(rings.reshape(len(cells), -1)),
@@ -167,9 +176,12 @@ def _scaled(table: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Decoys:
-    """Places most like one, most alike first, all far enough from it; `alias_index` 0..1 is how like the best one is.
+    """Places most like one, most alike first, all far enough from it.
 
-    `scorer` says which scorer each comes from, `points_m` has shape (N, 2).
+    `alias_index`, 0..1, is how like the likest place is: the mean of how the drawn classes' shares in rings overlap,
+    and of one less the root mean square by which distances to thin classes miss at the best turn. Both have scales of
+    their own, not the map's, so that regions can be compared. `scorer` says which scorer each comes from, `points_m`
+    has shape (N, 2).
     """
 
     points_m: NDArray[np.float64]
@@ -192,7 +204,8 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
     Returns
     -------
     Decoys
-        None nearer than `LEAST_RADII` half diagonals to the truth, and no two nearer than half the view's side.
+        None nearer than `LEAST_RADII` half diagonals to the truth or to another one: were they nearer to each other
+        than to the truth, the loneliest candidate would be the true one.
     """
     apart_m = np.hypot(*(windows.points_m - center_m).T)
     is_far = apart_m >= least_apart_m(windows.radius_m)
@@ -200,18 +213,26 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
     if here < 0 or not is_far.any():
         return Decoys(points_m=np.zeros((0, 2)), scorer=(), alias_index=0.0)
     far = np.flatnonzero(is_far)
-    order, likeness = [], []
+    order = []
     for name in SCORERS:
         distance = _distances(windows, name, here, far)
         order.append(far[np.argsort(distance, kind="stable")])
-        middle = float(np.median(distance))
-        likeness.append(1.0 - min(1.0, float(distance.min()) / middle) if middle > 0 else 1.0)
-    picked = list(_in_turn(order, windows.points_m, spacing_m=windows.radius_m, count=count))
+        if name == "distance":
+            misses = float(distance.min()) / math.sqrt(windows.polar[here].size)
+    spacing_m = least_apart_m(windows.radius_m)
+    picked = list(_in_turn(order, windows.points_m, spacing_m=spacing_m, count=count))
     return Decoys(
         points_m=windows.points_m[[index for index, _ in picked]].reshape(-1, 2),
         scorer=tuple(name for _, name in picked),
-        alias_index=float(np.mean(likeness)),
+        alias_index=(_overlap(windows.shares, here, far) + 1.0 - misses) / 2,
     )
+
+
+def _overlap(shares: Floats, here: int, far: NDArray[np.int64]) -> float:
+    """Largest overlap of the drawn classes' shares in rings with another place's: 1 less Bray and Curtis' index."""
+    apart = np.abs(shares[far] - shares[here]).sum(axis=1)
+    total = (shares[far] + shares[here]).sum(axis=1)
+    return 1.0 - float(np.divide(apart, total, out=np.zeros_like(apart), where=total > 0).min())
 
 
 def least_apart_m(radius_m: float) -> float:

@@ -49,7 +49,7 @@ SUITE: Final = PlainSuite(
         "mask of a fixed library that hides most of what is there (U4), over 15 to 60 % of the view.",
         separates="Matchers that leave unknown cells out from those that take them for absent.",
         falsifier="Nothing hidden: scores as in the control. Everything hidden: must be withheld.",
-        strength_unit="share of the view that is hidden",
+        strength_unit="share of the view that is hidden; in U3 of where trees and shadows hide thin classes",
         tracks=("localization", "retrieval"),
     ),
     variants=(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where queries lie: places spread over the blocks that are mapped, hold something, and do not overlap."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -17,7 +18,7 @@ from sasgeo_bench.suites.base import Scene, Seeds, Site, Suite
 
 _TRIES: Final = 400  # draws in a block before it counts as full
 _SCALE_CUT: Final = 2.0  # sigmas: a scale farther off is not drawn
-_ANCHOR_SPREAD: Final = 0.2  # of the view's side: how far a site lies from what it is about
+ANCHOR_SPREAD: Final = 0.2  # of the view's side: how far a site lies from what it is about
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +129,7 @@ class _Ground:
         near = self._near(block)
         if near is not None and len(near) == 0:
             return
-        spacing_m, spread_m = self.suite.spacing_m(), _ANCHOR_SPREAD * self.suite.main_side_m
+        spacing_m, spread_m = self.suite.spacing_m(self.scene), ANCHOR_SPREAD * self.suite.main_side_m
         failed = 0
         while failed < _TRIES:
             point = rng.uniform((west, south), (east, north))
@@ -152,12 +153,11 @@ class _Ground:
         return np.asarray(self.anchors[(x >= west) & (x < east) & (y >= south) & (y < north)])
 
     def _density(self, point: NDArray[np.float64]) -> float | None:
-        """Share of drawn cells in the main view, or None where the largest view is not mapped enough."""
+        """Share of drawn cells in the main view, or None where not all is mapped that a view may show."""
         grid = self.scene.map.grid
         row, col = grid.to_cells(point[None, :])[0].tolist()
-        largest_m = max(variant.side_m for variant in self.suite.variants)
-        known, _ = self.sums.shares(row, col, max(1, round(largest_m / 2 / grid.cell_size_m)))
-        if known < LEAST_KNOWN:
+        known, _ = self.sums.shares(row, col, math.ceil(self.suite.clear_m(self.scene) / grid.cell_size_m))
+        if known < 1.0:
             return None
         return self.sums.shares(row, col, max(1, round(self.suite.main_side_m / 2 / grid.cell_size_m)))[1]
 

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from sasgeo_bench.angles import bearing_deg, wrap_deg
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, Suite, SuiteCard, Variant, perceived
+from sasgeo_bench.suites.mining import least_apart_m
+from sasgeo_bench.suites.sites import ANCHOR_SPREAD
+from sasgeo_bench.suites.twins import Places
 
 STABLE: Final = ("road_major", "railway", "waterway")
 VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building")  # in this order they change
@@ -21,7 +24,6 @@ _REACH_M: Final = 90.0  # along the line, either way: most of a view of 192 m
 _STRAIGHT: Final = 0.995  # of the length along it
 _SAME_DEG: Final = 12.0
 _MOST_BUILT: Final = 0.03
-_APART_M: Final = 410.0
 
 
 class StableNotDistinctive(Suite):
@@ -36,24 +38,38 @@ class StableNotDistinctive(Suite):
         return straight_places(scene)[:, :2]
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit | None:
-        """No change of the map: the twins are there already."""
+        """No change of the map: the twins are there, as far off a line as sites are, and as far from each other."""
         places = straight_places(scene)
+        places = places[[scene.map.is_mapped(place[:2], self.clear_m(scene)) for place in places]]
+        apart_m = least_apart_m(self.main_side_m / 2)
+        spread_m = ANCHOR_SPREAD * self.main_side_m
         twins = {}
         for site in sites:
+            rng = seeds.rng("alias", site.index)
             here = np.array([site.pose.easting_m, site.pose.northing_m])
-            apart = np.hypot(*(places[:, :2] - here).T)
-            own = places[int(np.argmin(apart)), 2]
+            own = places[int(np.argmin(np.hypot(*(places[:, :2] - here).T))), 2]
             turned = np.abs(wrap_deg(2 * (places[:, 2] - own)) / 2)  # a line has no direction: modulo 180
-            like = places[(apart >= _APART_M) & (turned <= _SAME_DEG), :2]
-            order = seeds.rng("alias", site.index).permutation(len(like))[:MOST_ALIASES]
-            twins[site.index] = tuple((float(x), float(y)) for x, y in like[order])
-        return Edit(map_pastes=(), world_pastes=None, twins=twins)
+            like = rng.permutation(places[turned <= _SAME_DEG, :2])
+            like = like + rng.uniform(-spread_m, spread_m, like.shape)
+            twins[site.index] = _spaced(like, here, apart_m)
+        return Edit(
+            map_pastes=(), world_pastes=None, sites=tuple(site for site in sites if twins[site.index]), twins=twins
+        )
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """Mirror the layers of some volatile classes within the view: all of them at strength 1."""
         seen = perceived(scene.world, site, variant, seeds)
         after = mirrored(seen, round(variant.strength * len(VOLATILE)))
         return Draft(evidence=after, measured={"cells_changed": float((seen.cells != after.cells).mean())})
+
+
+def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], apart_m: float) -> Places:
+    """The first few places that keep their distance from here and from each other."""
+    taken = [here]
+    for point in points:
+        if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= apart_m:
+            taken.append(point)
+    return tuple((float(x), float(y)) for x, y in taken[1:])
 
 
 def mirrored(evidence: Evidence, count: int) -> Evidence:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the twin suites share: copies of a site elsewhere on the map, changed or not, and queries that must choose."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,15 +14,16 @@ from scipy import ndimage
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant, perceived
+from sasgeo_bench.suites.mining import least_apart_m
 from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.twin import Change, Paste
 
 LATTICE_M: Final = 16.0
-RING_M: Final = 12.0  # cleared around a site and its twins: a cut rim must not tell the copy from the place
-_APART: Final = 3.0  # radii between a site and its twin, as for every decoy
-_TRIES: Final = 60
+OFF_M: Final = 24.0  # how far the middle of what is copied lies from the site: its rim must not tell where the site is
 
 TWIN_GROUP: Final = PriorGroup(radius_m=2000.0, yaw="weak", scale_sigma=0.03)  # wide enough to hold the twins
+
+Places = tuple[tuple[float, float], ...]
 
 # What turns a site into the change of its copy, with the site's own chance.
 ChangeOf = Callable[[Scene, Site, np.random.Generator], Change]
@@ -33,7 +34,8 @@ class TwinSuite(Suite):
     """Every site has twins: copies elsewhere on the map that differ from it by one change.
 
     At every second site the true place has the change and the twin has not, so that "take the plainer one" does not
-    help. A query's view is of the true place; the twins are among its candidates.
+    help; at half of the sites, by lot, the copy is the true place and the original its twin, so that neither does "take
+    the one whose roads go on". A query's view is of the true place; the twins are among its candidates.
 
     Parameters
     ----------
@@ -68,39 +70,49 @@ class TwinSuite(Suite):
         """Near what the suite is about."""
         return self.find(scene)
 
-    def radius_m(self) -> float:
-        """Of the discs that are copied: the half diagonal of the largest view, and a little for its scale."""
-        return max(variant.side_m for variant in self.variants) / 2 * float(np.sqrt(2)) * 1.08
+    def radius_m(self, scene: Scene) -> float:
+        """Of the discs that are copied: all that a view may show, wherever the disc's middle lies."""
+        return scene.view_reach_m + OFF_M
 
-    def spacing_m(self) -> float:
-        """So that the discs of two sites, which are cut out of the map, do not meet."""
-        return 2 * (self.radius_m() + RING_M)
+    def spacing_m(self, scene: Scene) -> float:
+        """So that what is copied from one site is not pasted over for another."""
+        return 2 * self.clear_m(scene)
 
-    def mapped_m(self) -> float:
+    def clear_m(self, scene: Scene) -> float:
         """All that is copied: what is unknown at the site and known at its twin would tell them apart."""
-        return 2 * self.radius_m()
-
-    def least_known(self) -> float:
-        """The whole of it."""
-        return 1.0
+        return self.radius_m(scene) + OFF_M
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
-        """Find a place for every twin and say what is copied where."""
-        radius_m = self.radius_m()
-        targets = find_targets(scene.map, sites, radius_m=radius_m + RING_M, copies=self.copies, seeds=seeds)
+        """Find a place for every twin, say what is copied where, and by lot which of them is the true place."""
+        clear_m = self.clear_m(scene)
+        apart_m = max(least_apart_m(self.main_side_m / 2), 2 * clear_m)
+        targets = find_targets(scene.map, sites, clear_m=clear_m, apart_m=apart_m, copies=self.copies, seeds=seeds)
         pastes: list[Paste] = []
+        moved: list[Site] = []
+        twins: dict[int, Places] = {}
         for site in sites:
             if site.index not in targets:
                 continue
-            center_m = (site.pose.easting_m, site.pose.northing_m)
-            change = self.change_of(scene, site, seeds.rng("twin", *_key(site))) if self.change_of else None
-            swapped = self.is_swapped and site.index % 2 == 1
-            plain = Paste(source_m=center_m, target_m=center_m, radius_m=radius_m, ring_m=RING_M)
-            pastes.append(replace(plain, change=change if swapped else None))
-            pastes += [
-                replace(plain, target_m=target, change=None if swapped else change) for target in targets[site.index]
-            ]
-        return Edit(map_pastes=tuple(pastes), world_pastes=None, twins=targets)
+            rng = seeds.rng("twin", *_key(site))
+            change = self.change_of(scene, site, rng) if self.change_of else None
+            pastes += self._pastes(scene, site, targets[site.index], change, seeds)
+            true, twins[site.index] = _by_lot(scene, site, targets[site.index], seeds)
+            moved.append(true)
+        return Edit(map_pastes=tuple(pastes), world_pastes=None, sites=tuple(moved), twins=twins)
+
+    def _pastes(
+        self, scene: Scene, site: Site, targets: Places, change: Change | None, seeds: Seeds
+    ) -> Iterator[Paste]:
+        """The copies of one site; where the site is the changed one, itself as well."""
+        turn, share = seeds.rng("off", *_key(site)).random(2)
+        off_m = OFF_M * np.sqrt(share) * np.array([np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)])
+        source = np.array([site.pose.easting_m, site.pose.northing_m]) + off_m
+        is_changed = self.is_swapped and site.index % 2 == 1
+        plain = Paste(source_m=_place(source), target_m=_place(source), radius_m=self.radius_m(scene))
+        if is_changed:
+            yield replace(plain, change=change)
+        for target in targets:
+            yield replace(plain, target_m=_place(np.array(target) + off_m), change=None if is_changed else change)
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """See the true place; the control has no vectors, the falsifier's do not tell the two places apart."""
@@ -118,7 +130,7 @@ class TwinSuite(Suite):
 
     def _told_nothing(self, scene: Scene, site: Site) -> Pose:
         """The site where it is the place that the falsifier's vectors are of, else its twin."""
-        is_changed = self.is_swapped and site.index % 2 == 1
+        is_changed = (self.is_swapped and site.index % 2 == 1) != site.is_copy
         if is_changed == self.falsifier_sees_change:
             return site.pose
         easting_m, northing_m = scene.twins[site.index][0]
@@ -129,39 +141,52 @@ def _key(site: Site) -> tuple[int, int]:
     return (round(site.pose.easting_m * 100), round(site.pose.northing_m * 100))
 
 
+def _place(point: NDArray[np.float64]) -> tuple[float, float]:
+    return (float(point[0]), float(point[1]))
+
+
+def _by_lot(scene: Scene, site: Site, targets: Places, seeds: Seeds) -> tuple[Site, Places]:
+    """The true place and its twins: the site itself, or the first of its copies."""
+    block = next((item for item in scene.blocks if item.holds(targets[0])), None)
+    if block is None or seeds.rng("lot", *_key(site)).random() < 0.5:  # noqa: PLR2004 - heads
+        return site, targets
+    easting_m, northing_m = targets[0]
+    pose = replace(site.pose, easting_m=easting_m, northing_m=northing_m)
+    original = (site.pose.easting_m, site.pose.northing_m)
+    return replace(site, pose=pose, block=block.id, is_copy=True), (original, *targets[1:])
+
+
 def find_targets(
-    state: State, sites: Sequence[Site], *, radius_m: float, copies: int, seeds: Seeds
-) -> dict[int, tuple[tuple[float, float], ...]]:
-    """Find free discs for the copies of every site: mapped, off every site and every other copy, 3 radii from its own.
+    state: State, sites: Sequence[Site], *, clear_m: float, apart_m: float, copies: int, seeds: Seeds
+) -> dict[int, Places]:
+    """Find free places for the copies of every site: mapped, clear of every site and copy, apart from their own.
 
     Sites are served in turn; one that does not get all its copies gets none and is left out. A copy lies a whole number
     of cells from its site: moved by a part of one, its mask would differ at every edge, and tell it from the place.
     """
     cell_m = state.grid.cell_size_m
     step = max(1, round(LATTICE_M / cell_m))
-    reach = radius_m / LATTICE_M
     inside = np.pad(state.known[::step, ::step], 1)
-    deep = ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > reach + 1
-    cells = np.argwhere(deep) * step
-    free = state.grid.to_centres_m(cells)
+    deep = ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > clear_m / LATTICE_M + 1
+    free = state.grid.to_centres_m(np.argwhere(deep) * step)
     for site in sites:
-        free = free[np.hypot(*(free - (site.pose.easting_m, site.pose.northing_m)).T) > 2 * radius_m + cell_m]
-    found: dict[int, tuple[tuple[float, float], ...]] = {}
+        free = free[np.hypot(*(free - (site.pose.easting_m, site.pose.northing_m)).T) > 2 * clear_m + cell_m]
+    found: dict[int, Places] = {}
     for site in sites:
         rng = seeds.rng("target", *_key(site))
         own = np.array([site.pose.easting_m, site.pose.northing_m])
         taken: list[NDArray[np.float64]] = []
         left = free
         while len(taken) < copies:
-            far = left[np.hypot(*(left - own).T) > _APART * radius_m + cell_m]
+            far = left[np.hypot(*(left - own).T) > apart_m + cell_m]
             if len(far) == 0:
                 break
             picked = own + np.rint((far[rng.integers(len(far))] - own) / cell_m) * cell_m
             taken.append(picked)
-            left = left[np.hypot(*(left - picked).T) > 2 * radius_m + 2 * cell_m]
+            left = left[np.hypot(*(left - picked).T) > apart_m + 2 * cell_m]
         if len(taken) == copies:
             free = left
-            found[site.index] = tuple((float(x), float(y)) for x, y in taken)
+            found[site.index] = tuple(_place(point) for point in taken)
     return found
 
 

@@ -22,16 +22,23 @@ class VolatileLure(TwinSuite):
     """
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
-        """Change the world at the sites, and paste the lures into the map."""
+        """Paste the lures into the map, and change the world at the true places.
+
+        Where the lure is the true place, by lot, the original lures: the world has the lure's roads, and all else as at
+        the original.
+        """
         plain = super().edit(scene, sites, seeds)
-        own = [item for item in plain.map_pastes if item.source_m == item.target_m]
         lures = [
             replace(item, change=partial(mirror, classes=(*VOLATILE, *STABLE), center_m=item.source_m))
             for item in plain.map_pastes
-            if item not in own
         ]
-        world = [replace(item, change=partial(mirror, classes=VOLATILE, center_m=item.source_m)) for item in own]
-        return Edit(map_pastes=(*own, *lures), world_pastes=tuple(world), twins=plain.twins)
+        world = []
+        for site, item in zip(plain.sites, plain.map_pastes, strict=True):
+            changed = STABLE if site.is_copy else VOLATILE
+            target_m = item.target_m if site.is_copy else item.source_m
+            change = partial(mirror, classes=changed, center_m=item.source_m)
+            world.append(replace(item, target_m=target_m, change=change))
+        return replace(plain, map_pastes=tuple(lures), world_pastes=tuple(world))
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """The control and the falsifier see the map as it is, the stress the changed world."""

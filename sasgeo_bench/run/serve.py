@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a matcher's process does once it is shut in: load, prepare, match; every failure becomes a message."""
+
+import errno
+import socket
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matcher import Match, Matcher, check_match
+from sasgeo_bench.plugins import load_matcher
+from sasgeo_bench.query import Query
+from sasgeo_bench.results import one_line
+from sasgeo_bench.run import wire
+from sasgeo_bench.store.regiondir import read_region
+from sasgeo_bench.store.taskdir import query_of
+
+_REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
+
+
+class Server:
+    """Answers messages until the runner has gone."""
+
+    def __init__(self, channel: socket.socket, *, spec: str) -> None:
+        self.channel = channel
+        self.spec = spec
+        self.matcher: Matcher | None = None
+
+    def run(self) -> None:
+        """Serve until the other side closes."""
+        while True:
+            try:
+                message, blob = wire.receive(self.channel)
+            except wire.Closed:
+                return
+            try:
+                answer = self._answer(message, blob)
+            except MatchError as error:
+                answer = {"status": "invalid", "message": one_line(str(error))}
+            except MemoryError:
+                answer = {"status": "crash", "message": "out of memory"}
+            except OSError as error:
+                status = "refused" if error.errno in _REFUSED else "crash"
+                answer = {"status": status, "message": one_line(f"{type(error).__name__}: {error}")}
+            except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
+                answer = {"status": "crash", "message": one_line(f"{type(error).__name__}: {error}")}
+            wire.send(self.channel, answer)
+
+    def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+        if message["kind"] == "load":
+            self.matcher = load_matcher(self.spec)
+            return {"status": "ok"}
+        if self.matcher is None:
+            self.matcher = load_matcher(self.spec)
+        if message["kind"] == "prepare":
+            region = read_region(Path(message["region"]))
+            start = time.perf_counter()
+            self.matcher.prepare(region, None)
+            return {"status": "ok", "seconds": time.perf_counter() - start}
+        query = query_from(blob)
+        start = time.perf_counter()
+        found = self.matcher.match(query, top_k=message["top_k"])
+        seconds = time.perf_counter() - start
+        return {
+            "status": "ok",
+            "seconds": seconds,
+            "match": match_row(check_match(found, query, top_k=message["top_k"])),
+        }
+
+
+def query_from(blob: bytes) -> Query:
+    """A query out of one row in Arrow's stream format."""
+    with pa.ipc.open_stream(blob) as stream:
+        return query_of(stream.read_all().to_pylist()[0])
+
+
+def match_row(match: Match) -> dict[str, Any]:
+    """A checked answer as plain numbers."""
+    return {
+        "candidates": [
+            [pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale, score]
+            for pose, score in zip(match.poses, match.scores, strict=True)
+        ],
+        "confidence": match.confidence,
+        "diagnostics": dict(match.diagnostics),
+    }

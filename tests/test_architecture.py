@@ -64,7 +64,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "matcher": None,
     "results": None,
     "store": (
-        *("layerfile", "regiondir", "taskdir"),
+        *("layerfile", "regiondir", "taskdir", "rundir"),
         *("preview", "sheet", "splitmap", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,

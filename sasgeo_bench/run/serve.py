@@ -2,11 +2,15 @@
 """What a matcher's process does once it is shut in: load, prepare, match; every failure becomes a message."""
 
 import errno
+import hashlib
 import socket
+import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
+import psutil
 import pyarrow as pa
 
 from sasgeo_bench.errors import MatchError
@@ -52,14 +56,15 @@ class Server:
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
         if message["kind"] == "load":
             self.matcher = load_matcher(self.spec)
-            return {"status": "ok"}
+            return {"status": "ok", "card": asdict(self.matcher.card), "code": code_hash(self.matcher)}
         if self.matcher is None:
             self.matcher = load_matcher(self.spec)
         if message["kind"] == "prepare":
             region = read_region(Path(message["region"]))
-            start = time.perf_counter()
+            before, start = _resident_bytes(), time.perf_counter()
             self.matcher.prepare(region, None)
-            return {"status": "ok", "seconds": time.perf_counter() - start}
+            seconds = time.perf_counter() - start
+            return {"status": "ok", "seconds": seconds, "grown_bytes": max(0, _resident_bytes() - before)}
         query = query_from(blob)
         start = time.perf_counter()
         found = self.matcher.match(query, top_k=message["top_k"])
@@ -69,6 +74,32 @@ class Server:
             "seconds": seconds,
             "match": match_row(check_match(found, query, top_k=message["top_k"])),
         }
+
+
+def code_hash(matcher: Matcher) -> str:
+    """SHA-256 of the file a matcher's class is in and of all Python files beside and below it, by their names.
+
+    Examples
+    --------
+    >>> class Mine: ...
+    >>> len(code_hash(Mine()))
+    64
+    """
+    module = sys.modules.get(type(matcher).__module__)
+    name = getattr(module, "__file__", None)
+    digest = hashlib.sha256()
+    if name is None:
+        return digest.hexdigest()
+    own = Path(name)
+    is_package = "." in type(matcher).__module__ or own.name == "__init__.py"
+    files = sorted(own.parent.rglob("*.py")) if is_package else [own]
+    for path in files:
+        digest.update(path.relative_to(own.parent).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _resident_bytes() -> int:
+    return int(psutil.Process().memory_info().rss)
 
 
 def query_from(blob: bytes) -> Query:

@@ -21,7 +21,7 @@ import psutil
 
 import sasgeo_bench.run.child
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matcher import Match
+from sasgeo_bench.matcher import Match, MatcherCard
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.results import Status, one_line
 from sasgeo_bench.run import wire
@@ -63,12 +63,18 @@ class Reach:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """What came of a question: a status, a line that says why, the seconds it took inside, the answer."""
+    """What came of a question: a status, a line that says why, the seconds it took inside, the answer.
+
+    Of a plugin that was loaded: its card, and a hash of its code; of a map: by how much memory grew.
+    """
 
     status: Status
     message: str = ""
     seconds: float | None = None
     match: Match | None = None
+    card: MatcherCard | None = None
+    code: str = ""
+    grown_bytes: int | None = None
 
 
 @dataclass(kw_only=True)
@@ -270,7 +276,14 @@ def _reply_of(answer: Mapping[str, Any]) -> Reply:
     seconds = None if seconds is None else max(0.0, float(seconds))
     row = answer.get("match")
     if row is None:
-        return Reply(status="ok", seconds=seconds)
+        card = answer.get("card")
+        return Reply(
+            status="ok",
+            seconds=seconds,
+            card=None if card is None else _card_of(card),
+            code=str(answer.get("code", "")),
+            grown_bytes=int(answer.get("grown_bytes", 0)),
+        )
     numbers = [[float(value) for value in candidate] for candidate in row["candidates"]]
     poses = [Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in numbers]
     match = Match(
@@ -280,6 +293,13 @@ def _reply_of(answer: Mapping[str, Any]) -> Reply:
         diagnostics={str(name): float(value) for name, value in dict(row["diagnostics"]).items()},
     )
     return Reply(status="ok", seconds=seconds, match=match)
+
+
+def _card_of(said: Mapping[str, Any]) -> MatcherCard:
+    """A card as it came, held to what a card must be."""
+    lists = ("tracks", "needs", "trained_on")
+    fields: dict[str, Any] = {name: tuple(value) if name in lists else value for name, value in said.items()}
+    return MatcherCard(**fields)
 
 
 def _environment(scratch: Path) -> dict[str, str]:

@@ -362,6 +362,22 @@ def _belongs_to(truth_folder: Path) -> str:
         return "unknown"
 
 
+def read_ids(folder: Path) -> list[str]:
+    """Ids of a task's queries, in their order.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or damaged.
+    """
+    try:
+        return [str(name) for name in pq.read_table(folder / QUERIES, columns=["query_id"])["query_id"].to_pylist()]
+    except (OSError, pa.ArrowException) as error:
+        text = " ".join(str(error).split())[:200]
+        message = f"{folder / QUERIES} cannot be read ({text}): make the queries again"
+        raise StoreError(message) from error
+
+
 def read_queries(folder: Path) -> Iterator[Query]:
     """Queries of a task in the order of their ids, a row group in memory at a time."""
     for row in _rows(folder / QUERIES, QUERY_SCHEMA):

@@ -214,7 +214,8 @@ def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None
     """Every pose of a retrieval answer is one of the candidates, and none is given twice."""
     given: set[int] = set()
     for pose in poses:
-        at = candidate_index(pose, candidates)
+        near = candidates_at(pose, candidates)
+        at = next((index for index in near if index not in given), near[0] if near else None)
         if at is None:
             place = f"({pose.easting_m:.2f}, {pose.northing_m:.2f})"
             message = f"pose {place} is none of the {len(candidates)} candidates, expected one of query.candidates"
@@ -225,18 +226,18 @@ def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None
         given.add(at)
 
 
-def candidate_index(pose: Pose, candidates: Sequence[Pose]) -> int | None:
-    """Which candidate lies where a pose lies, within 5 cm; heading and scale may have been refined.
+def candidates_at(pose: Pose, candidates: Sequence[Pose]) -> list[int]:
+    """Candidates that lie where a pose lies, within 5 cm, the nearest first; heading and scale may have been refined.
 
     Examples
     --------
     >>> one, two = (Pose(easting_m=x, northing_m=0.0, yaw_deg=0.0) for x in (1.0, 7.0))
-    >>> candidate_index(two, [one, two])
-    1
+    >>> candidates_at(two, [one, two])
+    [1]
     """
     apart_m = [math.hypot(pose.easting_m - item.easting_m, pose.northing_m - item.northing_m) for item in candidates]
-    best = min(range(len(candidates)), key=apart_m.__getitem__, default=None)
-    return best if best is not None and apart_m[best] <= SAME_PLACE_M else None
+    near = [index for index, gap_m in enumerate(apart_m) if gap_m <= SAME_PLACE_M]
+    return sorted(near, key=apart_m.__getitem__)
 
 
 def _diagnostics(given: object) -> dict[str, float]:

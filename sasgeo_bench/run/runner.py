@@ -11,9 +11,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.matcher import MatcherCard, check_match, lacks
 from sasgeo_bench.query import Query
@@ -299,16 +296,8 @@ class _Questions:
 
     def __init__(self, task: Path, left: Sequence[str]) -> None:
         self._lock = threading.Lock()
-        self._rows = self._read(task, frozenset(left))
+        self._rows = taskdir.read_some(task, frozenset(left))
         self._is_stopped = False
-
-    def _read(self, task: Path, left: frozenset[str]) -> Iterator[tuple[Query, bytes]]:
-        with pq.ParquetFile(task / taskdir.QUERIES) as source:
-            for batch in source.iter_batches(batch_size=PART_ROWS):
-                for row in range(batch.num_rows):
-                    one = batch.slice(row, 1)
-                    if one.column("query_id")[0].as_py() in left:
-                        yield taskdir.query_of(one.to_pylist()[0]), _blob(one)
 
     def __iter__(self) -> Iterator[tuple[Query, bytes]]:
         """Give each query to one of those that ask."""
@@ -324,14 +313,6 @@ class _Questions:
     def stop(self) -> None:
         """Give nothing more."""
         self._is_stopped = True
-
-
-def _blob(batch: pa.RecordBatch) -> bytes:
-    """One row in Arrow's stream format."""
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, batch.schema) as stream:
-        stream.write_batch(batch)
-    return bytes(sink.getvalue())
 
 
 class _Writer:

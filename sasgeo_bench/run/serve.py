@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import psutil
-import pyarrow as pa
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import Match, Matcher, check_match
 from sasgeo_bench.plugins import load_matcher
-from sasgeo_bench.query import Query
 from sasgeo_bench.results import one_line
 from sasgeo_bench.run import wire
 from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.store.taskdir import query_of
+from sasgeo_bench.store.taskdir import query_from
 
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
@@ -100,12 +98,6 @@ def code_hash(matcher: Matcher) -> str:
 
 def _resident_bytes() -> int:
     return int(psutil.Process().memory_info().rss)
-
-
-def query_from(blob: bytes) -> Query:
-    """A query out of one row in Arrow's stream format."""
-    with pa.ipc.open_stream(blob) as stream:
-        return query_of(stream.read_all().to_pylist()[0])
 
 
 def match_row(match: Match) -> dict[str, Any]:

@@ -126,13 +126,13 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         raise StoreError(message)
     seen: set[str] = set()
     for part in parts:
-        for row in read_table(part).to_pylist():
+        for row in read_part(part).to_pylist():
             if row["query_id"] not in seen:
                 seen.add(row["query_id"])
                 yield prediction_of(row)
 
 
-def read_table(path: Path) -> pa.Table:
+def read_part(path: Path) -> pa.Table:
     """A parquet file whole.
 
     Raises
@@ -148,12 +148,41 @@ def read_table(path: Path) -> pa.Table:
         raise StoreError(message) from error
 
 
+def merge_runs(runs: Sequence[Path], into: Path) -> int:
+    """Write the predictions of several folders or files into one file, sorted by query; how many there are.
+
+    Of two for one query the first counts, in the order of `runs`. The same predictions give the same file, whatever
+    parts they came in.
+
+    Raises
+    ------
+    StoreError
+        If there are none, a file cannot be read, or the new one cannot be written.
+    """
+    found: dict[str, Prediction] = {}
+    for path in runs:
+        for prediction in read_predictions(path):
+            found.setdefault(prediction.query_id, prediction)
+    rows = [prediction_row(found[name]) for name in sorted(found)]
+    scratch = into.with_name(f".{into.name}.partial")
+    try:
+        into.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA), scratch, compression="zstd")
+        _flush(scratch)
+        scratch.rename(into)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        message = f"{into} cannot be written ({error.strerror or error}): check your rights and the free space"
+        raise StoreError(message) from error
+    return len(rows)
+
+
 def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
     """Ids of the queries a run has answered; those with a status in `again` do not count."""
     left_out = set(again)
     found: set[str] = set()
     for part in parts_of(folder):
-        table = read_table(part).select(["query_id", "status"])
+        table = read_part(part).select(["query_id", "status"])
         pairs = zip(table["query_id"].to_pylist(), table["status"].to_pylist(), strict=True)
         found |= {name for name, status in pairs if status not in left_out}
     return found

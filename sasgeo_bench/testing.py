@@ -25,6 +25,7 @@ TOWN: Final = "town-riverside"
 TOP_K: Final = 10
 _FAR_M: Final = 300.0
 _QUICK_S: Final = 5.0
+_ASKED: Final = 10  # about so many queries are asked in each check
 
 Outcome = Literal["pass", "fail", "not applicable"]
 
@@ -92,6 +93,7 @@ class _Kit:
     def checks(self) -> Iterator[Check]:
         """Every check in turn."""
         able = [query for query in self.queries if lacks(self.card, query) is None]
+        able = able[:: max(1, len(able) // _ASKED)]
         if not able:
             yield Check(name="answers a query", outcome="not applicable", found="the card's needs leave no query")
             return

@@ -16,7 +16,7 @@ def main() -> None:
     policy = start["policy"]
     isolation = sandbox.enter(sandbox.Policy(**policy)) if policy else None
     os.chdir(start["scratch"])
-    sys.path[:0] = start["paths"]
+    sys.path[:] = dict.fromkeys((*start["paths"], *sys.path))
     said = isolation.to_dict() if isolation else {}
     wire.send(channel, {"kind": "shut in", "isolation": said, "pid": os.getpid()})
     _serve(channel, start)

@@ -218,7 +218,8 @@ class Worker:
                 "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
                 "file_bytes": self.limits.file_bytes,
             }
-        start = {"spec": self.spec, "policy": policy, "scratch": str(self._scratch), "paths": [os.getcwd()]}  # noqa: PTH109
+        paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
+        start = {"spec": self.spec, "policy": policy, "scratch": str(self._scratch), "paths": paths}
         wire.send(ours, start)
         said, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
         self.isolation = {str(name): one_line(str(words)) for name, words in dict(said.get("isolation", {})).items()}

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.errors import MatchError, PoseError
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import STATUSES
@@ -151,7 +151,7 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Query) -
             diagnostics=prediction.diagnostics,
         )
         check_match(match, query, top_k=MOST_CANDIDATES)
-    except MatchError as error:
+    except (MatchError, PoseError) as error:
         text = str(error)
         column = "confidence" if "confidence" in text else "diagnostics" if "diagnostics" in text else "candidates"
         found, _, expected = text.partition(", expected ")

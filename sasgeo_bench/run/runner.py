@@ -21,7 +21,7 @@ from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import locked, read_manifest
 
 PART_ROWS: Final = 64
-PART_S: Final = 5.0  # rows wait no longer than this to be written: what a kill loses
+PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
 TOLD_S: Final = 10.0
 
 Tell = Callable[[str], None]

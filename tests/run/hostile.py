@@ -33,6 +33,14 @@ class Plain:
         return Match(poses=[Pose(easting_m=x, northing_m=y, yaw_deg=0.0)], scores=[seen], diagnostics={"seen": seen})
 
 
+class Slow(Plain):
+    """As plain, but slow enough to be killed in the middle."""
+
+    def match(self, query, *, top_k):
+        time.sleep(0.1)
+        return super().match(query, top_k=top_k)
+
+
 class Hangs(Plain):
     def match(self, query, *, top_k):
         while True:

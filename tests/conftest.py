@@ -67,7 +67,7 @@ def own_out(towns: Path, tmp_path: Path) -> Path:
 def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root with the towns and some tasks in them: `clean` at two sites, others at one; read it, do not write to it."""
     out = Path(shutil.copytree(towns, tmp_path_factory.mktemp("tasks") / "out"))
-    made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-riverside"))
+    made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-grid"))
     for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-grid")):
         count = 2 if suite == "clean" else 1
         wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)

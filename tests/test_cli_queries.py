@@ -105,7 +105,8 @@ def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
     code, told, err = program("make-queries", "--regions", RIVERSIDE, "--regions", "town-grid", "--dry-run")
     assert (code, err) == (0, "")
     assert len(told.splitlines()) == 2 * len(SUITES)
-    assert f"clean on {RIVERSIDE}: at most 8 sites, 144 queries, out/tasks/clean/{RIVERSIDE}" in told
+    count = 8 * len(SUITES["clean"].variants) * len(SUITES["clean"].card.tracks)
+    assert f"clean on {RIVERSIDE}: at most 8 sites, {count} queries, out/tasks/clean/{RIVERSIDE}" in told
     assert list(tmp_path.iterdir()) == []
 
 
@@ -222,7 +223,8 @@ def test_a_task_is_shown_with_a_sheet_of_the_right_size(program, out):
     assert (code, err) == (0, "")
     sheet = out / "sheets" / f"clean-{RIVERSIDE}.png"
     assert f"contact sheet: {sheet}" in told
-    for word in ("Rotation, scale and crop", "ODbL", "map_fingerprint", "localization 18"):
+    localization = 2 * len(SUITES["clean"].variants)
+    for word in ("Rotation, scale and crop", "ODbL", "map_fingerprint", f"localization {localization}"):
         assert word in told
     height, width, _ = cv2.imread(str(sheet)).shape
     assert (width, height) == pytest.approx((1100, 760), abs=1)

@@ -169,7 +169,7 @@ def test_how_much_of_a_disc_is_on_the_map_does_not_tell_whether_the_truth_is_in_
     with 0.84, now with 0.59: where all of a disc is on the map, it may lie anywhere on it.
     """
     west, south, east, north = wide.scene.map.grid.bounds_m
-    share_of = wide._share_of_disc(wide.scene.map)  # noqa: SLF001 - as `draw` asks for it
+    share_of = wide._share_of_disc(wide.scene.map)
     rng = np.random.default_rng(3)
     centers = {"inside": [], "outside": [], "anywhere outside": []}
     for site in [site for site in sites for _ in range(8)]:
@@ -329,6 +329,36 @@ def test_remainders_on_the_lattice_of_the_decoys_are_those_of_the_truth(drawn):
     assert stats.ks_2samp(right % STRIDE_M, wrong % STRIDE_M).pvalue > 1e-3
     decimals = [np.abs(values * 100 - np.rint(values * 100)).max() for values in (right, wrong)]
     assert max(decimals) < 1e-3
+
+
+def test_many_queries_of_a_site_do_not_tell_the_truth_by_the_mean_places_of_its_candidates(wide, sites):
+    """Each query jitters its candidates anew; what is left in the mean must not be the lattice of the decoys."""
+    views = tuple(Variant(role="stress", kind="perception", strength=at, view_cells=96) for at in range(10))
+    drawer = replace(wide, suite=replace(wide.suite, variants=views), mined={})
+    rights, chances = [0, 0], []
+    for site in sites[:30]:
+        drawn = [
+            drawer.draw(Job(query_id="q", site=site, variant=view, track="retrieval")) for view in drawer.suite.variants
+        ]
+        first = points_of(drawn[0][0])
+        found = [points_of(query) for query, _ in drawn]
+        assert len({tuple(at[0]) for at in found}) == len(found), "jittered anew for every query"
+        means = np.mean([at[cdist(first, at).argmin(axis=1)] for at in found], axis=0)
+        assert np.hypot(*(means - first).T).max() < STRIDE_M, "the same places"
+        off_m = off_lattice_m(means - drawer.windows[drawer.scene.map.region, 96.0].points_m[0])
+        for at, guess in enumerate((off_m.argmin(), off_m.argmax())):
+            rights[at] += int(guess == drawn[0][1].candidate)
+        chances.append(1 / len(first))
+    assert max(rights) <= stats.binom.isf(UNLIKELY, len(chances), float(np.mean(chances))), rights
+
+
+def test_candidates_are_shuffled_anew_for_every_query_of_a_site(wide, sites):
+    views = tuple(Variant(role="stress", kind="perception", strength=at, view_cells=96) for at in range(8))
+    drawer = replace(wide, suite=replace(wide.suite, variants=views), mined={})
+    answers = [
+        drawer.draw(Job(query_id="q", site=sites[1], variant=view, track="retrieval"))[1].candidate for view in views
+    ]
+    assert len(set(answers)) > 2
 
 
 def test_the_place_of_the_truth_in_the_list_is_any_alike(drawn):

@@ -324,6 +324,20 @@ def test_faults_of_a_task_are_listed_and_make_exit_2(program, out):
     assert "stray.txt: not part of a task" in told
 
 
+def test_verify_names_truths_of_other_queries(program, out):
+    shutil.copytree(out / "regions", "other/regions")
+    code, _, err = program(
+        *("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--n", "2", "--seed", "0"),
+        *("--prior", "r250-known-s10", "--out", "other"),
+    )
+    assert code == 0, err
+    shutil.rmtree(out / "truth" / CLEAN)
+    shutil.copytree(Path("other/truth") / CLEAN, out / "truth" / CLEAN)
+    code, told, err = program("verify", CLEAN, "--out", out)
+    assert (code, err) == (2, "")
+    assert "truth.json: the truths are of other queries, SHA-256 " in told
+
+
 @pytest.mark.parametrize("name", ["holdout", "crossfit"])
 def test_the_towns_of_the_shipped_splits_share_no_ground(name, program, towns):
     code, told, err = program("verify", name, "--out", towns)

@@ -88,7 +88,7 @@ def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     def draw(out: Path) -> None:
         shutil.copytree(towns, out)
         made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-grid"))
-        for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-grid")):
+        for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-riverside")):
             count = 2 if suite == "clean" else 1
             wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
             for request in plan_requests(wanted, tell=lambda _: None):

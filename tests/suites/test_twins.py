@@ -10,8 +10,8 @@ import shapely
 from sasgeo_bench.evidence import UNKNOWN
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.suites.base import Seeds, changed_share
-from sasgeo_bench.suites.sites import choose_sites
 from sasgeo_bench.suites.mining import least_apart_m
+from sasgeo_bench.suites.sites import choose_sites
 from sasgeo_bench.suites.twins import OFF_M, find_targets
 from sasgeo_bench.suites.vectors import VectorNoise, as_features, perceive_vectors
 from sasgeo_bench.suites.volatile_lure import STABLE, VOLATILE
@@ -235,14 +235,17 @@ def test_roads_that_go_on_across_the_rim_tell_the_original_but_not_the_truth(car
 
 @pytest.mark.parametrize("name", TWINS)
 def test_discs_that_are_copied_do_not_have_the_site_in_their_middle(carried, name):
-    found = list(lots(carried(name), 10))
+    made = carried(name)
+    found = list(lots(made, 10))
     off_m = []
     for before, _, edit in found:
         here = np.array([before.pose.easting_m, before.pose.northing_m])
         off_m.append(min(np.hypot(*(np.array(item.source_m) - here)) for item in edit.map_pastes))
     assert max(off_m) <= OFF_M + 1e-6
     assert np.mean(np.array(off_m) < OFF_M / 2) == pytest.approx(0.25, abs=0.22)  # by area
-    assert {item.radius_m for *_, edit in found for item in edit.map_pastes} == {carried(name).scene.view_reach_m + OFF_M}
+    assert {item.radius_m for *_, edit in found for item in edit.map_pastes} == {
+        carried(name).scene.view_reach_m + OFF_M
+    }
 
 
 @pytest.mark.parametrize("name", ["topology-twins", "instance-twins", "grade-separation", "alias"])

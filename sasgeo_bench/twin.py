@@ -17,7 +17,7 @@ Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
 
 _ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
-_FINE_DECIMALS: Final = 6  # of a copy: a wall cut into a hall stays on its edge, so that the mask stays cell by cell
+_FINE_DECIMALS: Final = 6  # of a cut or a copy: both stay on the line that was cut, so that the mask stays cell by cell
 _AT_M: Final = 0.1  # a road this near to a junction meets it
 _BEND_M: Final = 10.0  # of a road whose junction is moved, what is bent to meet it
 _OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
@@ -107,7 +107,7 @@ def _cut(features: gpd.GeoDataFrame, area: shapely.Geometry, *, keep_inside: boo
     crossing = (meets & ~within)[chosen]
     cut = shapely.intersection if keep_inside else shapely.difference
     shapes[crossing] = _same_dimension(cut(shapely.make_valid(shapes[crossing]), area), shapes[crossing])
-    shapes[crossing] = shapely.transform(shapes[crossing], lambda at: at.round(_DECIMALS))
+    shapes[crossing] = shapely.transform(shapes[crossing], lambda at: at.round(_FINE_DECIMALS))
     is_left = ~shapely.is_empty(shapes) & (np.maximum(shapely.length(shapes), shapely.area(shapes)) > _LEAST_M)
     table = features.iloc[chosen[is_left]]
     return table.set_geometry(gpd.GeoSeries(shapes[is_left], index=table.index, crs=features.crs))

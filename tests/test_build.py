@@ -57,7 +57,7 @@ def test_what_lies_beyond_the_town_is_unknown_not_absent(tmp_path):
     _, manifest = built(tmp_path, spec_of("town-industrial"))
     region = read_region(tmp_path / "regions" / "town-industrial")
     outside = (region.layers == OUTSIDE).all(axis=0)
-    assert 0.3 < outside.mean() < 0.4  # the town is 1024 m wide, the region 1280 m
+    assert 0.18 < outside.mean() < 0.24  # the town is 2048 m wide, the region 2304 m
     assert abs(1 - outside.mean() - manifest.coverage.share) < 0.002
     assert ((region.layers == OUTSIDE).any(axis=0) == outside).all()
 

@@ -40,7 +40,6 @@ class StableNotDistinctive(Suite):
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit | None:
         """No change of the map: the twins are there, as far off a line as sites are, and as far from each other."""
         places = straight_places(scene)
-        places = places[[scene.map.is_mapped(place[:2], self.clear_m(scene)) for place in places]]
         apart_m = least_apart_m(self.main_side_m / 2)
         spread_m = ANCHOR_SPREAD * self.main_side_m
         twins = {}
@@ -51,7 +50,8 @@ class StableNotDistinctive(Suite):
             turned = np.abs(wrap_deg(2 * (places[:, 2] - own)) / 2)  # a line has no direction: modulo 180
             like = rng.permutation(places[turned <= _SAME_DEG, :2])
             like = like + rng.uniform(-spread_m, spread_m, like.shape)
-            twins[site.index] = _spaced(like, here, apart_m)
+            is_whole = [scene.map.is_mapped(place, self.clear_m(scene)) for place in like]
+            twins[site.index] = _spaced(like[is_whole], here, apart_m)
         return Edit(
             map_pastes=(), world_pastes=None, sites=tuple(site for site in sites if twins[site.index]), twins=twins
         )

@@ -34,8 +34,8 @@ class TwinSuite(Suite):
     """Every site has twins: copies elsewhere on the map that differ from it by one change.
 
     At every second site the true place has the change and the twin has not, so that "take the plainer one" does not
-    help; at half of the sites, by lot, the copy is the true place and the original its twin, so that neither does "take
-    the one whose roads go on". A query's view is of the true place; the twins are among its candidates.
+    help; of the original and its copies any is the true place, by lot, so that neither does "take the one whose roads
+    go on". A query's view is of the true place; the twins are among its candidates.
 
     Parameters
     ----------
@@ -146,14 +146,16 @@ def _place(point: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _by_lot(scene: Scene, site: Site, targets: Places, seeds: Seeds) -> tuple[Site, Places]:
-    """The true place and its twins: the site itself, or the first of its copies."""
-    block = next((item for item in scene.blocks if item.holds(targets[0])), None)
-    if block is None or seeds.rng("lot", *_key(site)).random() < 0.5:  # noqa: PLR2004 - heads
+    """The true place and its twins, the original first: the site itself, or any of its copies in a block."""
+    blocks = {target: block for target in targets for block in scene.blocks if block.holds(target)}
+    lot = int(seeds.rng("lot", *_key(site)).integers(1 + len(blocks)))
+    if lot == 0:
         return site, targets
-    easting_m, northing_m = targets[0]
-    pose = replace(site.pose, easting_m=easting_m, northing_m=northing_m)
+    true = list(blocks)[lot - 1]
+    pose = replace(site.pose, easting_m=true[0], northing_m=true[1])
     original = (site.pose.easting_m, site.pose.northing_m)
-    return replace(site, pose=pose, block=block.id, is_copy=True), (original, *targets[1:])
+    others = tuple(target for target in targets if target != true)
+    return replace(site, pose=pose, block=blocks[true].id, is_copy=True), (original, *others)
 
 
 def find_targets(

@@ -20,25 +20,29 @@ from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.suites.all_suites import SUITES
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant
-from sasgeo_bench.suites.sites import choose_sites
+from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.twin import paste
 
-LARGE_M = 1792.0  # of a side: room for the copies of several sites
+# Sides of the region and of the town behind its name: "large" has room for the copies of several sites, "huge" for three
+# of each, and the map of a "short" one ends short of its grid.
+SIDES_M = {"medium": (1024.0, 1280.0), "large": (1792.0, 2048.0), "huge": (2560.0, 2816.0), "short": (1536.0, 1280.0)}
 OLDER = (dt.date(2014, 1, 1), dt.date(2019, 1, 1))  # of a town of 2025
 # Where each suite finds what it needs; what is not named here is drawn of the suburb.
 TOWN_OF = {
     "occlusion": "town-riverside",
     "false-unknown": "town-riverside",
     "season": "town-riverside",
-    "stable-not-distinctive": "town-industrial",
+    "stable-not-distinctive": "town-industrial large",
     "topology-twins": "town-grid large",
     "instance-twins": "town-old-town large",
     "grade-separation": "town-industrial large",
     "volatile-lure": "town-agricultural large",
-    "alias": "town-agricultural large",
+    "alias": "town-agricultural huge",
 }
-SITES = {"grade-separation": 1}  # one overpass; the others get as many as they are asked for
+# One overpass, little room for wide views; the others get as many as are asked for.
+SITES = {"grade-separation": 1, "no-priors": 3}
 MOST_SITES = 4
+MAIN_REACH_M = 144.0  # half a diagonal of a view of 192 m at its largest scale
 
 TownOf = Callable[..., Region]
 
@@ -65,21 +69,28 @@ class Carried:
         )
 
 
+def _view_reach_m(suite: Suite) -> float:
+    """How far from its centre a view of a suite may show anything."""
+    return max(item.side_m for item in suite.variants) / 2 * 2**0.5 * largest_scale(suite.card.group)
+
+
 @pytest.fixture(scope="session")
 def town(tmp_path_factory) -> TownOf:
-    """A town by its name, "large" behind it for a larger one; each is built once."""
+    """A town by its name, one of `SIDES_M` behind it for another size; each is built once."""
     out = tmp_path_factory.mktemp("towns")
 
     @cache
     def built(name: str, date: dt.date | None = None) -> Region:
-        spec = read_region_file(find_region_file(name.split(maxsplit=1)[0]))
-        if name.endswith(" large"):
+        plain_name, _, size = name.partition(" ")
+        spec = read_region_file(find_region_file(plain_name))
+        if size:
+            side_m, town_m = SIDES_M[size]
             extracts = [
-                item.model_copy(update={"town": item.town.model_copy(update={"size_m": LARGE_M + 256})})
+                item.model_copy(update={"town": item.town.model_copy(update={"size_m": town_m})})
                 for item in spec.extract
                 if item.town
             ]
-            spec = spec.model_copy(update={"id": f"{spec.id}-large", "size_m": (LARGE_M, LARGE_M), "extract": extracts})
+            spec = spec.model_copy(update={"id": f"{spec.id}-{size}", "size_m": (side_m, side_m), "extract": extracts})
         plan = plan_build(spec, out=out, date=date)
         build_region(plan, tell=lambda _: None, with_preview=False)
         return read_region(plan.folder)
@@ -88,20 +99,22 @@ def town(tmp_path_factory) -> TownOf:
 
 
 @pytest.fixture(scope="session")
-def scene(town) -> Callable[[str], Scene]:
-    """All that a town can offer to a suite."""
+def scene(town) -> Callable[..., Scene]:
+    """All that a town can offer to a suite; with the reach of a suite's views, or of those of 192 m."""
 
     @cache
-    def of_town(name: str) -> Scene:
+    def of_town(name: str, suite: str = "") -> Scene:
+        if suite:
+            return replace(of_town(name), view_reach_m=_view_reach_m(SUITES[suite]))
         state = State.of(town(name))
-        is_large = name.endswith(" large")
+        has_dates = " " not in name
         return Scene(
             map=state,
             world=state,
             blocks=blocks_of(state.region, state.grid),
-            reach_m=360.0,
+            view_reach_m=MAIN_REACH_M,
             scenes=town(name).manifest.scenes,
-            others=() if is_large else tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER),
+            others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if has_dates else (),
             elsewhere=State.of(town("town-riverside")),
             ageing=Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="here", redrawn=0.2),
         )
@@ -129,7 +142,7 @@ def carried(scene, edited) -> Callable[[str], Carried]:
     @cache
     def of_suite(name: str) -> Carried:
         suite, where = SUITES[name], TOWN_OF.get(name, "town-suburb")
-        plain = scene(where)
+        plain = scene(where, name)
         assert suite.lack(plain) is None
         suite = replace(suite, variants=suite.usable(plain))
         seeds = Seeds(root=1, names=(plain.map.region, name))
@@ -143,7 +156,8 @@ def carried(scene, edited) -> Callable[[str], Carried]:
                 world = edited(where, paste(plain.map.features, edit.world_pastes))
             after = replace(plain, map=changed, world=world)
         if edit is not None:
-            after = replace(after, twins=edit.twins)
+            after, sites = replace(after, twins=edit.twins), edit.sites
+            assert len(sites) == count
         return Carried(suite=suite, scene=after, plain=plain, sites=sites, seeds=seeds, edit=edit)
 
     return of_suite

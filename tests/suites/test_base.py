@@ -72,12 +72,15 @@ def test_a_changed_share_counts_cells_that_one_of_them_shows():
     assert changed_share(seen(one), seen(two)) == pytest.approx(3 / 6)
 
 
-def test_a_ladder_has_its_middle_at_the_other_views_and_controls_have_every_view():
-    rungs = ladder("U1", (0.1, 0.2, 0.3), views=(96, 192, 384))
+def test_a_ladder_has_the_strengths_asked_for_at_each_view_and_controls_have_every_view():
+    rungs = ladder("U1", (0.1, 0.2, 0.3), small=(0.1, 0.2), large=(0.3,))
     assert [(item.strength, item.view_cells) for item in rungs] == [
         *((strength, 192) for strength in (0.1, 0.2, 0.3)),
-        *((0.2, cells) for cells in (96, 384)),
+        *((strength, 96) for strength in (0.1, 0.2)),
+        (0.3, 384),
     ]
+    assert {(item.role, item.kind) for item in rungs} == {("stress", "U1")}
+    assert [item.view_cells for item in ladder("U1", (0.1,))] == [192]
     assert [item.view_cells for item in controls(views=(96, 192))] == [96, 192]
 
 

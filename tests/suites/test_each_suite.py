@@ -6,11 +6,16 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import UNKNOWN
 from sasgeo_bench.perturb.objects import thin_classes
 from sasgeo_bench.perturb.perception import Perception
 from sasgeo_bench.suites.all_suites import SUITES
+from sasgeo_bench.suites.base import DRAWN_CLASSES
 from sasgeo_bench.suites.local_warp import bent
+from sasgeo_bench.suites.mining import least_apart_m
+from sasgeo_bench.suites.sites import choose_sites
+from sasgeo_bench.suites.stable_not_distinctive import straight_places
 
 # What is measured of a stress, and grows with its strength.
 GROWS = {
@@ -110,7 +115,9 @@ def test_where_the_stress_lies_in_the_view_it_differs_from_the_control(carried, 
     for variant in stresses(made):
         for site in made.sites:
             draft, control = made.draw(site, variant), made.draw(site, made.control(variant))
-            assert (draft.evidence.cells != control.evidence.cells).any()
+            # In a small view a few years may leave everything as it was; the draft says so then.
+            is_still = variant.view_cells < 192 and draft.measured.get("changed_share") == 0
+            assert (draft.evidence.cells != control.evidence.cells).any() != is_still
 
 
 @pytest.mark.parametrize("name", GROWS)
@@ -198,7 +205,7 @@ def test_perception_is_that_of_the_site_and_the_view_alone(carried):
 @pytest.mark.parametrize("name", SUITES)
 def test_a_place_is_absent_only_where_the_kind_says_so(carried, name):
     made = carried(name)
-    absent = {"outside", "feature-poor", "wrong place", "corrupted view", "R1 truth removed"}
+    absent = {"outside", "wrong place", "corrupted view", "R1 truth removed"}
     for variant in made.suite.variants:
         draft = made.draw(made.sites[0], variant)
         assert draft.is_present == (variant.kind not in absent)
@@ -229,7 +236,7 @@ def test_seasons_without_anything_to_change_are_left_out(scene):
 
 def test_mirroring_leaves_stable_classes_and_amounts_as_they_were(carried):
     made = carried("stable-not-distinctive")
-    moved = {0.4: ("farmland", "parking"), 1.0: ("farmland", "parking", "field_boundary", "building", "green")}
+    moved = {0.4: ("green", "farmland"), 1.0: ("green", "farmland", "parking", "field_boundary", "building")}
     for variant in stresses(made):
         for site in made.sites:
             seen, control = (made.draw(site, item).evidence for item in (variant, made.control(variant)))
@@ -239,13 +246,42 @@ def test_mirroring_leaves_stable_classes_and_amounts_as_they_were(carried):
                     np.testing.assert_array_equal(seen.layer(layer), control.layer(layer))
 
 
-def test_aliases_of_a_straight_line_run_the_same_way_far_from_it(carried):
+def test_aliases_of_a_straight_line_run_the_same_way_far_from_it_and_from_each_other(carried):
     made = carried("stable-not-distinctive")
+    lines = straight_places(made.scene)
     for site in made.sites:
+        here = np.array([[site.pose.easting_m, site.pose.northing_m]])
         twins = np.array(made.scene.twins[site.index])
-        apart_m = np.hypot(*(twins - (site.pose.easting_m, site.pose.northing_m)).T)
-        assert apart_m.min() >= 410
         assert 1 <= len(twins) <= 8
+        both = np.vstack((here, twins))
+        apart_m = np.hypot(*(both[:, None] - both[None]).transpose(2, 0, 1))
+        assert apart_m[~np.eye(len(both), dtype=bool)].min() >= least_apart_m(96.0)
+        bearings = [lines[int(np.argmin(np.hypot(*(lines[:, :2] - at).T))), 2] for at in both]
+        off_deg = np.abs((np.array(bearings) - bearings[0] + 90) % 180 - 90)
+        assert off_deg.max() <= 12
+
+
+def test_aliases_lie_as_far_off_their_lines_as_sites_do_and_all_around_them_is_mapped(carried):
+    made = carried("stable-not-distinctive")
+    lines = straight_places(made.scene)[:, :2]
+    off_m = {"sites": [], "twins": []}
+    for root in range(20):
+        seeds = replace(made.seeds, root=root)
+        sites = choose_sites(
+            made.scene, made.suite, count=99, seeds=seeds, group=made.suite.card.group, may_be_fewer=True
+        )
+        edit = made.suite.edit(made.scene, sites, seeds)
+        places = {
+            "sites": [(site.pose.easting_m, site.pose.northing_m) for site in edit.sites],
+            "twins": [place for site in edit.sites for place in edit.twins[site.index]],
+        }
+        for name, points in places.items():
+            for point in np.array(points):
+                assert made.scene.map.is_mapped(point, made.scene.view_reach_m)
+                off_m[name].append(np.hypot(*(lines - point).T).min())
+    assert min(map(len, off_m.values())) > 40
+    assert np.mean(off_m["twins"]) == pytest.approx(np.mean(off_m["sites"]), rel=0.2)
+    assert np.median(off_m["twins"]) > 5  # not on the line, where no site is
 
 
 def test_without_priors_the_views_are_the_same_and_with_them_the_scale_is_said_as_wide_as_it_is(carried):
@@ -277,13 +313,64 @@ def test_a_corrupted_view_keeps_its_amounts_and_loses_its_place(carried):
         assert (seen.cells != control.cells).any()
 
 
-def test_a_feature_poor_view_has_nothing_drawn(carried):
+def test_a_view_of_a_wrong_place_shows_nothing_beyond_the_map_there(scene, carried):
+    made = carried("absent")
+    wrong = next(item for item in stresses(made) if item.kind == "wrong place")
+    poor = replace(made, scene=replace(made.scene, elsewhere=scene("town-industrial short").map))
+    for root in range(4):
+        for site in made.sites:
+            seen = replace(poor, seeds=replace(made.seeds, root=root)).draw(site, wrong).evidence
+            assert not (seen.cells == UNKNOWN).all(axis=0).any()
+
+
+def test_another_region_without_room_for_a_whole_view_is_refused(carried):
+    made = carried("absent")
+    wrong = next(item for item in stresses(made) if item.kind == "wrong place")
+    state, reach = made.scene.elsewhere, int(made.scene.view_reach_m)
+    bits = np.full_like(state.bits.bits, 1 << 31)
+    bits[300 : 300 + 2 * reach - 2, 300 : 300 + 2 * reach - 2] = 0
+    small = replace(made.scene, elsewhere=replace(state, bits=replace(state.bits, bits=bits)))
+    with pytest.raises(ConfigError, match="too small to take a view of a wrong place"):
+        replace(made, scene=small).draw(made.sites[0], wrong)
+
+
+def drawn_share(evidence):
+    """Share of cells in which anything is drawn."""
+    return np.any([evidence.layer(name) == 1 for name in DRAWN_CLASSES if name in evidence.classes], axis=0).mean()
+
+
+def test_a_feature_poor_view_is_of_a_real_place_of_the_block_with_next_to_nothing_drawn(carried):
     made = carried("absent")
     poor = next(item for item in stresses(made) if item.kind == "feature-poor")
+    bounds = {block.id: block.bounds_m for block in made.scene.blocks}
     for site in made.sites:
-        evidence = made.draw(site, poor).evidence
-        for layer in ("road_major", "road_minor", "path_track", "building", "railway", "waterway", "field_boundary"):
-            assert not (evidence.layer(layer) == 1).any()
+        draft = made.draw(site, poor)
+        assert draft.is_present
+        assert draft.measured["is_real_place"] == 1
+        pose = draft.pose
+        west, south, east, north = bounds[site.block]
+        assert west <= pose.easting_m < east
+        assert south <= pose.northing_m < north
+        assert (pose.yaw_deg, pose.scale) == (site.pose.yaw_deg, site.pose.scale)
+        assert made.scene.map.is_mapped(np.array([pose.easting_m, pose.northing_m]), made.scene.view_reach_m)
+        perfect = made.scene.world.view(pose, size_cells=192, cell_size_m=1.0)
+        assert drawn_share(perfect) < 0.01
+        assert drawn_share(draft.evidence) < 0.02  # with what perception sees that is not there
+        assert drawn_share(made.draw(site, made.control(poor)).evidence) > 0.02
+
+
+def test_where_all_of_a_block_has_something_the_site_itself_is_seen_without_it(carried):
+    made = carried("absent")
+    poor = next(item for item in stresses(made) if item.kind == "feature-poor")
+    state = made.scene.map
+    bits = state.bits.bits | np.uint32(1 << state.classes.index("building"))
+    full = replace(made.scene, map=replace(state, bits=replace(state.bits, bits=bits)))
+    for site in made.sites:
+        draft = replace(made, scene=full).draw(site, poor)
+        assert draft.measured["is_real_place"] == 0
+        assert draft.pose is None
+        assert draft.is_present
+        assert drawn_share(draft.evidence) == 0
 
 
 def test_neighbours_are_five_metres_apart_and_the_truth_is_any_of_them(carried):
@@ -308,7 +395,7 @@ def test_neighbours_are_five_metres_apart_and_the_truth_is_any_of_them(carried):
     [
         ("grade-separation", "town-suburb", "no bridge that carries one road over another"),
         ("topology-twins", "town-riverside", "no two junctions near each other"),
-        ("real-age", "town-industrial large", "one date only"),
+        ("real-age", "town-industrial short", "one date only"),
     ],
 )
 def test_a_place_that_cannot_carry_a_suite_says_what_it_lacks(scene, name, where, words):

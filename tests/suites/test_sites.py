@@ -10,8 +10,9 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import UNKNOWN
 from sasgeo_bench.split import blocks_of
 from sasgeo_bench.suites.all_suites import SUITES
-from sasgeo_bench.suites.base import LEAST_KNOWN, Seeds
-from sasgeo_bench.suites.sites import choose_sites, largest_scale
+from sasgeo_bench.suites.base import Seeds
+from sasgeo_bench.suites.sites import choose_sites
+from sasgeo_bench.suites.twins import OFF_M
 
 SEEDS = Seeds(root=3, names=("town", "sites"))
 ALL = 1000
@@ -28,24 +29,28 @@ def places(sites):
 
 @pytest.fixture(scope="module")
 def quarters(scene):
-    """The suburb in blocks of half a kilometre."""
+    """The suburb in blocks of half a kilometre, for views of 192 m."""
     town = scene("town-suburb")
     return replace(town, blocks=blocks_of(town.map.region, town.map.grid, block_m=500.0))
 
 
 @pytest.mark.parametrize("name", ["clean", "growth", "topology-twins", "instance-twins", "no-priors"])
-@pytest.mark.parametrize("where", ["town-suburb", "town-old-town"])
+@pytest.mark.parametrize("where", ["town-suburb", "town-old-town large"])
 def test_no_two_sites_are_nearer_than_the_suite_asks(scene, name, where):
-    found = places(chosen(scene(where), name))
+    town = scene(where, name)
+    found = places(chosen(town, name))
     apart_m = np.hypot(*(found[:, None] - found[None]).transpose(2, 0, 1))
-    assert apart_m[~np.eye(len(found), dtype=bool)].min(initial=np.inf) >= SUITES[name].spacing_m()
+    assert apart_m[~np.eye(len(found), dtype=bool)].min(initial=np.inf) >= SUITES[name].spacing_m(town)
 
 
-def test_footprints_of_twin_sites_leave_room_for_the_rings_around_them(scene):
-    found = places(chosen(scene("town-old-town"), "topology-twins"))
+def test_discs_copied_from_twin_sites_do_not_meet(scene):
+    town = scene("town-old-town large", "topology-twins")
+    suite = SUITES["topology-twins"]
+    found = places(chosen(town, "topology-twins"))
     assert len(found) > 3
-    half_diagonal_m = 96 * np.sqrt(2) * largest_scale(SUITES["topology-twins"].card.group)
-    assert np.hypot(*(found[:, None] - found[None]).transpose(2, 0, 1))[0, 1:].min() > 2 * half_diagonal_m
+    apart_m = np.hypot(*(found[:, None] - found[None]).transpose(2, 0, 1))
+    # Either disc may lie off its site, towards the other.
+    assert apart_m[~np.eye(len(found), dtype=bool)].min() >= 2 * (suite.radius_m(town) + OFF_M)
 
 
 def test_every_site_lies_in_the_block_it_names_and_blocks_take_turns(quarters):
@@ -73,21 +78,41 @@ def test_the_same_seed_gives_the_same_sites_and_another_one_others(quarters):
     assert not np.isin(places(other), places(chosen(quarters, "clean"))).any()
 
 
-def test_footprints_are_mapped(scene):
-    town = scene("town-industrial")  # its map ends short of its grid
+@pytest.mark.parametrize("name", ["clean", "no-priors", "instance-twins"])
+def test_all_that_any_view_of_a_site_may_show_is_mapped(scene, name):
+    town = scene("town-industrial short", name)  # its map ends short of its grid
     assert not town.map.known.all()
-    for site in chosen(town, "clean"):
-        square = town.map.view(replace(site.pose, yaw_deg=0.0, scale=1.0), size_cells=384, cell_size_m=1.0).layer(
-            "building"
-        )
-        assert (square != UNKNOWN).mean() >= LEAST_KNOWN - 0.01
+    suite = SUITES[name]
+    most = suite.clear_m(town)
+    assert most >= max(variant.side_m for variant in suite.variants) / 2 * np.sqrt(2)
+    sites = [site for root in range(5) for site in chosen(town, name, seeds=Seeds(root=root, names=()))]
+    at_rim = []
+    for site in sites:
+        row, col = town.map.grid.to_cells(places([site]))[0]
+        reach = int(most)
+        assert town.map.known[row - reach : row + reach, col - reach : col + reach].all()
+        at_rim.append(not town.map.is_mapped(places([site])[0], 1.5 * most))
+        for variant in suite.variants:
+            largest = replace(site.pose, scale=1 + 2 * suite.card.group.scale_sigma)
+            for pose in (site.pose, replace(largest, yaw_deg=45.0)):
+                view = town.map.view(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+                assert not (view.cells == UNKNOWN).any()
+    assert any(at_rim)
 
 
-def test_all_that_twin_suites_copy_is_mapped(scene):
-    town = scene("town-industrial")
-    for site in chosen(town, "instance-twins"):
-        for view in (town.map.view(site.pose, size_cells=192, cell_size_m=1.0),):
-            assert not (view.cells == UNKNOWN).any()
+def test_a_place_is_mapped_where_all_of_its_square_is(scene):
+    state = scene("town-suburb").map
+    bits = np.full_like(state.bits.bits, 1 << 31)
+    bits[200:301, 400:501] = 0
+    square = replace(state, bits=replace(state.bits, bits=bits))
+    middle = state.grid.to_centres_m(np.array([[250, 450]]))[0]
+    assert square.is_mapped(middle, 50.0)
+    assert not square.is_mapped(middle, 50.1)
+    assert not square.is_mapped(middle + np.array([1.0, 0.0]), 50.0)
+    corner = state.grid.to_centres_m(np.array([[30, 30]]))[0]
+    assert state.is_mapped(corner, 30.0)
+    assert not state.is_mapped(corner, 31.0)  # beyond the grid nothing is known
+    assert not state.is_mapped(corner - np.array([1e5, 0.0]), 5.0)
 
 
 def test_a_site_says_how_much_is_drawn_in_its_view(scene):

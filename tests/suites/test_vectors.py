@@ -169,7 +169,7 @@ def test_what_met_still_meets_after_the_shift(world, seed, yaw_deg):
 
 
 def test_junctions_of_a_town_survive_the_shift(scene):
-    state = scene("town-old-town").map
+    state = scene("town-old-town medium").map
     west, south, east, north = state.grid.bounds_m
     pose = Pose(easting_m=(west + east) / 2 + 200, northing_m=(south + north) / 2, yaw_deg=77.0)
     degrees = []

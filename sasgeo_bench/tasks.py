@@ -171,6 +171,11 @@ def _edited(
             f"{suite.card.name!r}: lower --n or pass --up-to"
         )
         raise ConfigError(message)
+    # Counted on the map as it is: the edited one is not written where there would be nothing to ask on it.
+    group = request.group or suite.card.group
+    trial = Drawer(suite=suite, scene=replace(scene, twins=edit.twins), seeds=seeds, group=group, split=request.split)
+    if not any(trial.can_draw(job) for job in trial.jobs(edit.sites)):
+        raise _too_small(request, suite)
     plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
     world = scene.world
     if edit.world_pastes is not None:
@@ -183,6 +188,10 @@ def _edited(
     edited = State.of(regiondir.read_region(folder))
     world = edited if edit.world_pastes is None else world
     return replace(scene, map=edited, world=world, twins=edit.twins), edit.sites
+
+
+def _too_small(request: Request, suite: Suite) -> ConfigError:
+    return ConfigError(f"{request.region.id} is too small for suite {suite.card.name!r}: no decoys far enough away")
 
 
 def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
@@ -209,8 +218,7 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} decoys")
     by_map: dict[str, list[Job]] = {}
     if not left:
-        message = f"{request.region.id} is too small for suite {drawer.suite.card.name!r}: no decoys far enough away"
-        raise ConfigError(message)
+        raise _too_small(request, drawer.suite)
     for job in left:
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name

@@ -286,7 +286,6 @@ def test_a_region_that_cannot_carry_a_suite_is_told_what_it_lacks(own_out):
     assert content(own_out) == {}
 
 
-@pytest.mark.xfail(strict=True, reason="decoys are looked for in the edited map, which is written by then")
 def test_a_region_too_small_for_decoys_is_refused_before_its_map_is_edited(own_out):
     with pytest.raises(ConfigError, match="town-riverside is too small for suite 'alias': no decoys far enough away"):
         make(own_out, "alias")

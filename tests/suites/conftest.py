@@ -23,8 +23,8 @@ from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Sui
 from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.twin import paste
 
-# Sides of the region and of the town behind its name: "large" has room for the copies of several sites, "huge" for three
-# of each, and the map of a "short" one ends short of its grid.
+# Sides of the region and of the town behind its name: "large" has room for the copies of several sites, "huge" for
+# three of each, and the map of a "short" one ends short of its grid.
 SIDES_M = {"medium": (1024.0, 1280.0), "large": (1792.0, 2048.0), "huge": (2560.0, 2816.0), "short": (1536.0, 1280.0)}
 OLDER = (dt.date(2014, 1, 1), dt.date(2019, 1, 1))  # of a town of 2025
 # Where each suite finds what it needs; what is not named here is drawn of the suburb.

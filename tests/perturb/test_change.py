@@ -81,8 +81,8 @@ def test_roads_go_and_come_in_pieces(views):
         before = view.layer("road_minor") == PRESENT
         if before.mean() > 0.02:
             names = ("road_minor",)
-            older = aged(view, rates=rates(vanish=0.03, names=names), years=10, seeds=range(8))
-            grown = aged(view, rates=rates(appear=0.03, names=names), years=10, seeds=range(8))
+            older = aged(view, rates=rates(vanish=0.03, names=names), years=10, seeds=range(40))
+            grown = aged(view, rates=rates(appear=0.03, names=names), years=10, seeds=range(40))
             kept += [(after.layer("road_minor") == PRESENT).sum() / before.sum() for after in older]
             new += [((after.layer("road_minor") == PRESENT) & ~before).sum() / before.sum() for after in grown]
     assert np.mean(kept) == pytest.approx(np.exp(-0.3), abs=0.08)

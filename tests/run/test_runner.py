@@ -95,12 +95,14 @@ def test_killed_at_random_moments_a_run_ends_with_the_same_rows(place, task, und
     command += ["--tasks", str(task), "--out", str(tmp_path), "--match-s", "5", "--jobs", "2"]
     chance = random.Random(7)  # noqa: S311 - moments, no secrets
     every, cut_off = len(taskdir.read_ids(task)), 0
-    for _ in range(kills):
+    for number in range(kills):
         (folder / "run.json").unlink(missing_ok=True)
         process = subprocess.Popen(command, cwd=place, env=env_with(place), stderr=subprocess.DEVNULL)  # noqa: S603
         while process.poll() is None and not (folder / "run.json").is_file():
             time.sleep(0.05)
-        time.sleep(chance.uniform(0.5, 4.0))
+        while number == 0 and process.poll() is None and not rundir.parts_of(folder):
+            time.sleep(0.01)  # the first time certainly in the middle
+        time.sleep(0 if number == 0 else chance.uniform(0.5, 4.0))
         process.kill()
         process.wait()
         done = len(rundir.ids_done(folder)) if folder.is_dir() else 0

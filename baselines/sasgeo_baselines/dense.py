@@ -21,6 +21,7 @@ _SPREAD: Final = 2.0  # standard deviations of heading and scale that are search
 _MARGIN_M: Final = 12.0  # how far a mode may move while it is refined
 _WIDEN: Final = 0.05  # how far its scale may leave those that were searched
 _ROUNDS: Final = 8  # of steps of one size
+_SOME_CELLS: Final = 96  # a side: enough to climb by
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,8 +156,8 @@ class Search:
         plan, factor = self.plan, self._factor()
         coarse = self._peaks(self._tiles_of_prior(factor), factor, most=max(plan.modes, 2 * count))
         limit = self._limit(factor)
-        rough = _ranked(self._refined(mode, limit, is_last=False) for mode in coarse)
-        fine = _ranked(self._refined(mode, limit, is_last=True) for mode in rough[: max(plan.finals, count + 1)])
+        rough = _ranked(self._rough(mode, limit) for mode in coarse)
+        fine = _ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
         return _thinned(fine, plan.apart_m)
 
     def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
@@ -173,7 +174,7 @@ class Search:
         for at, mode in enumerate(rough):
             if mode is not None and mode.score >= cut:
                 disc = Disc(center_m=(poses[at].easting_m, poses[at].northing_m), radius_m=self.plan.around_m)
-                fine[at] = self._refined(self._refined(mode, disc, is_last=False), disc, is_last=True)
+                fine[at] = self._fine(self._rough(mode, disc), disc)
         lowest = min((mode.score for mode in fine.values()), default=0.0)
         return [
             fine.get(at, mode and replace(mode, score=lowest - (cut - mode.score))) for at, mode in enumerate(rough)
@@ -302,42 +303,52 @@ class Search:
     # Fine
 
     @cached_property
-    def _levels(self) -> tuple[_Level, _Level]:
-        """How a mode is refined: on blurred squares by a few samples, then on the map itself by every cell."""
+    def _levels(self) -> tuple[_Level, _Level, _Level]:
+        """How a mode is refined: on blurred squares, then on the map itself by some cells, then by all of them."""
         cell_m, blur_m = self.chart.grid.cell_size_m, self.plan.coarse_m
-        stride = max(1, round(blur_m / self.view.grid.cell_size_m))
         yaw_deg, scale = self.plan.yaw_step_deg, self.plan.scale_step
-        rough = _Level(
-            samples=self.view.samples(self.view.blurred(blur_m), stride=stride),
-            blur_m=blur_m,
-            steps=(blur_m / 2, yaw_deg / 2, scale / 2),
-            halvings=2,
+        blurred = self.view.samples(self.view.blurred(blur_m), stride=self._stride(blur_m))
+        some = self.view.samples(self.view.template, stride=max(1, round(max(self.view.grid.shape) / _SOME_CELLS)))
+        every = self.view.samples(self.view.template, stride=1)
+        return (
+            _Level(samples=blurred, blur_m=blur_m, steps=(blur_m / 2, yaw_deg / 2, scale / 2), halvings=2),
+            _Level(samples=some, blur_m=0.0, steps=(cell_m, yaw_deg / 4, scale / 4), halvings=2),
+            _Level(samples=every, blur_m=0.0, steps=(cell_m / 4, yaw_deg / 16, scale / 16), halvings=1),
         )
-        last = _Level(
-            samples=self.view.samples(self.view.template, stride=1),
-            blur_m=0.0,
-            steps=(cell_m, yaw_deg / 4, scale / 4),
-            halvings=3,
-        )
-        return rough, last
 
-    def _refined(self, mode: Mode, disc: Disc, *, is_last: bool) -> Mode:
-        """Climb from a mode to a better one nearby."""
-        level, start = self._levels[is_last], mode.pose
+    def _stride(self, size_m: float) -> int:
+        """How many cells of the view a size spans."""
+        return max(1, round(size_m / self.view.grid.cell_size_m))
+
+    def _rough(self, mode: Mode, disc: Disc) -> Mode:
+        """Climb from a coarse mode to a better one nearby, on blurred squares."""
+        level = self._levels[0]
+        patch = self._patch(mode).blurred(level.blur_m)
+        return self._climbed(mode, level, patch, disc)
+
+    def _fine(self, mode: Mode, disc: Disc) -> Mode:
+        """Climb on the map itself."""
+        patch = self._patch(mode)
+        for level in self._levels[1:]:
+            mode = self._climbed(mode, level, patch, disc)
+        return mode
+
+    def _patch(self, mode: Mode) -> Patch:
+        """The map under a view that moves a little."""
+        place_m = (mode.pose.easting_m, mode.pose.northing_m)
+        half_m = self.view.reach_m * (self._turns[-1].scale + _WIDEN) + 2 * _MARGIN_M
+        return Patch.around(self.chart, self.view.bands, place_m, half_m)
+
+    def _climbed(self, mode: Mode, level: _Level, patch: Patch, disc: Disc) -> Mode:
         low, high = self._turns[0].scale - _WIDEN, self._turns[-1].scale + _WIDEN
-        place_m = (start.easting_m, start.northing_m)
-        half_m = self.view.reach_m * high + _MARGIN_M
-        patch = Patch.around(self.chart, self.view.bands, place_m, half_m)
-        if level.blur_m > 0:
-            patch = patch.blurred(level.blur_m)
-        near = Disc(center_m=place_m, radius_m=_MARGIN_M)
+        near = Disc(center_m=(mode.pose.easting_m, mode.pose.northing_m), radius_m=_MARGIN_M)
 
         def score_of(pose: Pose) -> float:
             if not (low <= pose.scale <= high and near.has(pose) and disc.has(pose)):
                 return NOWHERE
             return patch.score(level.samples, pose, least_overlap=self.plan.least_overlap)
 
-        best = Mode(pose=start, score=patch.score(level.samples, start, least_overlap=self.plan.least_overlap))
+        best = replace(mode, score=patch.score(level.samples, mode.pose, least_overlap=self.plan.least_overlap))
         for halving in range(level.halvings):
             best = _climb(best, score_of, tuple(step / 2**halving for step in level.steps))
         return best

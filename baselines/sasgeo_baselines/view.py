@@ -105,7 +105,7 @@ class Patch:
     def around(cls, chart: Chart, bands: NDArray[np.int64], place_m: tuple[float, float], half_m: float) -> Self:
         """Read the square of at least `half_m` to each side of a place."""
         row, col = chart.grid.to_cells(np.array([place_m]))[0].tolist()
-        half = math.ceil(half_m / chart.grid.cell_size_m) + 1
+        half = math.ceil(half_m / chart.grid.cell_size_m)
         side = 2 * half + 1
         square = chart.square(row - half, col - half, side, bands)
         grid = chart.grid.window(row - half, col - half, side, side)

@@ -53,9 +53,7 @@ def ranked_candidates(
         else query.candidates[at]
         for at in chosen
     ]
-    return Match(
-        poses=turned, scores=[float(scores[at] or 0.0) for at in chosen], diagnostics=dict(diagnostics or {})
-    )
+    return Match(poses=turned, scores=[float(scores[at] or 0.0) for at in chosen], diagnostics=dict(diagnostics or {}))
 
 
 def offsets_m(points_m: NDArray[np.float64], place_m: tuple[float, float]) -> NDArray[np.float64]:

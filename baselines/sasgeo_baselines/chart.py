@@ -100,5 +100,7 @@ def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float3
     """
     if not present.any():
         return np.zeros(present.shape, dtype=np.float32)
-    distance = cv2.distanceTransform(np.where(present, ABSENT, PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = cv2.distanceTransform(
+        np.where(present, ABSENT, PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    )
     return np.asarray(np.exp(-(distance**2) / np.float32(2 * reach_cells**2)), dtype=np.float32)

@@ -134,10 +134,9 @@ def _steps(reach: float, step: float) -> list[float]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """One pass of refinement: samples of the view, blur of the map, first steps (m, degrees, 1), how often halved."""
+    """One pass of refinement: samples of the view, first steps (m, degrees, 1), how often halved."""
 
     samples: Samples
-    blur_m: float
     steps: tuple[float, float, float]
     halvings: int
 
@@ -227,7 +226,9 @@ class Search:
         row, col = self.chart.grid.to_cells(np.array([place_m]))[0].tolist()
         reach = math.ceil(self.plan.around_m / (factor * self.chart.grid.cell_size_m))
         back = reach * factor + factor // 2
-        return self._tile(row - back, col - back, 2 * reach + 1, factor, Disc(center_m=place_m, radius_m=self.plan.around_m))
+        return self._tile(
+            row - back, col - back, 2 * reach + 1, factor, Disc(center_m=place_m, radius_m=self.plan.around_m)
+        )
 
     def _tile(self, row: int, col: int, count: int, factor: int, disc: Disc) -> _Tile:
         """Tile of `count` coarse cells a side, the first of them at a cell of the map."""
@@ -311,9 +312,9 @@ class Search:
         some = self.view.samples(self.view.template, stride=max(1, round(max(self.view.grid.shape) / _SOME_CELLS)))
         every = self.view.samples(self.view.template, stride=1)
         return (
-            _Level(samples=blurred, blur_m=blur_m, steps=(blur_m / 2, yaw_deg / 2, scale / 2), halvings=2),
-            _Level(samples=some, blur_m=0.0, steps=(cell_m, yaw_deg / 4, scale / 4), halvings=2),
-            _Level(samples=every, blur_m=0.0, steps=(cell_m / 4, yaw_deg / 16, scale / 16), halvings=1),
+            _Level(samples=blurred, steps=(blur_m / 2, yaw_deg / 2, scale / 2), halvings=2),
+            _Level(samples=some, steps=(cell_m, yaw_deg / 4, scale / 4), halvings=2),
+            _Level(samples=every, steps=(cell_m / 4, yaw_deg / 16, scale / 16), halvings=1),
         )
 
     def _stride(self, size_m: float) -> int:
@@ -322,22 +323,21 @@ class Search:
 
     def _rough(self, mode: Mode, disc: Disc) -> Mode:
         """Climb from a coarse mode to a better one nearby, on blurred squares."""
-        level = self._levels[0]
-        patch = self._patch(mode).blurred(level.blur_m)
-        return self._climbed(mode, level, patch, disc)
+        patch = self._patch(mode, factor=self._cells(self.plan.coarse_m / 2))
+        return self._climbed(mode, self._levels[0], patch, disc)
 
     def _fine(self, mode: Mode, disc: Disc) -> Mode:
         """Climb on the map itself."""
-        patch = self._patch(mode)
+        patch = self._patch(mode, factor=1)
         for level in self._levels[1:]:
             mode = self._climbed(mode, level, patch, disc)
         return mode
 
-    def _patch(self, mode: Mode) -> Patch:
+    def _patch(self, mode: Mode, *, factor: int) -> Patch:
         """The map under a view that moves a little."""
         place_m = (mode.pose.easting_m, mode.pose.northing_m)
         half_m = self.view.reach_m * (self._turns[-1].scale + _WIDEN) + 2 * _MARGIN_M
-        return Patch.around(self.chart, self.view.bands, place_m, half_m)
+        return Patch.around(self.chart, self.view.bands, place_m, half_m, factor=factor)
 
     def _climbed(self, mode: Mode, level: _Level, patch: Patch, disc: Disc) -> Mode:
         low, high = self._turns[0].scale - _WIDEN, self._turns[-1].scale + _WIDEN

@@ -50,7 +50,9 @@ class DenseMatcher(ABC):
             raise RuntimeError(message)
         if is_blind(query):
             return WITHHELD
-        search = Search(chart=self._chart, view=self._view(self._chart, query.evidence), prior=query.prior, plan=self.plan)
+        search = Search(
+            chart=self._chart, view=self._view(self._chart, query.evidence), prior=query.prior, plan=self.plan
+        )
         known = {"known_share": 1.0 - query.evidence.unknown_share}
         if query.track == "retrieval":
             found = search.candidates(query.candidates)

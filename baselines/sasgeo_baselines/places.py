@@ -80,7 +80,9 @@ class Sums:
         known = (region.layers <= PRESENT).all(axis=0)
         grid = region.grid.coarsen(factor)
         below = np.zeros((len(bands) + 1, grid.rows + 1, grid.cols + 1), dtype=np.int64)
-        for into, layer in zip(below, (*((region.layers[band] == PRESENT) & known for band in bands), known), strict=True):
+        for into, layer in zip(
+            below, (*((region.layers[band] == PRESENT) & known for band in bands), known), strict=True
+        ):
             padded = np.zeros((grid.rows * factor, grid.cols * factor), dtype=np.int64)
             padded[: layer.shape[0], : layer.shape[1]] = layer
             blocks = padded.reshape(grid.rows, factor, grid.cols, factor).sum(axis=(1, 3))
@@ -94,9 +96,7 @@ class Sums:
         left, right = (np.clip(edge, 0, self.grid.cols) for edge in (left, right))
         top, bottom = (np.clip(edge, 0, self.grid.rows) for edge in (top, bottom))
         sums = self.below
-        return np.asarray(
-            sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left]
-        )
+        return np.asarray(sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left])
 
 
 def points_of(poses: tuple[Pose, ...]) -> NDArray[np.float64]:

@@ -52,9 +52,7 @@ class RasterUniform(DenseMatcher):
         ),
     )
 
-    def __init__(
-        self, *, reach_m: float = REACH_M, is_unknown_absent: bool = False, plan: Plan | None = None
-    ) -> None:
+    def __init__(self, *, reach_m: float = REACH_M, is_unknown_absent: bool = False, plan: Plan | None = None) -> None:
         super().__init__(plan)
         self.reach_m = reach_m
         self.is_unknown_absent = is_unknown_absent

@@ -47,9 +47,7 @@ class View:
         size = 2 * round(size_m / self.grid.cell_size_m / 2) + 1
         return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.template])
 
-    def turned(
-        self, blurred: NDArray[np.float32], pose: Pose, *, half: int, step_m: float
-    ) -> NDArray[np.float32]:
+    def turned(self, blurred: NDArray[np.float32], pose: Pose, *, half: int, step_m: float) -> NDArray[np.float32]:
         """Lay a blurred template onto a north-up lattice around its middle, shape (B + 2, 2 half + 1, 2 half + 1).
 
         `pose` says heading and scale; its place is not looked at.
@@ -102,21 +100,21 @@ class Patch:
     grid: Grid
 
     @classmethod
-    def around(cls, chart: Chart, bands: NDArray[np.int64], place_m: tuple[float, float], half_m: float) -> Self:
-        """Read the square of at least `half_m` to each side of a place."""
-        row, col = chart.grid.to_cells(np.array([place_m]))[0].tolist()
-        half = math.ceil(half_m / chart.grid.cell_size_m)
-        side = 2 * half + 1
-        square = chart.square(row - half, col - half, side, bands)
-        grid = chart.grid.window(row - half, col - half, side, side)
-        return cls(cells=np.ascontiguousarray(square.reshape(len(square), -1).T), grid=grid)
+    def around(
+        cls, chart: Chart, bands: NDArray[np.int64], place_m: tuple[float, float], half_m: float, *, factor: int = 1
+    ) -> Self:
+        """Read the square of at least `half_m` to each side of a place, in cells of `factor` map cells a side.
 
-    def blurred(self, size_m: float) -> Self:
-        """The same square, each cell the mean of those around it."""
-        size = 2 * round(size_m / self.grid.cell_size_m / 2) + 1
-        layers = self.cells.T.reshape(-1, *self.grid.shape)
-        soft = np.stack([cv2.blur(np.ascontiguousarray(band), (size, size)) for band in layers])
-        return type(self)(cells=np.ascontiguousarray(soft.reshape(len(soft), -1).T), grid=self.grid)
+        Where cells are larger than the map's, each is the mean of the nine around it.
+        """
+        row, col = chart.grid.to_cells(np.array([place_m]))[0].tolist()
+        half = math.ceil(half_m / chart.grid.cell_size_m / factor)
+        side, back = 2 * half + 1, half * factor + factor // 2
+        square = chart.pooled(row - back, col - back, side, factor, bands)
+        if factor > 1:
+            square = np.stack([cv2.blur(band, (3, 3)) for band in square])
+        grid = chart.grid.window(row - back, col - back, side * factor, side * factor).coarsen(factor)
+        return cls(cells=np.ascontiguousarray(square.reshape(len(square), -1).T), grid=grid)
 
     def score(self, samples: Samples, pose: Pose, *, least_overlap: float) -> float:
         """Score a pose on this square by the samples of a view: Eq. (8) over the number of known cells.

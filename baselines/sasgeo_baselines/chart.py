@@ -39,7 +39,9 @@ class Chart:
     @classmethod
     def of(cls, region: Region, *, thin: tuple[str, ...] = (), reach_m: float = 0.0) -> Self:
         """Read a region; the classes in `thin` fade with the distance to the nearest cell, as in `fade`."""
-        known = (region.layers <= PRESENT).all(axis=0)
+        known = np.ones(region.grid.shape, dtype=bool)
+        for layer in region.layers:
+            known &= layer <= PRESENT
         degree = np.empty(region.layers.shape, dtype=np.uint8)
         for name, layer, kept in zip(region.classes, region.layers, degree, strict=True):
             present = (layer == PRESENT) & known
@@ -47,8 +49,10 @@ class Chart:
                 faded = fade(present, reach_cells=reach_m / region.grid.cell_size_m)
                 kept[:] = np.rint(FULL * faded) * known
             else:
-                kept[:] = FULL * present
-        return cls(grid=region.grid, classes=region.classes, degree=degree, known=(FULL * known).astype(np.uint8))
+                np.multiply(present, np.uint8(FULL), out=kept)
+        return cls(
+            grid=region.grid, classes=region.classes, degree=degree, known=np.where(known, np.uint8(FULL), np.uint8(0))
+        )
 
     def used(self) -> NDArray[np.bool_]:
         """Which classes the map holds at all, shape (C,)."""
@@ -59,23 +63,27 @@ class Chart:
 
         The result has shape (bands + 1, size, size); its first cell is (row, col) of the map.
         """
-        found = np.zeros((len(bands) + 1, size, size), dtype=np.float32)
-        rows, cols = self.grid.shape
-        top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
-        if top < bottom and left < right:
-            inside = found[:, top - row : bottom - row, left - col : right - col]
-            for into, band in zip(inside[:-1], bands, strict=True):
-                into[:] = self.degree[band, top:bottom, left:right]
-            inside[-1] = self.known[top:bottom, left:right]
-            inside /= FULL
-        return found
+        return np.stack([self._cut(layer, row, col, size) for layer in self._layers(bands)])
 
     def pooled(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
         """Mean degrees over blocks of `factor` cells a side, shape (bands + 1, size, size)."""
-        fine = self.square(row, col, size * factor, bands)
         if factor == 1:
-            return fine
-        return np.stack([cv2.resize(layer, (size, size), interpolation=cv2.INTER_AREA) for layer in fine])
+            return self.square(row, col, size, bands)
+        cuts = (self._cut(layer, row, col, size * factor) for layer in self._layers(bands))
+        return np.stack([cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) for cut in cuts])
+
+    def _layers(self, bands: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+        return [*(self.degree[band] for band in bands), self.known]
+
+    def _cut(self, layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.float32]:
+        """Square of one layer, 0..1."""
+        found = np.zeros((size, size), dtype=np.float32)
+        rows, cols = layer.shape
+        top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
+        if top < bottom and left < right:
+            inside = found[top - row : bottom - row, left - col : right - col]
+            np.divide(layer[top:bottom, left:right], np.float32(FULL), out=inside)
+        return found
 
 
 def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float32]:

@@ -292,7 +292,8 @@ class Search:
         votes = _Votes(
             score=np.concatenate([part.score for part in parts]), turn=np.concatenate([part.turn for part in parts])
         )
-        left, found = votes.score.copy(), []
+        left = votes.score.copy()
+        found: list[Mode] = []
         while len(found) < most:
             at = int(np.argmax(left))
             if not left[at] > NOWHERE:

@@ -77,15 +77,17 @@ class Sums:
         """Sum a region's layers, or those of some classes it has."""
         factor = max(1, round(_POOLED_M / region.grid.cell_size_m))
         bands = [band for band, name in enumerate(region.classes) if classes is None or name in classes]
-        known = (region.layers <= PRESENT).all(axis=0)
+        known = np.ones(region.grid.shape, dtype=bool)
+        for layer in region.layers:
+            known &= layer <= PRESENT
         grid = region.grid.coarsen(factor)
         below = np.zeros((len(bands) + 1, grid.rows + 1, grid.cols + 1), dtype=np.int64)
         for into, layer in zip(
             below, (*((region.layers[band] == PRESENT) & known for band in bands), known), strict=True
         ):
-            padded = np.zeros((grid.rows * factor, grid.cols * factor), dtype=np.int64)
+            padded = np.zeros((grid.rows * factor, grid.cols * factor), dtype=bool)
             padded[: layer.shape[0], : layer.shape[1]] = layer
-            blocks = padded.reshape(grid.rows, factor, grid.cols, factor).sum(axis=(1, 3))
+            blocks = padded.reshape(grid.rows, factor, grid.cols, factor).sum(axis=(1, 3), dtype=np.int64)
             into[1:, 1:] = blocks.cumsum(axis=0).cumsum(axis=1)
         return cls(grid=grid, below=below)
 
@@ -112,7 +114,8 @@ def first_apart(points_m: NDArray[np.float64], scores: NDArray[np.float64], *, a
     >>> first_apart(np.array([(0.0, 0.0), (1.0, 0.0), (9.0, 0.0)]), np.array([1.0, 2.0, 0.0]), apart_m=5.0, most=2)
     [1, 2]
     """
-    left, chosen = scores.astype(np.float64), []
+    left = scores.astype(np.float64)
+    chosen: list[int] = []
     while len(chosen) < most:
         at = int(np.argmax(left))
         if not np.isfinite(left[at]):

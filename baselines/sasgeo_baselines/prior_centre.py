@@ -3,7 +3,6 @@
 
 from sasgeo_baselines.answers import offsets_m, ranked_candidates
 from sasgeo_baselines.places import at_place, middle_m, points_of
-from sasgeo_bench.grid import Grid
 from sasgeo_bench.matcher import Match, MatcherCard, Training
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
@@ -24,16 +23,16 @@ class PriorCentre:
     )
 
     def __init__(self) -> None:
-        self._grid: Grid | None = None
+        self._region: Region | None = None
 
     def prepare(self, region: Region, training: Training | None) -> None:
-        """Keep the map's outline, for queries without a disc."""
+        """Keep the map, for queries without a disc."""
         del training
-        self._grid = region.grid
+        self._region = region
 
     def match(self, query: Query, *, top_k: int) -> Match:
         """Answer without looking."""
-        if self._grid is None:
+        if self._region is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
         if query.track == "retrieval":
@@ -41,5 +40,5 @@ class PriorCentre:
             center = points_m.mean(axis=0) if len(points_m) else points_m.sum(axis=0)
             away_m = offsets_m(points_m, (float(center[0]), float(center[1])))
             return ranked_candidates(query, (-away_m).tolist(), top_k=top_k)
-        poses = [at_place(middle_m(query.prior, self._grid), query.prior)][:top_k]
+        poses = [at_place(middle_m(query.prior, self._region.grid), query.prior)][:top_k]
         return Match(poses=poses, scores=[0.0] * len(poses))

@@ -39,7 +39,7 @@ class RasterUniform(DenseMatcher):
         title="Raster matching with uniform weights",
         source="SASGeo paper (Trukhina and Vashkelis), Eqs. 7-8 and variant 2 of its Section VI",
         ours=(
-            "Distance turned into a degree by exp(-D^2 / 2 tau^2), tau 4 m, for the classes drawn as lines, on the map, "
+            "Distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for the classes drawn as lines, on the map, "
             "and in the view as an excuse for what seems missed; all gains 1; division by the known cells; the search "
             "over place, heading and scale (the paper ranks ten windows). Unknown is silent as in Eq. 7, "
             "though the paper's trials add that in their last variant only"

@@ -3,7 +3,6 @@
 
 import datetime as dt
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -79,7 +78,7 @@ def made() -> SimpleNamespace:
 
 
 @pytest.fixture(scope="session")
-def town_tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Path]:
+def town_tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root with town-riverside and the suite `clean` at one site."""
     out = tmp_path_factory.mktemp("baselines") / "out"
     shutil.copytree(towns / "regions" / "town-riverside", out / "regions" / "town-riverside")

@@ -12,6 +12,7 @@ from sasgeo_baselines.map_density_prior import MapDensityPrior
 from sasgeo_baselines.places import Sums
 
 from sasgeo_bench.matcher import MatcherCard, candidate_index, check_match
+from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.store.taskdir import read_queries, read_truths
 
@@ -142,8 +143,6 @@ def test_the_fullest_place_and_the_likest_shares_are_found_on_a_map_made_for_it(
     full, likest = MapDensityPrior(), GlobalDescriptor()
     for matcher in (full, likest):
         matcher.prepare(region, None)
-    from sasgeo_bench.pose import Pose, Prior  # noqa: PLC0415
-
     pose = Pose(easting_m=1112.0, northing_m=8728.0, yaw_deg=0.0)
     anywhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
     query = made.query_of(made.view_of(region, pose, size_cells=64), anywhere)

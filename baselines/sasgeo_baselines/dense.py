@@ -13,7 +13,7 @@ from scipy import fft
 
 from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.view import NOWHERE, Patch, Samples, View
-from sasgeo_baselines.voting import transform, vote_spectra
+from sasgeo_baselines.voting import transform, transform_window, vote_spectra
 from sasgeo_bench.pose import Pose, Prior
 
 _TILE: Final = 256  # places a side that are searched at once; larger ones take more memory and save no time
@@ -240,7 +240,7 @@ class Search:
         west_m, south_m, east_m, north_m = self.chart.grid.bounds_m
         on_map = (points_m >= (west_m, south_m)).all(axis=1) & (points_m <= (east_m, north_m)).all(axis=1)
         size = _transform_size(side)
-        return _Tile(window=fft.rfft2(layers, s=size), points_m=points_m, allowed=disc.holds(points_m) & on_map)
+        return _Tile(window=transform_window(layers, size), points_m=points_m, allowed=disc.holds(points_m) & on_map)
 
     # Coarse
 

@@ -152,7 +152,7 @@ def vote(seen: NDArray[np.uint8], mapped: NDArray[np.uint8], gains: Gains) -> ND
     window = np.concatenate(((mapped == PRESENT) & known, known[None])).astype(np.float64)
     window = np.pad(window, ((0, 0), (rows - 1, rows - 1), (cols - 1, cols - 1)))
     size = (fft.next_fast_len(window.shape[1], real=True), fft.next_fast_len(window.shape[2], real=True))
-    total, counted = correlate(fft.rfft2(window, s=size), make_template(seen, gains), size)
+    total, counted = vote_spectra(transform_window(window, size), transform(make_template(seen, gains), size), size)
     valid = (slice(window.shape[1] - rows + 1), slice(window.shape[2] - cols + 1))
     total, counted = total[valid], counted[valid]
     return np.asarray(np.where(counted > _HALF_A_CELL, total / np.maximum(counted, 1.0), 0.0))
@@ -168,25 +168,23 @@ class Spectrum:
 
 def transform(template: NDArray[np.floating], size: tuple[int, int]) -> Spectrum:
     """Transform a template, padded with zeros; a half of the rows that are all zeros is never computed."""
-    bands = np.conj(fft.fft(fft.rfft(template, n=size[1], axis=-1), n=size[0], axis=-2))
+    bands = fft.fft(fft.rfft(template, n=size[1], axis=-1), n=size[0], axis=-2)
     return Spectrum(score=bands[:-1], counts=bands[-1])
 
 
-def correlate(
-    window: NDArray[np.complexfloating], template: NDArray[np.floating], size: tuple[int, int]
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Sum of gains and number of known cells at every shift of a template within a transformed window.
-
-    Entry (i, j) has the template's first cell on the window's cell (i, j); entries where the template would reach
-    beyond the window wrap around and mean nothing.
-    """
-    return vote_spectra(window, transform(template, size), size)
+def transform_window(layers: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.complexfloating]:
+    """Transform a square of the map and conjugate it, once for all templates; `vote_spectra` conjugates back."""
+    return np.conj(fft.rfft2(layers, s=size))
 
 
 def vote_spectra(
     window: NDArray[np.complexfloating], template: Spectrum, size: tuple[int, int]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """`correlate` for a template that was transformed before: one inverse transform each for the sum and the count."""
-    total = fft.irfft2((window * template.score).sum(axis=0), s=size)
-    counted = fft.irfft2(window[-1] * template.counts, s=size)
+    """Sum of gains and number of known cells at every shift of a template within a window.
+
+    Entry (i, j) has the template's first cell on the window's cell (i, j); entries where the template would reach
+    beyond the window wrap around and mean nothing. One inverse transform each for the sum and for the count.
+    """
+    total = fft.irfft2(np.conj((window * template.score).sum(axis=0)), s=size)
+    counted = fft.irfft2(np.conj(window[-1] * template.counts), s=size)
     return total, counted

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The baselines of sasgeo-bench, written as an outsider would write a plugin; holds no matcher yet."""
+"""The baselines of sasgeo-bench, written as an outsider would write a plugin: one file for each matcher."""

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chart: a region's layers as degrees of presence, made ready for reading squares of them at any coarseness."""
+
+from dataclasses import dataclass
+from typing import Final, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.evidence import ABSENT, PRESENT
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.region import Region
+
+FULL: Final = 255  # present without doubt; degrees are kept in steps of 1/255
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """What a dense matcher reads of a map.
+
+    Parameters
+    ----------
+    grid : Grid
+        The map's lattice.
+    classes : tuple of str
+        Class names in band order.
+    degree : ndarray of uint8, shape (C, rows, cols)
+        0 where a class is absent or nothing is known, up to `FULL` where it is present.
+    known : ndarray of uint8, shape (rows, cols)
+        `FULL` where the map says anything, else 0.
+    """
+
+    grid: Grid
+    classes: tuple[str, ...]
+    degree: NDArray[np.uint8]
+    known: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, region: Region, *, thin: tuple[str, ...] = (), reach_m: float = 0.0) -> Self:
+        """Read a region; the classes in `thin` fade with the distance to the nearest cell, as in `fade`."""
+        known = np.ones(region.grid.shape, dtype=bool)
+        for layer in region.layers:
+            known &= layer <= PRESENT
+        degree = np.empty(region.layers.shape, dtype=np.uint8)
+        for name, layer, kept in zip(region.classes, region.layers, degree, strict=True):
+            present = (layer == PRESENT) & known
+            if name in thin and reach_m > 0:
+                faded = fade(present, reach_cells=reach_m / region.grid.cell_size_m)
+                kept[:] = np.rint(FULL * faded) * known
+            else:
+                np.multiply(present, np.uint8(FULL), out=kept)
+        return cls(
+            grid=region.grid, classes=region.classes, degree=degree, known=np.where(known, np.uint8(FULL), np.uint8(0))
+        )
+
+    def used(self) -> NDArray[np.bool_]:
+        """Which classes the map holds at all, shape (C,)."""
+        return np.asarray(self.degree.reshape(len(self.degree), -1).max(axis=1) > 0)
+
+    def square(self, row: int, col: int, size: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Degrees 0..1 of some classes, then of knowing, in a square that may reach beyond the map: there all is 0.
+
+        The result has shape (bands + 1, size, size); its first cell is (row, col) of the map.
+        """
+        return np.stack([self._cut(layer, row, col, size) for layer in self._layers(bands)])
+
+    def pooled(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Mean degrees over blocks of `factor` cells a side, shape (bands + 1, size, size)."""
+        if factor == 1:
+            return self.square(row, col, size, bands)
+        cuts = (self._cut(layer, row, col, size * factor) for layer in self._layers(bands))
+        return np.stack([cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) for cut in cuts])
+
+    def _layers(self, bands: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+        return [*(self.degree[band] for band in bands), self.known]
+
+    def _cut(self, layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.float32]:
+        """Square of one layer, 0..1."""
+        found = np.zeros((size, size), dtype=np.float32)
+        rows, cols = layer.shape
+        top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
+        if top < bottom and left < right:
+            inside = found[top - row : bottom - row, left - col : right - col]
+            np.divide(layer[top:bottom, left:right], np.float32(FULL), out=inside)
+        return found
+
+
+def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float32]:
+    """Presence that fades with the distance D to the nearest present cell: exp(-D^2 / (2 reach^2)).
+
+    Parameters
+    ----------
+    present : ndarray of bool, shape (rows, cols)
+        Where a class is.
+    reach_cells : float
+        Distance, in cells, at which 0.61 is left.
+
+    Returns
+    -------
+    ndarray of float32, shape (rows, cols)
+        1 where it is present, 0 everywhere if it is nowhere.
+
+    Examples
+    --------
+    >>> fade(np.array([[True, False, False]]), reach_cells=1.0).round(2).tolist()
+    [[1.0, 0.6100000143051147, 0.14000000059604645]]
+    """
+    if not present.any():
+        return np.zeros(present.shape, dtype=np.float32)
+    distance = cv2.distanceTransform(
+        np.where(present, ABSENT, PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    )
+    return np.asarray(np.exp(-(distance**2) / np.float32(2 * reach_cells**2)), dtype=np.float32)

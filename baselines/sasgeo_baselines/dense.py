@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Dense search: all places, headings and scales at a coarse cell by FFT, then the best modes at the map's own."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from sasgeo_baselines.chart import Chart
+from sasgeo_baselines.view import NOWHERE, Patch, Samples, View
+from sasgeo_baselines.voting import transform, transform_window, vote_spectra
+from sasgeo_bench.pose import Pose, Prior
+
+_TILE: Final = 256  # places a side that are searched at once; larger ones take more memory and save no time
+_SPREAD: Final = 2.0  # standard deviations of heading and scale that are searched
+_MARGIN_M: Final = 12.0  # how far a mode may move while it is refined
+_WIDEN: Final = 0.05  # how far its scale may leave those that were searched
+_ROUNDS: Final = 8  # of steps of one size
+_SOME_CELLS: Final = 96  # a side: enough to climb by
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """How a search is done.
+
+    Parameters
+    ----------
+    coarse_m, coarse_wide_m, wide_m2 : float
+        Side of a coarse cell; another for areas beyond `wide_m2`, square metres.
+    yaw_step_deg, scale_step : float
+        Largest step between headings and scales that are tried.
+    apart_m : float
+        Least distance between two modes.
+    least_overlap : float
+        Share of what the view knows that the map must know for a pose to be looked at.
+    modes, finals : int
+        Modes that are refined at all, and to the last.
+    around_m : float
+        How far around a candidate the view may lie.
+    """
+
+    coarse_m: float = 4.0
+    coarse_wide_m: float = 8.0
+    wide_m2: float = 5e6
+    yaw_step_deg: float = 3.0
+    scale_step: float = 0.06
+    apart_m: float = 25.0
+    least_overlap: float = 0.5
+    modes: int = 12
+    finals: int = 6
+    around_m: float = 24.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mode:
+    """A pose and its score."""
+
+    pose: Pose
+    score: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disc:
+    """Where a view may lie; anywhere, if there is no centre."""
+
+    center_m: tuple[float, float] | None
+    radius_m: float
+
+    def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether each of some places, shape (N, 2), lies within.
+
+        Examples
+        --------
+        >>> Disc(center_m=(0.0, 0.0), radius_m=5.0).holds(np.array([(3.0, 4.0), (4.0, 4.0)])).tolist()
+        [True, False]
+        """
+        if self.center_m is None:
+            return np.ones(len(points_m), dtype=bool)
+        return np.asarray(np.hypot(*(points_m - self.center_m).T) <= self.radius_m)
+
+    def has(self, pose: Pose) -> bool:
+        """Whether a pose lies within."""
+        return bool(self.holds(np.array([(pose.easting_m, pose.northing_m)]))[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tile:
+    """A square of places, row by row, and the transformed map under all views from there.
+
+    `points_m` has shape (n * n, 2); `allowed`, of shape (n * n,), is False for places outside of what is searched.
+    """
+
+    window: NDArray[np.complexfloating]
+    points_m: NDArray[np.float64]
+    allowed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Votes:
+    """For each place of a tile its best score, and which of the turns (heading and scale) it has it from."""
+
+    score: NDArray[np.float64]
+    turn: NDArray[np.int64]
+
+
+def turns(prior: Prior, plan: Plan) -> tuple[Pose, ...]:
+    """Headings and scales to be tried, as poses at the origin.
+
+    Examples
+    --------
+    >>> known = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=3.0, scale_sigma=0.0)
+    >>> [pose.yaw_deg for pose in turns(known, Plan())]
+    [354.0, 357.0, 0.0, 3.0, 6.0]
+    """
+    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or _SPREAD * prior.yaw_sigma_deg >= 180:  # noqa: PLR2004
+        count = math.ceil(360 / plan.yaw_step_deg)
+        yaws = [360 * index / count for index in range(count)]
+    else:
+        yaws = [prior.yaw_deg + offset for offset in _steps(_SPREAD * prior.yaw_sigma_deg, plan.yaw_step_deg)]
+    scales = [1 + offset for offset in _steps(min(_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
+    return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws)
+
+
+def _steps(reach: float, step: float) -> list[float]:
+    """From -reach to reach through 0 in equal steps no larger than `step`."""
+    count = math.ceil(reach / step - 1e-9)
+    return [reach * index / count for index in range(-count, count + 1)] if count else [0.0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Level:
+    """One pass of refinement: samples of the view, first steps (m, degrees, 1), how often halved."""
+
+    samples: Samples
+    steps: tuple[float, float, float]
+    halvings: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """The search for one view on one map."""
+
+    chart: Chart
+    view: View
+    prior: Prior
+    plan: Plan
+
+    def places(self, count: int) -> list[Mode]:
+        """Find the best modes within the prior, best first; none where no pose shows enough of the map."""
+        plan, factor = self.plan, self._factor()
+        coarse = self._peaks(self._tiles_of_prior(factor), factor, most=max(plan.modes, 2 * count))
+        limit = self._limit(factor)
+        rough = _ranked(self._rough(mode, limit) for mode in coarse)
+        fine = _ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
+        return _thinned(fine, plan.apart_m)
+
+    def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
+        """Score every candidate by the best pose near it, in their order; None where the map shows too little.
+
+        Those that the coarse search puts behind `plan.modes` others keep its score, below all that were refined.
+        """
+        factor = self._cells(self.plan.coarse_m)
+        tiles = [self._tile_around(pose, factor) for pose in poses]
+        rough = [self._best(tile, votes) for tile, votes in zip(tiles, self._vote(tiles, factor), strict=True)]
+        order = sorted((mode.score for mode in rough if mode), reverse=True)
+        cut = order[min(self.plan.modes, len(order)) - 1] if order else NOWHERE
+        fine: dict[int, Mode] = {}
+        for at, mode in enumerate(rough):
+            if mode is not None and mode.score >= cut:
+                disc = Disc(center_m=(poses[at].easting_m, poses[at].northing_m), radius_m=self.plan.around_m)
+                fine[at] = self._fine(self._rough(mode, disc), disc)
+        lowest = min((mode.score for mode in fine.values()), default=0.0)
+        return [
+            fine.get(at, mode and replace(mode, score=lowest - (cut - mode.score))) for at, mode in enumerate(rough)
+        ]
+
+    # Where
+
+    def _cells(self, size_m: float) -> int:
+        return max(1, round(size_m / self.chart.grid.cell_size_m))
+
+    def _factor(self) -> int:
+        """Map cells a side of a coarse cell."""
+        top, left, bottom, right = self._box()
+        area_m2 = max(bottom - top, 0) * max(right - left, 0) * self.chart.grid.cell_size_m**2
+        return self._cells(self.plan.coarse_wide_m if area_m2 > self.plan.wide_m2 else self.plan.coarse_m)
+
+    def _box(self) -> tuple[int, int, int, int]:
+        """Top, left, bottom and right cell of the places to be searched: the disc's box on the map, or all of it."""
+        rows, cols = self.chart.grid.shape
+        if self.prior.center_m is None or self.prior.radius_m is None:
+            return 0, 0, rows, cols
+        row, col = self.chart.grid.to_cells(np.array([self.prior.center_m]))[0].tolist()
+        reach = math.ceil(self.prior.radius_m / self.chart.grid.cell_size_m)
+        return max(row - reach, 0), max(col - reach, 0), min(row + reach + 1, rows), min(col + reach + 1, cols)
+
+    def _limit(self, factor: int) -> Disc:
+        """The prior's disc and a coarse cell around it."""
+        around_m = factor * self.chart.grid.cell_size_m
+        return Disc(center_m=self.prior.center_m, radius_m=(self.prior.radius_m or 0.0) + around_m)
+
+    def _half(self, factor: int) -> int:
+        """Coarse cells from the middle of a template to its rim."""
+        largest = self._turns[-1].scale
+        return math.ceil(self.view.reach_m * largest / (factor * self.chart.grid.cell_size_m)) + 1
+
+    def _tiles_of_prior(self, factor: int) -> list[_Tile]:
+        top, left, bottom, right = self._box()
+        if top >= bottom or left >= right:
+            return []
+        count = min(_TILE, -(-max(bottom - top, right - left) // factor))
+        limit = self._limit(factor)
+        starts = [
+            (row, col) for row in range(top, bottom, count * factor) for col in range(left, right, count * factor)
+        ]
+        return [self._tile(row, col, count, factor, limit) for row, col in starts]
+
+    def _tile_around(self, pose: Pose, factor: int) -> _Tile:
+        """Places around a candidate, on a lattice that hangs on it: the same map gives the same votes anywhere."""
+        place_m = (pose.easting_m, pose.northing_m)
+        row, col = self.chart.grid.to_cells(np.array([place_m]))[0].tolist()
+        reach = math.ceil(self.plan.around_m / (factor * self.chart.grid.cell_size_m))
+        back = reach * factor + factor // 2
+        return self._tile(
+            row - back, col - back, 2 * reach + 1, factor, Disc(center_m=place_m, radius_m=self.plan.around_m)
+        )
+
+    def _tile(self, row: int, col: int, count: int, factor: int, disc: Disc) -> _Tile:
+        """Tile of `count` coarse cells a side, the first of them at a cell of the map."""
+        half = self._half(factor)
+        side = count + 2 * half
+        layers = self.chart.pooled(row - half * factor, col - half * factor, side, factor, self.view.bands)
+        cells = np.column_stack([index.ravel() for index in np.indices((count, count))])
+        points_m = self.chart.grid.window(row, col, count * factor, count * factor).coarsen(factor).to_centres_m(cells)
+        west_m, south_m, east_m, north_m = self.chart.grid.bounds_m
+        on_map = (points_m >= (west_m, south_m)).all(axis=1) & (points_m <= (east_m, north_m)).all(axis=1)
+        size = _transform_size(side)
+        return _Tile(window=transform_window(layers, size), points_m=points_m, allowed=disc.holds(points_m) & on_map)
+
+    # Coarse
+
+    @cached_property
+    def _turns(self) -> tuple[Pose, ...]:
+        return turns(self.prior, self.plan)
+
+    def _vote(self, tiles: Sequence[_Tile], factor: int) -> list[_Votes]:
+        """Best score and turn for every place of every tile; each template is transformed once for all tiles."""
+        step_m = factor * self.chart.grid.cell_size_m
+        half, blurred = self._half(factor), self.view.blurred(step_m)
+        votes = [
+            _Votes(score=np.full(len(tile.points_m), NOWHERE), turn=np.zeros(len(tile.points_m), dtype=np.int64))
+            for tile in tiles
+        ]
+        for index, turn in enumerate(self._turns if tiles else ()):
+            template = self.view.turned(blurred, turn, half=half, step_m=step_m)
+            known = float(template[-1].sum(dtype=np.float64))
+            if known <= 0:
+                continue
+            size = _transform_size(math.isqrt(len(tiles[0].points_m)) + 2 * half)
+            spectrum = transform(template, size)
+            for tile, best in zip(tiles, votes, strict=True):
+                side = math.isqrt(len(tile.points_m))
+                total, counted = (part[:side, :side].ravel() for part in vote_spectra(tile.window, spectrum, size))
+                enough = tile.allowed & (counted >= self.plan.least_overlap * known)
+                score = np.where(enough, total / np.where(enough, counted, 1.0), NOWHERE)
+                better = score > best.score
+                best.score[better] = score[better]
+                best.turn[better] = index
+        return votes
+
+    def _best(self, tile: _Tile, votes: _Votes) -> Mode | None:
+        """Best place of a tile, if there is any."""
+        at = int(np.argmax(votes.score))
+        return self._mode(tile.points_m[at], votes, at) if votes.score[at] > NOWHERE else None
+
+    def _mode(self, point_m: NDArray[np.float64], votes: _Votes, at: int) -> Mode:
+        turn = self._turns[votes.turn[at]]
+        pose = replace(turn, easting_m=float(point_m[0]), northing_m=float(point_m[1]))
+        return Mode(pose=pose, score=float(votes.score[at]))
+
+    def _peaks(self, tiles: Sequence[_Tile], factor: int, *, most: int) -> list[Mode]:
+        """Best modes of all tiles, none nearer to a better one than `apart_m`."""
+        if not tiles:
+            return []
+        parts = self._vote(tiles, factor)
+        points_m = np.concatenate([tile.points_m for tile in tiles])
+        votes = _Votes(
+            score=np.concatenate([part.score for part in parts]), turn=np.concatenate([part.turn for part in parts])
+        )
+        left = votes.score.copy()
+        found: list[Mode] = []
+        while len(found) < most:
+            at = int(np.argmax(left))
+            if not left[at] > NOWHERE:
+                break
+            found.append(self._mode(points_m[at], votes, at))
+            left[np.hypot(*(points_m - points_m[at]).T) < self.plan.apart_m] = NOWHERE
+        return found
+
+    # Fine
+
+    @cached_property
+    def _levels(self) -> tuple[_Level, _Level, _Level]:
+        """How a mode is refined: on blurred squares, then on the map itself by some cells, then by all of them."""
+        cell_m, blur_m = self.chart.grid.cell_size_m, self.plan.coarse_m
+        yaw_deg, scale = self.plan.yaw_step_deg, self.plan.scale_step
+        blurred = self.view.samples(self.view.blurred(blur_m), stride=self._stride(blur_m))
+        some = self.view.samples(self.view.template, stride=max(1, round(max(self.view.grid.shape) / _SOME_CELLS)))
+        every = self.view.samples(self.view.template, stride=1)
+        return (
+            _Level(samples=blurred, steps=(blur_m / 2, yaw_deg / 2, scale / 2), halvings=2),
+            _Level(samples=some, steps=(cell_m, yaw_deg / 4, scale / 4), halvings=2),
+            _Level(samples=every, steps=(cell_m / 4, yaw_deg / 16, scale / 16), halvings=1),
+        )
+
+    def _stride(self, size_m: float) -> int:
+        """How many cells of the view a size spans."""
+        return max(1, round(size_m / self.view.grid.cell_size_m))
+
+    def _rough(self, mode: Mode, disc: Disc) -> Mode:
+        """Climb from a coarse mode to a better one nearby, on blurred squares."""
+        patch = self._patch(mode, factor=self._cells(self.plan.coarse_m / 2))
+        return self._climbed(mode, self._levels[0], patch, disc)
+
+    def _fine(self, mode: Mode, disc: Disc) -> Mode:
+        """Climb on the map itself."""
+        patch = self._patch(mode, factor=1)
+        for level in self._levels[1:]:
+            mode = self._climbed(mode, level, patch, disc)
+        return mode
+
+    def _patch(self, mode: Mode, *, factor: int) -> Patch:
+        """The map under a view that moves a little."""
+        place_m = (mode.pose.easting_m, mode.pose.northing_m)
+        half_m = self.view.reach_m * (self._turns[-1].scale + _WIDEN) + 2 * _MARGIN_M
+        return Patch.around(self.chart, self.view.bands, place_m, half_m, factor=factor)
+
+    def _climbed(self, mode: Mode, level: _Level, patch: Patch, disc: Disc) -> Mode:
+        low, high = self._turns[0].scale - _WIDEN, self._turns[-1].scale + _WIDEN
+        near = Disc(center_m=(mode.pose.easting_m, mode.pose.northing_m), radius_m=_MARGIN_M)
+
+        def score_of(pose: Pose) -> float:
+            if not (low <= pose.scale <= high and near.has(pose) and disc.has(pose)):
+                return NOWHERE
+            return patch.score(level.samples, pose, least_overlap=self.plan.least_overlap)
+
+        best = replace(mode, score=patch.score(level.samples, mode.pose, least_overlap=self.plan.least_overlap))
+        for halving in range(level.halvings):
+            best = _climb(best, score_of, tuple(step / 2**halving for step in level.steps))
+        return best
+
+
+def _climb(best: Mode, score_of: Callable[[Pose], float], steps: Sequence[float]) -> Mode:
+    """Step along place, heading and scale, one at a time, as long as that is better."""
+    metres, degrees, scale = steps
+    for _ in range(_ROUNDS):
+        before = best
+        for name, step in (("easting_m", metres), ("northing_m", metres), ("yaw_deg", degrees), ("scale", scale)):
+            for sign in (1, -1):
+                pose = replace(best.pose, **{name: getattr(best.pose, name) + sign * step})
+                score = score_of(pose)
+                if score > best.score:
+                    best = Mode(pose=pose, score=score)
+                    break
+        if best is before:
+            break
+    return best
+
+
+def _transform_size(side: int) -> tuple[int, int]:
+    size = fft.next_fast_len(side, real=True)
+    return size, size
+
+
+def _ranked(modes: Iterable[Mode]) -> list[Mode]:
+    """Best first; equals keep their order."""
+    return sorted((mode for mode in modes if mode.score > NOWHERE), key=lambda mode: -mode.score)
+
+
+def _thinned(modes: Sequence[Mode], apart_m: float) -> list[Mode]:
+    """Without those that came to lie beside a better one."""
+    kept: list[Mode] = []
+    for mode in modes:
+        here = (mode.pose.easting_m, mode.pose.northing_m)
+        if not any(math.dist(here, (other.pose.easting_m, other.pose.northing_m)) < apart_m for other in kept):
+            kept.append(mode)
+    return kept

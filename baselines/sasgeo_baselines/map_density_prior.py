@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`map_density_prior`: the control that knows where on the map there is most to see, and does not look at the view."""
+
+from typing import Final
+
+import numpy as np
+
+from sasgeo_baselines.answers import ranked_candidates
+from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
+from sasgeo_bench.matcher import Match, MatcherCard, Training
+from sasgeo_bench.query import Query
+from sasgeo_bench.region import Region
+
+DRAWN: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
+STEP_M: Final = 16.0
+APART_M: Final = 25.0
+
+
+class MapDensityPrior:
+    """The places of the map with most roads, buildings, railways, streams and boundaries within the prior."""
+
+    card = MatcherCard(
+        name="map_density_prior",
+        version="1",
+        title="Control: where the map is fullest",
+        source="original",
+        ours="All of it: cells of drawn classes in upright squares of the view's side, on a lattice of 16 m",
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits="A control: does not look at the view, but for its side; heading is the prior's; never withholds",
+    )
+
+    def __init__(self) -> None:
+        self._sums: Sums | None = None
+
+    def prepare(self, region: Region, training: Training | None) -> None:
+        """Sum the drawn classes of the map once."""
+        del training
+        self._sums = Sums.of(region, DRAWN)
+        self._grid = region.grid
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Answer without looking at the view."""
+        if self._sums is None:
+            message = f"{self.card.name}: call prepare() with a region before match()"
+            raise RuntimeError(message)
+        side_m = max(query.evidence.size_m)
+        if query.track == "retrieval":
+            drawn = self._sums.squares(points_of(query.candidates), side_m)[:-1].sum(axis=0)
+            return ranked_candidates(query, drawn.astype(np.float64).tolist(), top_k=top_k)
+        points_m = lattice_m(query.prior, self._grid, step_m=STEP_M)
+        drawn = self._sums.squares(points_m, side_m)[:-1].sum(axis=0).astype(np.float64)
+        chosen = first_apart(points_m, drawn, apart_m=APART_M, most=top_k)
+        poses = [at_place(points_m[at], query.prior) for at in chosen]
+        return Match(poses=poses, scores=[float(drawn[at]) for at in chosen])

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`prior_centre`: the control that answers with what was known before."""
+
+from sasgeo_baselines.answers import offsets_m, ranked_candidates
+from sasgeo_baselines.places import at_place, middle_m, points_of
+from sasgeo_bench.matcher import Match, MatcherCard, Training
+from sasgeo_bench.query import Query
+from sasgeo_bench.region import Region
+
+
+class PriorCentre:
+    """The middle of the prior's disc with its heading, or of the map; the candidate nearest to the middle of all."""
+
+    card = MatcherCard(
+        name="prior_centre",
+        version="1",
+        title="Control: the middle of the prior",
+        source="original",
+        ours="All of it",
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits="A control: looks at neither the view nor the map; never withholds",
+    )
+
+    def __init__(self) -> None:
+        self._region: Region | None = None
+
+    def prepare(self, region: Region, training: Training | None) -> None:
+        """Keep the map, for queries without a disc."""
+        del training
+        self._region = region
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Answer without looking."""
+        if self._region is None:
+            message = f"{self.card.name}: call prepare() with a region before match()"
+            raise RuntimeError(message)
+        if query.track == "retrieval":
+            points_m = points_of(query.candidates)
+            center = points_m.mean(axis=0) if len(points_m) else points_m.sum(axis=0)
+            away_m = offsets_m(points_m, (float(center[0]), float(center[1])))
+            return ranked_candidates(query, (-away_m).tolist(), top_k=top_k)
+        poses = [at_place(middle_m(query.prior, self._region.grid), query.prior)][:top_k]
+        return Match(poses=poses, scores=[0.0] * len(poses))

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`random`: the control that guesses, by the query's id alone."""
+
+import hashlib
+import math
+
+import numpy as np
+
+from sasgeo_baselines.answers import ranked_candidates
+from sasgeo_baselines.places import middle_m
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.matcher import MOST_CANDIDATES, Match, MatcherCard, Training
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.query import Query
+from sasgeo_bench.region import Region
+
+
+class RandomPlaces:
+    """Places spread evenly over the prior's disc, or the map, with headings of the prior; candidates shuffled."""
+
+    card = MatcherCard(
+        name="random",
+        version="1",
+        title="Control: chance",
+        source="original",
+        ours="All of it; chance comes from the SHA-256 of the query's id",
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits="A control: looks at neither the view nor the map; never withholds",
+    )
+
+    def __init__(self) -> None:
+        self._grid: Grid | None = None
+
+    def prepare(self, region: Region, training: Training | None) -> None:
+        """Keep the map's outline, for queries without a disc."""
+        del training
+        self._grid = region.grid
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Guess."""
+        if self._grid is None:
+            message = f"{self.card.name}: call prepare() with a region before match()"
+            raise RuntimeError(message)
+        rng = generator(query.query_id)
+        if query.track == "retrieval":
+            return ranked_candidates(query, rng.random(len(query.candidates)).tolist(), top_k=top_k)
+        count = min(top_k, MOST_CANDIDATES)
+        poses = [self._guess(query, self._grid, rng) for _ in range(count)]
+        return Match(poses=poses, scores=sorted(rng.random(count).tolist(), reverse=True))
+
+    def _guess(self, query: Query, grid: Grid, rng: np.random.Generator) -> Pose:
+        prior = query.prior
+        (east_m, north_m), chance = middle_m(prior, grid), rng.random(3)
+        if prior.radius_m is not None:
+            away_m, turn = prior.radius_m * math.sqrt(chance[0]), 2 * math.pi * chance[1]
+            east_m, north_m = east_m + away_m * math.sin(turn), north_m + away_m * math.cos(turn)
+        else:
+            west_m, south_m, right_m, top_m = grid.bounds_m
+            east_m, north_m = west_m + (right_m - west_m) * chance[0], south_m + (top_m - south_m) * chance[1]
+        yaw_deg = 360 * float(chance[2])
+        if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
+            yaw_deg = prior.yaw_deg + prior.yaw_sigma_deg * float(rng.standard_normal())
+        return Pose(easting_m=float(east_m), northing_m=float(north_m), yaw_deg=yaw_deg)
+
+
+def generator(query_id: str) -> np.random.Generator:
+    """Chance for one query: the same for the same id, whatever was asked before.
+
+    Examples
+    --------
+    >>> bool(generator("one").random() == generator("one").random())
+    True
+    """
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(query_id.encode()).digest()[:16], "big"))

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A view made ready for voting: its template in its own frame, turned onto the map's lattice, sampled, and scored."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_baselines.chart import Chart
+from sasgeo_bench.evidence import Evidence
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.pose import Pose, inverse
+
+NOWHERE = -math.inf  # the score of a pose that shows too little of the map
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """The template of a view (`voting.make_template`) and the bands of the map it speaks of.
+
+    `template` is float32 of shape (B + 2, rows, cols), `grid` the view's lattice with its origin in the middle of the
+    view (right and up as east and north), `bands` the places of its classes among those of the map, shape (B,).
+    """
+
+    template: NDArray[np.float32]
+    grid: Grid
+    bands: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, evidence: Evidence, template: NDArray[np.float64], bands: NDArray[np.int64]) -> Self:
+        """Take the frame of a view; `template` is made of it, for the classes in `bands`."""
+        (rows, cols), (width_m, height_m) = evidence.shape, evidence.size_m
+        cell_m = evidence.cell_size_m
+        grid = Grid(epsg=0, west_m=-width_m / 2, north_m=height_m / 2, cell_size_m=cell_m, rows=rows, cols=cols)
+        return cls(template=template.astype(np.float32), grid=grid, bands=bands)
+
+    @property
+    def reach_m(self) -> float:
+        """Half a diagonal at scale 1."""
+        return math.hypot(self.grid.rows, self.grid.cols) * self.grid.cell_size_m / 2
+
+    def blurred(self, size_m: float) -> NDArray[np.float32]:
+        """Mean of the template over squares of about a size, shape (B + 2, rows, cols)."""
+        size = 2 * round(size_m / self.grid.cell_size_m / 2) + 1
+        return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.template])
+
+    def turned(self, blurred: NDArray[np.float32], pose: Pose, *, half: int, step_m: float) -> NDArray[np.float32]:
+        """Lay a blurred template onto a north-up lattice around its middle, shape (B + 2, 2 half + 1, 2 half + 1).
+
+        `pose` says heading and scale; its place is not looked at.
+        """
+        side = 2 * half + 1
+        steps = np.arange(-half, half + 1) * step_m
+        points = np.column_stack((np.tile(steps, side), np.repeat(-steps, side)))
+        here = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=pose.yaw_deg, scale=pose.scale)
+        rows, cols = self.grid.to_cells(inverse(here).to_map(points)).T
+        inside = (rows >= 0) & (rows < self.grid.rows) & (cols >= 0) & (cols < self.grid.cols)
+        at = np.where(inside, rows * self.grid.cols + cols, 0)
+        laid = blurred.reshape(len(blurred), -1).take(at, axis=1)
+        laid *= inside
+        return laid.reshape(-1, side, side)
+
+    def samples(self, template: NDArray[np.float32], *, stride: int) -> "Samples":
+        """Every `stride`-th cell of a template, with its place in the view."""
+        first = stride // 2
+        rows, cols = np.arange(first, self.grid.rows, stride), np.arange(first, self.grid.cols, stride)
+        zeros = np.zeros(1, dtype=np.int64)
+        up_m = self.grid.to_centres_m(np.column_stack((rows, zeros.repeat(len(rows)))))[:, 1]
+        right_m = self.grid.to_centres_m(np.column_stack((zeros.repeat(len(cols)), cols)))[:, 0]
+        chosen = template[:, first::stride, first::stride].reshape(len(template), -1)
+        counts = np.ascontiguousarray(chosen[-1])
+        return Samples(
+            up_m=up_m,
+            right_m=right_m,
+            weights=np.ascontiguousarray(chosen[:-1].T),
+            counts=counts,
+            known=float(counts.sum(dtype=np.float64)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """Cells of a template: offsets from the middle of the view, weights of shape (n, B + 1), classes known in each."""
+
+    up_m: NDArray[np.float64]
+    right_m: NDArray[np.float64]
+    weights: NDArray[np.float32]
+    counts: NDArray[np.float32]
+    known: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patch:
+    """A square of the map, cell after cell: `cells` has shape (rows * cols, B + 1)."""
+
+    cells: NDArray[np.float32]
+    grid: Grid
+
+    @classmethod
+    def around(
+        cls, chart: Chart, bands: NDArray[np.int64], place_m: tuple[float, float], half_m: float, *, factor: int = 1
+    ) -> Self:
+        """Read the square of at least `half_m` to each side of a place, in cells of `factor` map cells a side.
+
+        Where cells are larger than the map's, each is the mean of the nine around it.
+        """
+        row, col = chart.grid.to_cells(np.array([place_m]))[0].tolist()
+        half = math.ceil(half_m / chart.grid.cell_size_m / factor)
+        side, back = 2 * half + 1, half * factor + factor // 2
+        square = chart.pooled(row - back, col - back, side, factor, bands)
+        if factor > 1:
+            square = np.stack([cv2.blur(band, (3, 3)) for band in square])
+        grid = chart.grid.window(row - back, col - back, side * factor, side * factor).coarsen(factor)
+        return cls(cells=np.ascontiguousarray(square.reshape(len(square), -1).T), grid=grid)
+
+    def score(self, samples: Samples, pose: Pose, *, least_overlap: float) -> float:
+        """Score a pose on this square by the samples of a view: Eq. (8) over the number of known cells.
+
+        `NOWHERE` where less than a share of what the view knows is known to the map; the square must hold the view.
+        """
+        # A pose is an affine map, so three points give it, and each sample lies at a sum of two numbers.
+        corners = pose.to_map(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
+        middle, right, up = self.grid.to_uv(corners)
+        along, across = np.outer(up - middle, samples.up_m), np.outer(right - middle, samples.right_m)
+        cols, rows = np.floor((middle[:, None] + along)[:, :, None] + across[:, None, :]).astype(np.int64)
+        found = self.cells.take((rows * self.grid.cols + cols).ravel(), axis=0)
+        counted = float(np.einsum("i,i->", found[:, -1], samples.counts))
+        if counted < max(least_overlap * samples.known, 1.0 / len(samples.counts)):
+            return NOWHERE
+        return float(np.einsum("ij,ij->", found, samples.weights)) / counted

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every registered matcher on an embedded town: its card, its answers, and that they depend on the query alone."""
+
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sasgeo_baselines.global_descriptor import GlobalDescriptor
+from sasgeo_baselines.map_density_prior import MapDensityPrior
+from sasgeo_baselines.places import Sums
+
+from sasgeo_bench.matcher import MatcherCard, candidate_index, check_match
+from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.store.regiondir import read_region
+from sasgeo_bench.store.taskdir import read_queries, read_truths
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
+REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.matchers"]
+DENSE = ("fft_vote", "raster_uniform")
+CONTROLS = ("random", "prior_centre", "map_density_prior")
+
+
+def make(name: str):
+    module, _, attribute = REGISTERED[name].partition(":")
+    return getattr(import_module(module), attribute)()
+
+
+@pytest.fixture(scope="module")
+def region(town_tasks):
+    return read_region(town_tasks / "regions" / "town-riverside")
+
+
+@pytest.fixture(scope="module")
+def queries(town_tasks):
+    return [
+        query
+        for query in read_queries(town_tasks / "tasks" / "clean" / "town-riverside")
+        if query.evidence.shape[0] < 384
+    ]
+
+
+@pytest.fixture(scope="module")
+def truths(town_tasks):
+    return {item.query_id: item for item in read_truths(town_tasks / "truth" / "clean" / "town-riverside")}
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_a_matcher_is_registered_under_the_name_of_its_card(name) -> None:
+    card = make(name).card
+    assert isinstance(card, MatcherCard)
+    assert card.name == name
+    assert card.licence == "Apache-2.0"
+    assert card.limits
+    assert set(card.tracks) == {"retrieval", "localization"}
+
+
+def test_every_matcher_is_registered() -> None:
+    assert set(REGISTERED) == {"global_descriptor", *DENSE, *CONTROLS}
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_answers_are_valid_and_the_same_in_any_order(name, region, queries) -> None:
+    some = queries[:: 6 if name in DENSE else 1]
+    first, second = make(name), make(name)
+    for matcher in (first, second):
+        matcher.prepare(region, None)
+    forward = {query.query_id: check_match(first.match(query, top_k=5), query, top_k=5) for query in some}
+    backward = {query.query_id: check_match(second.match(query, top_k=5), query, top_k=5) for query in reversed(some)}
+    assert forward == backward
+    assert all(match.poses for match in forward.values())
+    assert all(match.confidence is None for match in forward.values())
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_a_matcher_says_that_it_must_be_prepared(name, queries) -> None:
+    with pytest.raises(RuntimeError, match="prepare"):
+        make(name).match(queries[0], top_k=1)
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_no_more_is_given_than_asked_for(name, region, queries) -> None:
+    matcher = make(name)
+    matcher.prepare(region, None)
+    query = next(item for item in queries if item.track == "retrieval")
+    assert len(matcher.match(query, top_k=1).poses) == 1
+
+
+@pytest.mark.parametrize("name", DENSE)
+def test_dense_matchers_find_what_has_no_errors(name, region, queries, truths) -> None:
+    matcher = make(name)
+    matcher.prepare(region, None)
+    for query in queries:
+        truth = truths[query.query_id]
+        if truth.role != "control" or truth.pose is None:
+            continue
+        best = matcher.match(query, top_k=5).poses[0]
+        if query.track == "retrieval":
+            assert candidate_index(best, query.candidates) == truth.candidate
+        elif query.evidence.shape[0] == 192:
+            away_m = np.hypot(best.easting_m - truth.pose.easting_m, best.northing_m - truth.pose.northing_m)
+            assert away_m <= 1.0
+
+
+@pytest.mark.parametrize("name", CONTROLS)
+def test_controls_do_not_look_at_the_view(name, region, queries) -> None:
+    matcher = make(name)
+    matcher.prepare(region, None)
+    for query in queries[:6]:
+        other = query.evidence.replace(np.zeros_like(query.evidence.cells))
+        changed = type(query)(**{field: getattr(query, field) for field in query.__slots__} | {"evidence": other})
+        assert matcher.match(changed, top_k=5) == matcher.match(query, top_k=5)
+
+
+def test_random_places_lie_in_the_disc(region, queries) -> None:
+    matcher = make("random")
+    matcher.prepare(region, None)
+    query = next(item for item in queries if item.prior.center_m is not None)
+    points = np.array([(pose.easting_m, pose.northing_m) for pose in matcher.match(query, top_k=500).poses])
+    away_m = np.hypot(*(points - query.prior.center_m).T)
+    assert away_m.max() <= query.prior.radius_m
+    assert (away_m < query.prior.radius_m / 2).mean() == pytest.approx(0.25, abs=0.07)
+
+
+def test_sums_of_squares_are_those_of_the_cells(made) -> None:
+    layers = made.textured(5, side=96)
+    layers[:, :8, :8] = 255
+    region = made.region_of(layers)
+    sums = Sums.of(region)
+    # A square on whole coarse cells, its corner unknown: rows and columns 0..31 of the map.
+    counted = sums.squares(np.array([(1016.0, 8984.0)]), 32.0)[:, 0]
+    inside = layers[:, :32, :32]
+    assert counted.tolist() == [*(int((layer == 1).sum()) for layer in inside), 32 * 32 - 64]
+
+
+def test_the_fullest_place_and_the_likest_shares_are_found_on_a_map_made_for_it(made) -> None:
+    layers = np.zeros((3, 400, 400), dtype=np.uint8)
+    layers[0, 240:304, 80:144] = (
+        1  # one block of houses: its middle is 112 m east, 128 m north of the south-west corner
+    )
+    region = made.region_of(layers)
+    full, likest = MapDensityPrior(), GlobalDescriptor()
+    for matcher in (full, likest):
+        matcher.prepare(region, None)
+    pose = Pose(easting_m=1112.0, northing_m=8728.0, yaw_deg=0.0)
+    anywhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
+    query = made.query_of(made.view_of(region, pose, size_cells=64), anywhere)
+    for matcher in (full, likest):
+        best = matcher.match(query, top_k=1).poses[0]
+        assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 25.0

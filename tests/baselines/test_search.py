@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A perfect view is found where it was cut; errors of sign, half a cell or axes are noticed; ties and silence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sasgeo_baselines.dense import Disc, Plan, turns
+from sasgeo_baselines.fft_vote import FftVote
+from sasgeo_baselines.raster_uniform import RasterUniform
+from sasgeo_baselines.view import Patch, View
+
+from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.evidence import UNKNOWN
+from sasgeo_bench.matcher import WITHHELD, check_match
+from sasgeo_bench.pose import Pose, Prior
+
+CELL_M, YAW_STEP_DEG = 1.0, 3.0
+POSES = st.builds(
+    Pose,
+    easting_m=st.floats(1130, 1290),
+    northing_m=st.floats(8710, 8870),
+    yaw_deg=st.floats(0, 359.9),
+    scale=st.floats(0.95, 1.05),
+)
+SOME = (
+    Pose(easting_m=1170.3, northing_m=8801.6, yaw_deg=37.0, scale=1.02),
+    Pose(easting_m=1222.8, northing_m=8755.1, yaw_deg=251.0, scale=0.97),
+    Pose(easting_m=1241.4, northing_m=8820.9, yaw_deg=121.0, scale=1.0),
+)
+
+
+def prior_near(pose: Pose, *, sigma_deg: float | None = 10.0) -> Prior:
+    """A disc that the pose is not in the middle of, a heading that is off."""
+    return Prior(
+        center_m=(pose.easting_m + 31.0, pose.northing_m - 22.0),
+        radius_m=60.0,
+        yaw_deg=None if sigma_deg is None else (pose.yaw_deg + 7.0) % 360,
+        yaw_sigma_deg=sigma_deg,
+        scale_sigma=0.03,
+    )
+
+
+def errors(made, matcher, pose: Pose, *, size_cells: int = 96) -> tuple[float, float]:
+    """How far off a perfect view is found, in cells and degrees."""
+    region = made.region_of(made.textured(1))
+    matcher.prepare(region, None)
+    query = made.query_of(made.view_of(region, pose, size_cells=size_cells), prior_near(pose))
+    best = check_match(matcher.match(query, top_k=3), query, top_k=3).poses[0]
+    away_m = np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
+    return float(away_m / CELL_M), float(abs(wrap_deg(best.yaw_deg - pose.yaw_deg)))
+
+
+def is_found(found: tuple[float, float]) -> bool:
+    return found[0] <= 0.5 and found[1] <= YAW_STEP_DEG / 2
+
+
+@settings(max_examples=15)
+@given(pose=POSES)
+def test_a_perfect_view_is_found_within_half_a_cell_and_half_a_yaw_step(made, pose) -> None:
+    assert is_found(errors(made, FftVote(), pose))
+
+
+@pytest.mark.parametrize("pose", SOME)
+def test_lines_that_fade_find_it_too(made, pose) -> None:
+    cells, degrees = errors(made, RasterUniform(), pose)
+    assert cells <= 1.0
+    assert degrees <= YAW_STEP_DEG / 2
+
+
+def _yaw_turned_round(monkeypatch) -> None:
+    score, turned = Patch.score, View.turned
+
+    def mirrored(pose: Pose) -> Pose:
+        return replace(pose, yaw_deg=-pose.yaw_deg)
+
+    monkeypatch.setattr(
+        Patch, "score", lambda self, samples, pose, **more: score(self, samples, mirrored(pose), **more)
+    )
+    monkeypatch.setattr(View, "turned", lambda self, blur, pose, **more: turned(self, blur, mirrored(pose), **more))
+
+
+def _half_a_cell_off(monkeypatch) -> None:
+    score = Patch.score
+
+    def moved(pose: Pose) -> Pose:
+        return replace(pose, easting_m=pose.easting_m + CELL_M / 2, northing_m=pose.northing_m - CELL_M / 2)
+
+    monkeypatch.setattr(Patch, "score", lambda self, samples, pose, **more: score(self, samples, moved(pose), **more))
+
+
+def _axes_swapped(monkeypatch) -> None:
+    of = View.of
+    monkeypatch.setattr(View, "of", lambda seen, template, bands: of(seen, template.transpose(0, 2, 1), bands))
+
+
+def _up_is_down(monkeypatch) -> None:
+    of = View.of
+    monkeypatch.setattr(View, "of", lambda seen, template, bands: of(seen, template[:, ::-1], bands))
+
+
+@pytest.mark.parametrize("mutate", [_yaw_turned_round, _half_a_cell_off, _axes_swapped, _up_is_down])
+def test_a_wrong_sign_half_a_cell_or_swapped_axes_are_noticed(made, monkeypatch, mutate) -> None:
+    assert all(is_found(errors(made, FftVote(), pose)) for pose in SOME)
+    mutate(monkeypatch)
+    assert not all(is_found(errors(made, FftVote(), pose)) for pose in SOME)
+
+
+def test_a_view_is_found_without_any_prior_and_on_cells_of_another_size(made) -> None:
+    region = made.region_of(made.textured(2, side=240), cell_size_m=2.0)
+    pose = Pose(easting_m=1251.0, northing_m=8733.0, yaw_deg=200.0)
+    matcher = FftVote(Plan(yaw_step_deg=6.0))
+    matcher.prepare(region, None)
+    nothing = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
+    query = made.query_of(made.view_of(region, pose, size_cells=128), nothing)
+    best = check_match(matcher.match(query, top_k=1), query, top_k=1).poses[0]
+    assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 1.0
+
+
+def test_a_view_that_reaches_beyond_the_map_is_found(made) -> None:
+    region = made.region_of(made.textured(1))
+    pose = Pose(easting_m=1030.0, northing_m=8800.0, yaw_deg=15.0)
+    matcher = FftVote()
+    matcher.prepare(region, None)
+    query = made.query_of(made.view_of(region, pose, size_cells=96), prior_near(pose))
+    best = matcher.match(query, top_k=1).poses[0]
+    assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 0.5
+
+
+@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform()])
+def test_the_same_place_twice_scores_the_same_and_keeps_its_order(made, matcher) -> None:
+    one = made.textured(4, side=200)
+    region = made.region_of(np.concatenate((one, one, one), axis=2))  # three copies, 200 m apart
+    matcher.prepare(region, None)
+    pose = Pose(easting_m=1300.25, northing_m=8900.0, yaw_deg=30.0)
+    places = [replace(pose, easting_m=1309.5 + 200 * step, northing_m=8895.5, yaw_deg=33.0) for step in (0, 1, -1)]
+    other = replace(pose, easting_m=1380.0, northing_m=8890.0, yaw_deg=33.0)
+    candidates = (other, *places)
+    prior = Prior(center_m=None, radius_m=None, yaw_deg=33.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
+    query = made.query_of(made.view_of(region, pose, size_cells=64), prior, candidates=candidates)
+    match = check_match(matcher.match(query, top_k=4), query, top_k=4)
+    shown = [round(found.easting_m, 1) for found in match.poses[:3]]
+    assert shown == [1309.5, 1509.5, 1109.5]
+    assert len(set(match.scores[:3])) == 1
+    assert match.scores[3] < match.scores[0]
+
+
+def test_a_candidate_given_twice_is_answered_once(made) -> None:
+    region = made.region_of(made.textured(1))
+    pose = SOME[0]
+    matcher = FftVote()
+    matcher.prepare(region, None)
+    near = Prior(center_m=None, radius_m=None, yaw_deg=pose.yaw_deg, yaw_sigma_deg=5.0, scale_sigma=0.03)
+    query = made.query_of(made.view_of(region, pose, size_cells=64), near, candidates=(SOME[1], pose, pose))
+    match = check_match(matcher.match(query, top_k=3), query, top_k=3)
+    assert [(found.easting_m, found.northing_m) for found in match.poses] == [
+        (item.easting_m, item.northing_m) for item in (pose, SOME[1])
+    ]
+
+
+@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform()])
+def test_an_answer_is_withheld_where_nothing_was_seen_or_no_map_is_near(made, matcher) -> None:
+    region = made.region_of(made.textured(1))
+    matcher.prepare(region, None)
+    seen = made.view_of(region, SOME[0], size_cells=64)
+    blind = seen.replace(np.full_like(seen.cells, UNKNOWN))
+    assert matcher.match(made.query_of(blind, prior_near(SOME[0])), top_k=5) == WITHHELD
+    far = replace(prior_near(SOME[0]), center_m=(90_000.0, 90_000.0))
+    assert matcher.match(made.query_of(seen, far), top_k=5).poses == []
+
+
+def test_headings_and_scales_reach_two_standard_deviations() -> None:
+    prior = Prior(center_m=None, radius_m=None, yaw_deg=350.0, yaw_sigma_deg=20.0, scale_sigma=0.03)
+    tried = turns(prior, Plan())
+    yaws = [float(wrap_deg(pose.yaw_deg - 350.0)) for pose in tried]
+    assert (min(yaws), max(yaws)) == pytest.approx((-40.0, 40.0))
+    assert {round(pose.scale, 2) for pose in tried} == {0.94, 1.0, 1.06}
+    assert len(turns(replace(prior, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), Plan())) == 120
+
+
+def test_a_disc_without_a_middle_holds_everything() -> None:
+    assert Disc(center_m=None, radius_m=0.0).holds(np.array([(1e9, -1e9)])).all()

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The score by FFT is the score cell by cell; the score of a pose is the score of what is seen from it."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from sasgeo_baselines.chart import Chart
+from sasgeo_baselines.view import Patch, View
+from sasgeo_baselines.voting import Gains, make_template, score_cells, vote, vote_directly
+
+from sasgeo_bench.evidence import UNKNOWN, LayerBits, observe
+from sasgeo_bench.pose import Pose
+
+POSITIVE = arrays(np.float64, 3, elements=st.floats(0, 10))
+GAINS = st.builds(Gains, agree=POSITIVE, extra=POSITIVE, missed=POSITIVE)
+
+
+@given(
+    seen=arrays(np.uint8, (3, 4, 5), elements=st.integers(0, 2)),
+    mapped=arrays(np.uint8, (3, 8, 7), elements=st.integers(0, 1)),
+    unknown=arrays(np.bool_, (8, 7)),
+    gains=GAINS,
+)
+def test_the_sum_by_fft_is_the_sum_cell_by_cell(seen, mapped, unknown, gains) -> None:
+    mapped = np.where(unknown, UNKNOWN, mapped).astype(np.uint8)
+    np.testing.assert_allclose(vote(seen, mapped, gains), vote_directly(seen, mapped, gains), rtol=1e-6, atol=1e-9)
+
+
+def test_a_view_of_two_cells_scores_as_worked_by_hand() -> None:
+    # Seen: present, absent. Map: absent, present, present. Off the map nothing counts.
+    seen, mapped = np.array([[[1, 0]]], dtype=np.uint8), np.array([[[0, 1, 1]]], dtype=np.uint8)
+    gains = Gains(agree=np.array([4.0]), extra=np.array([2.0]), missed=np.array([1.0]))
+    expected = [[0.0, (-2 - 1) / 2, (4 - 1) / 2, 4.0]]
+    np.testing.assert_allclose(vote_directly(seen, mapped, gains), expected)
+    np.testing.assert_allclose(vote(seen, mapped, gains), expected, atol=1e-12)
+
+
+@given(seen=arrays(np.uint8, (3, 4, 5), elements=st.integers(0, 2)), gains=GAINS)
+def test_what_is_unknown_is_silent(seen, gains) -> None:
+    mapped = np.random.default_rng(3).integers(0, 2, seen.shape, dtype=np.uint8)
+    hidden = np.where(seen == UNKNOWN, UNKNOWN, mapped).astype(np.uint8)
+    assert score_cells(seen, mapped, gains) == score_cells(seen, hidden, gains)
+    assert score_cells(np.full_like(seen, UNKNOWN), mapped, gains) == 0.0
+
+
+@given(
+    east_m=st.floats(-220, 220),
+    north_m=st.floats(-220, 220),
+    yaw_deg=st.floats(0, 359),
+    scale=st.floats(0.9, 1.1),
+    seed=st.integers(0, 9),
+)
+def test_a_pose_scores_as_what_is_seen_from_it(made, east_m, north_m, yaw_deg, scale, seed) -> None:
+    region = made.region_of(made.textured(1))
+    chart = Chart.of(region)
+    pose = Pose(easting_m=1210.0 + east_m, northing_m=8790.0 + north_m, yaw_deg=yaw_deg, scale=scale)
+    rng = np.random.default_rng(seed)
+    evidence = made.view_of(region, Pose(easting_m=1200.0, northing_m=8800.0, yaw_deg=10.0), size_cells=32)
+    cells = np.where(rng.random(evidence.cells.shape) < 0.2, UNKNOWN, evidence.cells).astype(np.uint8)
+    gains = Gains(agree=rng.random(3), extra=rng.random(3), missed=rng.random(3))
+    view = View.of(evidence, make_template(cells, gains), np.arange(3))
+    patch = Patch.around(chart, view.bands, (pose.easting_m, pose.northing_m), view.reach_m * 1.2)
+    under = observe(LayerBits.of(region.layers), region.grid, pose, size_cells=32, cell_size_m=1.0)
+    expected = score_cells(cells, under, gains)
+    found = patch.score(view.samples(view.template, stride=1), pose, least_overlap=0.0)
+    if (under == UNKNOWN).all():
+        assert found == -np.inf
+    else:
+        assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)

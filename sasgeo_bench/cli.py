@@ -20,9 +20,13 @@ from sasgeo_bench.duplicates import constellations, search_split
 from sasgeo_bench.errors import ConfigError, SasgeoError
 from sasgeo_bench.extract.history import MARGIN_M, date_extracts, read_history
 from sasgeo_bench.extract.scan import Box
+from sasgeo_bench.plugins import list_entry_points
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.request import Request, Wanted, plan_requests
+from sasgeo_bench.run.runner import RunRequest, plan_run, run
+from sasgeo_bench.run.worker import Limits
+from sasgeo_bench.scaffold import plugin_files
 from sasgeo_bench.split import make_split
 from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
 from sasgeo_bench.store.catalog import (
@@ -33,13 +37,17 @@ from sasgeo_bench.store.catalog import (
     read_region_file,
     read_split_file,
 )
+from sasgeo_bench.store.pluginfiles import write_plugin
 from sasgeo_bench.store.ratebookfile import write_ratebook
 from sasgeo_bench.store.regiondir import differing_files, read_features, read_manifest
+from sasgeo_bench.store.rundir import merge_runs
 from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
 from sasgeo_bench.store.taskdir import TASK, read_task
 from sasgeo_bench.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.tasks import check_task, has_truths, make_tasks, panels
+from sasgeo_bench.testing import check_matcher
+from sasgeo_bench.validate import validate
 
 EXIT_USER: Final = 2
 EXIT_INTERRUPTED: Final = 130
@@ -393,6 +401,121 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
         for item in search_split(split, maps)
     ]
     return faults, f"no two parts share ground, {len(built)} regions searched"
+
+
+@app.command("list-matchers")
+def list_matchers_command() -> None:
+    """List the matchers that are installed, and where each comes from."""
+    table = Table("matcher", "package", "class", box=None, pad_edge=False)
+    for name, point in list_entry_points().items():
+        table.add_row(name, point.dist.name if point.dist is not None else "", point.value)
+    _print(table)
+
+
+@app.command("new-matcher")
+def new_matcher_command(
+    name: Annotated[str, typer.Argument(help="of the matcher, as in my-matcher")],
+    folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
+) -> None:
+    """Write a plugin package that passes check-matcher at once, for you to put your method into."""
+    files = plugin_files(name)
+    target = folder or Path(name)
+    write_plugin(target, files)
+    typer.echo(f"{target}: {len(files)} files; next: pip install -e {target} && sasgeo-bench check-matcher {name}")
+
+
+@app.command("check-matcher")
+def check_matcher_command(
+    matcher: Annotated[str, typer.Argument(help="name from list-matchers, or module:Class")],
+) -> None:
+    """Try a matcher on a tiny town and say, row by row, whether it keeps to what all of them keep to."""
+    table = Table("check", "outcome", "found", box=None, pad_edge=False)
+    failed = 0
+    for check in check_matcher(matcher):
+        failed += check.outcome == "fail"
+        table.add_row(check.name, check.outcome, check.found)
+    _print(table)
+    if failed:
+        _tell(f"{matcher}: {failed} checks failed")
+        raise typer.Exit(EXIT_USER)
+
+
+@app.command("run")
+def run_command(  # noqa: PLR0913 - a command has as many flags as its users need
+    *,
+    matcher: Annotated[str, typer.Option(help="name from list-matchers, or module:Class")],
+    tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated")],
+    top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25,
+    jobs: Annotated[int, typer.Option(help="processes at once")] = 1,
+    shard: Annotated[str, typer.Option(help="i/n: answer the i-th of n parts of the queries")] = "1/1",
+    limit: Annotated[int | None, typer.Option(help="queries of each task at most")] = None,
+    match_s: Annotated[float, typer.Option(help="seconds for one query")] = Limits().match_s,
+    prepare_s: Annotated[float, typer.Option(help="seconds for one map")] = Limits().prepare_s,
+    memory_mb: Annotated[int, typer.Option(help="MiB for all processes of the matcher")] = Limits().memory_bytes
+    // 2**20,
+    again: Annotated[list[str] | None, typer.Option(help="ask rows of this status again, as in timeout")] = None,
+    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in; run.json says so")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is left to do, and stop")] = False,
+    out: Out = Path("out"),
+) -> None:
+    """Ask a matcher every query of some tasks; goes on where an earlier run was cut off."""
+    request = RunRequest(
+        spec=matcher,
+        tasks=tasks,
+        out=out,
+        top_k=top_k,
+        limits=Limits(match_s=match_s, prepare_s=prepare_s, memory_bytes=memory_mb * 2**20),
+        jobs=jobs,
+        shard=_shard(shard),
+        limit=limit,
+        again=tuple(again or ()),
+        is_shut_in=not trusted,
+    )
+    plan = plan_run(request)
+    if dry_run:
+        typer.echo(plan.to_text())
+        return
+    report = run(plan, tell=_tell)
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
+    _tell(f"{plan.card.name} {plan.card.version}: {counts}")
+    for folder in report.folders:
+        typer.echo(str(folder))
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit()):
+        message = f"--shard must be i/n, as in 1/2, got {text!r}"
+        raise ConfigError(message)
+    return int(index), int(count)
+
+
+@app.command("merge")
+def merge_command(
+    *,
+    runs: Annotated[list[Path], typer.Option(help="folder of parts, or file; may be repeated")],
+    into: Annotated[Path, typer.Option(help="predictions file to write")],
+) -> None:
+    """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
+    count = merge_runs(runs, into)
+    typer.echo(f"{into}: {count} predictions")
+
+
+@app.command("validate")
+def validate_command(
+    *,
+    predictions: Annotated[Path, typer.Option(help="predictions file, or the folder of a run")],
+    tasks: Annotated[list[Path], typer.Option(help="task folder; may be repeated")],
+) -> None:
+    """List everything in which predictions are not what the tasks ask for."""
+    count = 0
+    for violation in validate(predictions, tasks):
+        typer.echo(violation.to_text())
+        count += 1
+    if count:
+        _tell(f"{predictions}: {count} violations")
+        raise typer.Exit(EXIT_USER)
+    typer.echo(f"{predictions}: answers every query of {len(tasks)} tasks, and nothing else")
 
 
 @app.command("doctor")

@@ -159,9 +159,13 @@ class Drawer:
         center_m = (site.pose.easting_m, site.pose.northing_m)
         key = (state.region, side_m)
         if key not in self.windows:
-            self.windows[key] = describe(state, side_m=side_m, clear_m=self.suite.clear_m(self.scene))
+            clear_m = self.suite.clear_m(self.scene) + _JITTER_M
+            self.windows[key] = describe(state, side_m=side_m, clear_m=clear_m)
         if (*key, site.index) not in self.mined:
-            self.mined[*key, site.index] = mine(self.windows[key], center_m, count=max(CANDIDATES))
+            found = mine(self.windows[key], center_m, count=max(CANDIDATES))
+            # Off their lattice once and for all: the jitter of each query goes if many queries of a site are averaged.
+            off_m = self._site_seeds(site).rng("decoys", *key).uniform(-_JITTER_M, _JITTER_M, found.points_m.shape)
+            self.mined[*key, site.index] = replace(found, points_m=found.points_m + off_m)
         return self.mined[*key, site.index]
 
     def _decoys(self, state: State, job: Job) -> NDArray[np.float64]:

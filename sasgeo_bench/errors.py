@@ -42,3 +42,7 @@ class StoreError(SasgeoError, OSError):
 
 class PerturbError(SasgeoError, ValueError):
     """A perturbation with a strength out of range, or asked for what it must not do."""
+
+
+class MatchError(SasgeoError, ValueError):
+    """An answer, a card or a plugin that is not what the door asks for."""

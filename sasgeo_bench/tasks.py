@@ -5,13 +5,13 @@ import datetime as dt
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import geopandas as gpd
 import numpy as np
 
-from sasgeo_bench import __version__
 from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
 from sasgeo_bench.draw import LEAST_CANDIDATES, Drawer, Job
@@ -69,8 +69,10 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
-    # Held all the way: a second run of the same request would change the map that this one draws from.
-    with regiondir.locked(request.out / "tasks" / suite.card.name / f"{request.region.id}.request", tell=tell):
+    # Held all the way: a second run of the same request would change the map that this one draws from. The lock lies
+    # where maps are built, so that a request that is refused leaves nothing where tasks are.
+    name = f"{request.region.id}+{suite.card.name}.request"
+    with regiondir.locked(request.out / "regions" / name, tell=tell):
         return _make_tasks(request, suite, tell)
 
 
@@ -259,7 +261,7 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
         "sites": len(sites),
         "views_cells": sorted({job.variant.view_cells for job in jobs}),
         "prior_group": (request.group or card.group).name,
-        "made_by": f"sasgeo-bench {__version__}",
+        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
     }
 
 

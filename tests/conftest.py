@@ -4,10 +4,12 @@
 import os
 import shutil
 import socket
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from sasgeo_bench.build import build_region, plan_build
@@ -50,10 +52,26 @@ def real_extracts() -> Path:
 @pytest.fixture(scope="session")
 def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root of what is built, with two embedded towns in it; copy it before you write there."""
-    out = tmp_path_factory.mktemp("towns") / "out"
-    for name in ("town-riverside", "town-grid"):
-        plan = plan_build(read_region_file(find_region_file(name)), out=out)
-        build_region(plan, tell=lambda _: None, with_preview=False)
+
+    def build(out: Path) -> None:
+        for name in ("town-riverside", "town-grid"):
+            plan = plan_build(read_region_file(find_region_file(name)), out=out)
+            build_region(plan, tell=lambda _: None, with_preview=False)
+
+    return _made_once(tmp_path_factory, "towns", build)
+
+
+def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """Make a root once for all processes that share the work; where one fails, the next one tries anew."""
+    base = factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    out = base / f"shared-{name}" / "out"
+    with FileLock(base / f"shared-{name}.lock"):
+        if not out.is_dir():
+            partial = Path(tempfile.mkdtemp(prefix=f"shared-{name}-", dir=base)) / "out"
+            make(partial)
+            out.parent.mkdir()
+            partial.rename(out)
     return out
 
 
@@ -66,14 +84,17 @@ def own_out(towns: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root with the towns and some tasks in them: `clean` at two sites, others at one; read it, do not write to it."""
-    out = Path(shutil.copytree(towns, tmp_path_factory.mktemp("tasks") / "out"))
-    made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-riverside"))
-    for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-grid")):
-        count = 2 if suite == "clean" else 1
-        wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
-        for request in plan_requests(wanted, tell=lambda _: None):
-            make_tasks(request, tell=lambda _: None)
-    return out
+
+    def draw(out: Path) -> None:
+        shutil.copytree(towns, out)
+        made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-grid"))
+        for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-riverside")):
+            count = 2 if suite == "clean" else 1
+            wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
+            for request in plan_requests(wanted, tell=lambda _: None):
+                make_tasks(request, tell=lambda _: None)
+
+    return _made_once(tmp_path_factory, "tasks", draw)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -22,7 +22,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.store import regiondir
-from sasgeo_bench.store.taskdir import QUERIES, TASK, TRUTH, read_queries, read_task, read_truths, task_faults
+from sasgeo_bench.store.taskdir import QUERIES, TASK, TRUTH, TRUTH_OF, read_queries, read_task, read_truths, task_faults
 from sasgeo_bench.tasks import check_task, has_truths, make_tasks, panels
 
 RIVERSIDE = "town-riverside"
@@ -66,12 +66,12 @@ def test_the_same_request_makes_the_same_bytes(tasks, own_out):
 
 
 def test_other_suites_and_regions_change_no_byte_of_a_task(tasks, own_out):
-    make(own_out, "no-priors", suites=("synthetic-age", "no-priors", "absent"), regions=("town-grid", RIVERSIDE))
+    make(own_out, suites=("synthetic-age", "no-priors", "absent"), regions=("town-grid", RIVERSIDE))
     mine, theirs = content(own_out), content(tasks)
     shared = set(mine) & set(theirs)
     assert {name.split("/", 1)[1].rsplit("/", 1)[0] for name in shared} == {
         "absent/town-riverside",
-        "no-priors/town-grid",
+        "no-priors/town-riverside",
     }
     assert all(mine[name] == theirs[name] for name in shared)
 
@@ -116,7 +116,7 @@ def test_ids_are_unique_and_sorted_and_say_nothing(tasks):
         assert own == sorted(own)
         assert own == [truth.query_id for truth in read_truths(truth_of(folder))]
         names += own
-    assert len(names) == len(set(names)) > 50
+    assert len(names) == len(set(names)) > 40
     assert all(len(name) == 24 and set(name) <= set("0123456789abcdef") for name in names)
     leading = np.array([int(name[:8], 16) for name in names]) / 2**32
     assert 0.35 < leading.mean() < 0.65
@@ -124,12 +124,11 @@ def test_ids_are_unique_and_sorted_and_say_nothing(tasks):
 
 def test_task_json_says_where_a_task_comes_from(tasks):
     about = read_task(tasks / "tasks/clean" / RIVERSIDE)
-    said = {name: about[name] for name in ("suite", "region", "split", "seed", "sites", "prior_group", "map_date")}
+    said = {name: about[name] for name in ("suite", "region", "split", "sites", "prior_group", "map_date")}
     assert said == {
         "suite": "clean",
         "region": RIVERSIDE,
         "split": "crossfit",
-        "seed": 0,
         "sites": 2,
         "prior_group": "r500-weak-s3",
         "map_date": "2025-01-01",
@@ -219,6 +218,31 @@ def test_the_search_for_spelled_truths_finds_one_that_is_there(tasks):
     assert round(pose.easting_m, 1) in numbers
 
 
+SEED = 7_315_482_906_117
+
+
+def test_the_seed_lies_with_the_truths_and_nowhere_that_a_matcher_sees(own_out):
+    (made,) = make(own_out, "topology-twins", regions=("town-grid",), seed=SEED)
+    map_folder = own_out / "regions" / made.folder.name
+    assert map_folder.name != "town-grid"
+    assert json.loads((truth_of(made.folder) / TRUTH_OF).read_text(encoding="utf-8"))["seed"] == SEED
+    said = {str(SEED).encode(), f"{SEED:x}".encode(), struct.pack("<q", SEED), struct.pack(">q", SEED)}
+    looked = set()
+    for folder in (own_out / "tasks", own_out / "regions"):
+        for path in folder.rglob("*"):
+            if path.is_file():
+                assert not [item for item in said if item in path.read_bytes() + str(path).encode()], path
+                looked.add(path.name)
+    assert {QUERIES, TASK, "region.json"} <= looked
+    tables = [path for folder in (made.folder, map_folder) for path in folder.glob("*.parquet")]
+    assert len(tables) > 1
+    for path in tables:  # compressed: the bytes above would not show it
+        table = pq.read_table(path)
+        flat = [value for name in table.column_names for array in leaves(table[name]) for value in array.to_pylist()]
+        assert SEED not in {value for value in flat if isinstance(value, (int, float))}
+        assert not [value for value in flat if isinstance(value, str) and str(SEED) in value]
+
+
 def test_candidates_hold_the_truth_only_jittered(tasks):
     looked = 0
     for folder in task_folders(tasks):
@@ -260,6 +284,14 @@ def test_a_region_that_cannot_carry_a_suite_is_told_what_it_lacks(own_out):
     with pytest.raises(ConfigError, match="cannot carry suite 'grade-separation': no bridge"):
         make(own_out, "grade-separation")
     assert content(own_out) == {}
+
+
+@pytest.mark.xfail(strict=True, reason="decoys are looked for in the edited map, which is written by then")
+def test_a_region_too_small_for_decoys_is_refused_before_its_map_is_edited(own_out):
+    with pytest.raises(ConfigError, match="town-riverside is too small for suite 'alias': no decoys far enough away"):
+        make(own_out, "alias")
+    assert content(own_out) == {}
+    assert not (own_out / "regions/town-riverside+alias").exists()
 
 
 def test_views_that_reach_beyond_the_split_are_refused(own_out, tmp_path):
@@ -323,6 +355,53 @@ def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
     assert sum("5 queries at 1 sites" in line for line in told) == 2
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
     assert leftovers(own_out) == []
+
+
+def test_two_runs_of_different_counts_at_once_leave_one_map_and_its_task(own_out):
+    told: dict[int, list[str]] = {1: [], 2: []}
+    runs = [
+        threading.Thread(
+            target=make,
+            args=(own_out, "topology-twins"),
+            kwargs={"tell": lines.append, "regions": ("town-grid",), "count": count, "may_be_fewer": True},
+        )
+        for count, lines in told.items()
+    ]
+    for run in runs:
+        run.start()
+    for run in runs:
+        run.join(120)
+    folder = own_out / "tasks/topology-twins/town-grid+topology-twins"
+    assert [sum(" queries at " in line for line in lines) for lines in told.values()] == [1, 1]
+    assert sum("is being written by another run" in line for lines in told.values() for line in lines) == 1
+    assert check_task(folder, out=own_out) == []
+    assert leftovers(own_out) == []
+    (last,) = [count for count, lines in told.items() if any("being written by another run" in line for line in lines)]
+    both, manifest = content(own_out), regiondir.read_manifest(own_out / "regions" / folder.name)
+    assert read_task(folder)["sites"] == len({truth.pose for truth in read_truths(truth_of(folder))}) <= last
+    make(own_out, "topology-twins", regions=("town-grid",), count=last, may_be_fewer=True)
+    assert content(own_out) == both
+    assert regiondir.read_manifest(own_out / "regions" / folder.name) == manifest
+
+
+def test_the_truths_are_in_place_before_the_task(own_out, monkeypatch):
+    renamed = []
+    rename = Path.rename
+
+    def noted(self, target):
+        renamed.append(Path(target).relative_to(own_out).parts[0])
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", noted)
+    make(own_out)
+    assert renamed == ["truth", "tasks"]
+
+
+def test_a_refused_request_leaves_nothing_behind(own_out):
+    before = sorted(path for path in own_out.rglob("*") if not path.name.endswith(".lock"))
+    with pytest.raises(ConfigError, match="holds"):
+        make(own_out, count=900)
+    assert sorted(path for path in own_out.rglob("*") if not path.name.endswith(".lock")) == before
 
 
 def test_a_run_that_is_killed_leaves_the_old_task_and_the_next_one_clears_up(own_out):
@@ -389,7 +468,8 @@ def test_what_is_wrong_with_a_task_is_named(copied):
     manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
     told = "\n".join(check_task(folder, out=copied))
     assert "notes.txt: not part of a task" in told
-    assert "31 truths that are not those of the 32 queries" in told
+    count = sum(read_task(folder)["counts"].values())
+    assert f"{count - 1} truths that are not those of the {count} queries" in told
     assert "town-riverside was built anew since: make the queries again" in told
 
 

@@ -168,14 +168,24 @@ def differing_files(folder: Path) -> list[str]:
 
 @contextmanager
 def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
-    """Hold a region's lock; a second build of the same region says so and waits."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    """Hold the lock of a region, or of something else that is written; a second run says so and waits.
+
+    Raises
+    ------
+    StoreError
+        If there is no right or no room for a lock.
+    """
     lock = FileLock(folder.parent / f".{folder.name}.lock")
     try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        tell(f"{folder} is being written by another run, waiting for it")
-        lock.acquire()
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            tell(f"{folder} is being written by another run, waiting for it")
+            lock.acquire()
+    except OSError as error:
+        message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        raise StoreError(message) from error
     try:
         yield
     finally:

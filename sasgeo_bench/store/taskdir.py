@@ -362,6 +362,50 @@ def _belongs_to(truth_folder: Path) -> str:
         return "unknown"
 
 
+def query_bytes(query: Query) -> bytes:
+    """One query as it goes to a matcher's process: a row in Arrow's stream format."""
+    return _stream(pa.RecordBatch.from_pylist([query_row(query)], schema=QUERY_SCHEMA))
+
+
+def query_from(data: bytes) -> Query:
+    """Inverse of `query_bytes`."""
+    with pa.ipc.open_stream(data) as stream:
+        return query_of(stream.read_all().to_pylist()[0])
+
+
+def _stream(batch: pa.RecordBatch) -> bytes:
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, batch.schema) as stream:
+        stream.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+def read_some(folder: Path, wanted: frozenset[str]) -> Iterator[tuple[Query, bytes]]:
+    """The queries of some ids, each with its bytes for a matcher's process; a row group in memory at a time."""
+    with pq.ParquetFile(folder / QUERIES) as source:
+        for batch in source.iter_batches(batch_size=_ROWS):
+            for row in range(batch.num_rows):
+                one = batch.slice(row, 1)
+                if one.column("query_id")[0].as_py() in wanted:
+                    yield query_of(one.to_pylist()[0]), _stream(one)
+
+
+def read_ids(folder: Path) -> list[str]:
+    """Ids of a task's queries, in their order.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or damaged.
+    """
+    try:
+        return [str(name) for name in pq.read_table(folder / QUERIES, columns=["query_id"])["query_id"].to_pylist()]
+    except (OSError, pa.ArrowException) as error:
+        text = " ".join(str(error).split())[:200]
+        message = f"{folder / QUERIES} cannot be read ({text}): make the queries again"
+        raise StoreError(message) from error
+
+
 def read_queries(folder: Path) -> Iterator[Query]:
     """Queries of a task in the order of their ids, a row group in memory at a time."""
     for row in _rows(folder / QUERIES, QUERY_SCHEMA):

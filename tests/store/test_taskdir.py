@@ -23,6 +23,7 @@ from sasgeo_bench.store.taskdir import (
     QUERY_SCHEMA,
     TASK,
     TRUTH,
+    TRUTH_OF,
     query_of,
     query_row,
     read_queries,
@@ -299,6 +300,36 @@ def test_a_missing_truth_a_foreign_file_and_a_wrong_count_are_faults(written):
     assert "truth.parquet: 2 truths that are not those of the 3 queries" in told
     assert "note.txt: not part of a task" in told
     assert "holds {'retrieval': 3}, task.json says {'retrieval': 4}" in told
+
+
+def test_truths_say_which_queries_they_are_of_and_what_is_hidden_stays_with_them(folders):
+    write_task(*folders, [(one_query(), one_truth())], ABOUT, {"seed": 987_654_321})
+    said = json.loads((folders[1] / TRUTH_OF).read_text(encoding="utf-8"))
+    assert said == {"queries_sha256": read_task(folders[0])["files"][QUERIES]["sha256"], "seed": 987_654_321}
+    assert "987654321" not in (folders[0] / TASK).read_text(encoding="utf-8")
+    assert sorted(path.name for path in folders[0].iterdir()) == [QUERIES, TASK]
+    assert sorted(path.name for path in folders[1].iterdir()) == [TRUTH_OF, TRUTH]
+    assert task_faults(*folders) == []
+
+
+def test_truths_of_other_queries_are_a_fault_though_their_ids_are_the_same(written, tmp_path):
+    others = [tmp_path / "other" / name for name in ("task", "truth")]
+    for folder in others:
+        folder.mkdir(parents=True)
+    names = [letter * 24 for letter in "abc"]
+    write_task(*others, ((one_query(query_id=name, season="x"), one_truth(query_id=name)) for name in names), ABOUT)
+    (fault,) = task_faults(written[0], others[1])
+    other = read_task(others[0])["files"][QUERIES]["sha256"]
+    assert fault == f"truth.json: the truths are of other queries, SHA-256 {other}: make the queries again"
+
+
+@pytest.mark.parametrize("text", [None, "{", "[]", "3", "{}", '{"queries_sha256": null}'])
+def test_truths_that_do_not_say_which_queries_they_are_of_are_a_fault(text, written):
+    (written[1] / TRUTH_OF).unlink()
+    if text is not None:
+        (written[1] / TRUTH_OF).write_text(text)
+    (fault,) = task_faults(*written)
+    assert fault.startswith("truth.json: the truths are of other queries, SHA-256 ")
 
 
 def test_truths_in_another_order_are_a_fault(written):

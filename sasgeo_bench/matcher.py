@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The doors: what a matcher and a rejector are, what they say of themselves, and what they answer."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal, Protocol, get_args, runtime_checkable
+
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.query import Query, Track, Truth
+from sasgeo_bench.region import Region
+
+Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
+NEEDS: Final[tuple[Need, ...]] = get_args(Need)
+MOST_CANDIDATES: Final = 1000  # of one answer
+MOST_DIAGNOSTICS: Final = 64
+SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatcherCard:
+    """What a matcher says of itself; printed on the board beside its row.
+
+    Parameters
+    ----------
+    name : str
+        Lower-case letters, digits, hyphens and underscores.
+    version : str
+        Raised whenever answers change.
+    title : str
+        One line for people.
+    source : str
+        Paper, page or "original": where the method comes from.
+    ours : str
+        What of it is the implementer's own.
+    licence : str
+        SPDX name of the code's licence.
+    tracks : tuple of {"retrieval", "localization"}
+        What it answers; elsewhere its row says "not applicable".
+    needs : tuple of str
+        Of `NEEDS`: what a query must tell or hold; without it the row says "not applicable".
+    limits : str
+        What it is known not to do.
+    trained_on : tuple of str
+        Places its parameters come from; a row that was trained on a test place is set apart.
+
+    Raises
+    ------
+    MatchError
+        If a field is empty or says what is not known.
+
+    Examples
+    --------
+    >>> said = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
+    >>> MatcherCard(**said, tracks=("localization",)).needs
+    ()
+    """
+
+    name: str
+    version: str
+    title: str
+    source: str
+    ours: str
+    licence: str
+    tracks: tuple[Track, ...]
+    needs: tuple[Need, ...] = ()
+    limits: str = ""
+    trained_on: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a card that does not say what a reader of the board needs."""
+        for name in ("name", "version", "title", "source", "ours", "licence"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value.strip():
+                message = f"card: {name} is empty, say it in one line"
+                raise MatchError(message)
+        if not all(
+            letter.isascii() and (letter.islower() or letter.isdigit() or letter in "-_") for letter in self.name
+        ):
+            message = f"card: name {self.name!r} may hold lower-case letters, digits, hyphens and underscores only"
+            raise MatchError(message)
+        for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
+            wrong = next((item for item in getattr(self, name) if item not in known), None)
+            if wrong is not None:
+                message = f"card: {name} holds {wrong!r}, known are {', '.join(known)}"
+                raise MatchError(message)
+        if not self.tracks:
+            message = "card: tracks is empty, name retrieval, localization or both"
+            raise MatchError(message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Match:
+    """An answer to one query: places with scores, best first; no place at all is an answer withheld.
+
+    Parameters
+    ----------
+    poses : sequence of Pose
+        For retrieval, candidates of the query; for localization, any poses.
+    scores : sequence of float
+        As many as poses, none greater than the one before it; any scale.
+    confidence : float, optional
+        Probability, 0..1, that the first pose is right; None where the matcher does not say.
+    diagnostics : mapping of str to float
+        Whatever a rejector or a reader may want, as in "margin".
+    """
+
+    poses: Sequence[Pose]
+    scores: Sequence[float]
+    confidence: float | None = None
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+
+
+WITHHELD: Final = Match(poses=(), scores=(), confidence=0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Training:
+    """What a matcher may learn from: maps, queries and truths of the training blocks of a split."""
+
+    regions: Mapping[str, Region]
+    pairs: Sequence[tuple[Query, Truth]]
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """A method under test. It is made without arguments, in a process of its own, and sees no truth."""
+
+    card: MatcherCard
+
+    def prepare(self, region: Region, training: Training | None) -> None:
+        """Index a map; called once for each map, timed apart."""
+        ...
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Answer a query on the map prepared last, with at most `top_k` poses."""
+        ...
+
+
+def check_match(match: object, query: Query, *, top_k: int) -> Match:
+    """Hold an answer to what an answer must be.
+
+    Parameters
+    ----------
+    match : object
+        What a matcher returned.
+    query : Query
+        What it was asked.
+    top_k : int
+        How many poses it may give.
+
+    Returns
+    -------
+    Match
+        The answer, with floats for numbers.
+
+    Raises
+    ------
+    MatchError
+        With found and expected, if it is not a Match, gives more than `top_k` poses, as many scores as it should not,
+        a number that is not finite, scores out of order, a confidence out of 0..1, a pose twice or one that is no
+        candidate of a retrieval query.
+    """
+    if not isinstance(match, Match):
+        message = f"match() returned {type(match).__name__}, expected sasgeo_bench.matcher.Match"
+        raise MatchError(message)
+    count = len(match.poses)
+    if count > min(top_k, MOST_CANDIDATES):
+        message = f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}"
+        raise MatchError(message)
+    if len(match.scores) != count:
+        message = f"match() returned {len(match.scores)} scores for {count} poses, expected one each"
+        raise MatchError(message)
+    scores = [_number(score, "score") for score in match.scores]
+    poses = [_pose(pose) for pose in match.poses]
+    fallen = next((at for at in range(1, count) if scores[at] > scores[at - 1]), None)
+    if fallen is not None:
+        message = (
+            f"scores rise from {scores[fallen - 1]:g} to {scores[fallen]:g} at place {fallen}, expected best first"
+        )
+        raise MatchError(message)
+    confidence = None if match.confidence is None else _number(match.confidence, "confidence")
+    if confidence is not None and not 0 <= confidence <= 1:
+        message = f"confidence is {confidence:g}, expected 0..1 or None"
+        raise MatchError(message)
+    if query.track == "retrieval":
+        _check_candidates(poses, query.candidates)
+    diagnostics = _diagnostics(match.diagnostics)
+    return Match(poses=poses, scores=scores, confidence=confidence, diagnostics=diagnostics)
+
+
+def _number(value: object, name: str) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        message = f"{name} is a {type(value).__name__}, expected a number"
+        raise MatchError(message) from error
+    if not math.isfinite(number):
+        message = f"{name} is {number}, expected a finite number"
+        raise MatchError(message)
+    return number
+
+
+def _pose(pose: object) -> Pose:
+    if not isinstance(pose, Pose):
+        message = f"a pose is a {type(pose).__name__}, expected sasgeo_bench.pose.Pose"
+        raise MatchError(message)
+    numbers = {name: _number(getattr(pose, name), name) for name in ("easting_m", "northing_m", "yaw_deg", "scale")}
+    return Pose(**numbers)
+
+
+def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None:
+    """Every pose of a retrieval answer is one of the candidates, and none is given twice."""
+    given: set[int] = set()
+    for pose in poses:
+        near = candidates_at(pose, candidates)
+        at = next((index for index in near if index not in given), near[0] if near else None)
+        if at is None:
+            place = f"({pose.easting_m:.2f}, {pose.northing_m:.2f})"
+            message = f"pose {place} is none of the {len(candidates)} candidates, expected one of query.candidates"
+            raise MatchError(message)
+        if at in given:
+            message = f"candidate {at} is given twice, expected each at most once"
+            raise MatchError(message)
+        given.add(at)
+
+
+def candidates_at(pose: Pose, candidates: Sequence[Pose]) -> list[int]:
+    """Candidates that lie where a pose lies, within 5 cm, the nearest first; heading and scale may have been refined.
+
+    Examples
+    --------
+    >>> one, two = (Pose(easting_m=x, northing_m=0.0, yaw_deg=0.0) for x in (1.0, 7.0))
+    >>> candidates_at(two, [one, two])
+    [1]
+    """
+    apart_m = [math.hypot(pose.easting_m - item.easting_m, pose.northing_m - item.northing_m) for item in candidates]
+    near = [index for index, gap_m in enumerate(apart_m) if gap_m <= SAME_PLACE_M]
+    return sorted(near, key=apart_m.__getitem__)
+
+
+def _diagnostics(given: object) -> dict[str, float]:
+    if not isinstance(given, Mapping):
+        message = f"diagnostics is a {type(given).__name__}, expected a mapping of name to number"
+        raise MatchError(message)
+    if len(given) > MOST_DIAGNOSTICS:
+        message = f"diagnostics holds {len(given)} entries, expected at most {MOST_DIAGNOSTICS}"
+        raise MatchError(message)
+    return {str(name): _number(value, f"diagnostics[{str(name)!r}]") for name, value in given.items()}
+
+
+def lacks(card: MatcherCard, query: Query) -> str | None:
+    """Why a query is not applicable to a matcher, or None if it is.
+
+    A disc, a heading or vectors that a card needs and a query lacks are named; so is a track it does not answer.
+    """
+    if query.track not in card.tracks:
+        return f"track {query.track}"
+    has = {
+        "position": query.prior.center_m is not None or bool(query.candidates),
+        "yaw": query.prior.yaw_deg is not None,
+        "scale": True,
+        "vectors": query.vectors is not None,
+        "image": False,
+        "training": True,
+    }
+    return next((f"no {need}" for need in card.needs if not has[need]), None)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding plugins: by name through entry points, or by module:Class; built-in ones win a clash of names."""
+
+import difflib
+import importlib
+import warnings
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
+
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matcher import Matcher, MatcherCard
+from sasgeo_bench.results import one_line
+
+MATCHERS: Final = "sasgeo_bench.matchers"
+REJECTORS: Final = "sasgeo_bench.rejectors"
+BUILT_IN: Final = "sasgeo-baselines"  # the distribution whose names win
+
+
+def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
+    """Every entry point of a group by its name; of two with one name the built-in one, else the first.
+
+    Warns
+    -----
+    UserWarning
+        Where a name stands twice.
+    """
+    found: dict[str, EntryPoint] = {}
+    points = sorted(entry_points(group=group), key=lambda point: (_home(point) != BUILT_IN, _home(point), point.value))
+    for point in points:
+        if point.name not in found:
+            found[point.name] = point
+        elif found[point.name].value != point.value:
+            kept, lost = _home(found[point.name]), _home(point)
+            message = f"two plugins are named {point.name!r}: {kept} is used, {lost} ({point.value}) is not"
+            warnings.warn(message, stacklevel=2)
+    return dict(sorted(found.items()))
+
+
+def _home(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else ""
+
+
+def load_matcher(spec: str) -> Matcher:
+    """Import a matcher and make one.
+
+    Parameters
+    ----------
+    spec : str
+        A name, or "module:Class".
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name, it cannot be imported or made, is not a matcher, or has no sound card.
+
+    Examples
+    --------
+    >>> load_matcher("no_such_matcher")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list-matchers shows all; or module:Class)
+    """
+    matcher = _load(spec, MATCHERS, "matcher")()
+    card = getattr(matcher, "card", None)
+    if not isinstance(card, MatcherCard):
+        message = f"{spec}: card is a {type(card).__name__}, expected a sasgeo_bench.matcher.MatcherCard"
+        raise MatchError(message)
+    missing = [name for name in ("prepare", "match") if not callable(getattr(matcher, name, None))]
+    if missing:
+        message = f"{spec}: {type(matcher).__name__} is not a matcher, it has no {' and no '.join(missing)}"
+        raise MatchError(message)
+    found: Matcher = matcher
+    return found
+
+
+def _load(spec: str, group: str, kind: str) -> Callable[[], Any]:
+    """The class behind a name or module:Class, wrapped so that what goes wrong is told in one line."""
+    target = _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
+
+    def make() -> Any:  # noqa: ANN401 - whatever the plugin is
+        try:
+            return target()
+        except Exception as error:
+            message = f"{spec}: cannot be made ({one_line(f'{type(error).__name__}: {error}')})"
+            raise MatchError(message) from error
+
+    return make
+
+
+def _from_module(spec: str) -> Callable[[], Any]:
+    module, _, name = spec.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
+    except Exception as error:
+        message = f"{spec}: cannot be imported ({one_line(f'{type(error).__name__}: {error}')})"
+        raise MatchError(message) from error
+
+
+def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
+    points = list_entry_points(group)
+    if name not in points:
+        near = difflib.get_close_matches(name, points, n=1, cutoff=0.6)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        message = f"there is no {kind} {name!r}{hint} (list-{kind}s shows all; or module:Class)"
+        raise MatchError(message)
+    try:
+        return points[name].load()  # type: ignore[no-any-return]
+    except Exception as error:
+        said = one_line(f"{type(error).__name__}: {error}")
+        message = f"{name}: {points[name].value} of {_home(points[name])} cannot be imported ({said})"
+        raise MatchError(message) from error

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predictions on disk: parts that are only ever added, and `run.json`; a file of the same shape is a submission."""
+
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.results import Prediction
+
+RUN: Final = "run.json"
+SCHEMA_VERSION: Final = 1
+_CANDIDATE: Final = pa.struct(
+    [(name, pa.float64()) for name in ("easting_m", "northing_m", "yaw_deg", "scale", "score")]
+)
+PREDICTION_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("candidates", pa.list_(_CANDIDATE)),
+        ("confidence", pa.float64()),
+        ("diagnostics", pa.map_(pa.string(), pa.float64())),
+        ("status", pa.string()),
+        ("message", pa.string()),
+        ("latency_s", pa.float64()),
+    ],
+    metadata={"schema_version": str(SCHEMA_VERSION), "attribution": ATTRIBUTION, "licence": LICENCE},
+)
+
+
+def prediction_row(prediction: Prediction) -> dict[str, Any]:
+    """One prediction as a row of `PREDICTION_SCHEMA`."""
+    return {
+        "query_id": prediction.query_id,
+        "candidates": [
+            {
+                "easting_m": pose.easting_m,
+                "northing_m": pose.northing_m,
+                "yaw_deg": pose.yaw_deg,
+                "scale": pose.scale,
+                "score": score,
+            }
+            for pose, score in prediction.candidates
+        ],
+        "confidence": prediction.confidence,
+        "diagnostics": list(prediction.diagnostics.items()),
+        "status": prediction.status,
+        "message": prediction.message,
+        "latency_s": prediction.latency_s,
+    }
+
+
+def prediction_of(row: Mapping[str, Any]) -> Prediction:
+    """Inverse of `prediction_row`."""
+    poses = tuple(
+        (Pose(**{name: value for name, value in item.items() if name != "score"}), item["score"])
+        for item in row["candidates"] or ()
+    )
+    return Prediction(
+        query_id=row["query_id"],
+        candidates=poses,
+        confidence=row["confidence"],
+        diagnostics=dict(row["diagnostics"] or ()),
+        status=row["status"],
+        message=row["message"] or "",
+        latency_s=row["latency_s"],
+    )
+
+
+def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
+    """Add some rows to a run, in a file of their own that is there whole or not at all.
+
+    Raises
+    ------
+    StoreError
+        If the disk is full or the folder cannot be written; what was there before is as it was.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"part-{time.time_ns():020d}-{os.getpid()}"
+    scratch, path = folder / f".{name}.partial", folder / f"{name}.parquet"
+    table = pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=PREDICTION_SCHEMA)
+    try:
+        pq.write_table(table, scratch, compression="zstd")
+        _flush(scratch)
+        scratch.rename(path)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        message = (
+            f"{folder} cannot be written ({error.strerror or error}): free some space and run again, it goes on there"
+        )
+        raise StoreError(message) from error
+    return path
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The files of a run's folder in the order they were written, or the file itself."""
+    return [path] if path.is_file() else sorted(path.glob("part-*.parquet"))
+
+
+def read_predictions(path: Path) -> Iterator[Prediction]:
+    """Predictions of a run's folder or of a file; of two for one query, the one written first.
+
+    Raises
+    ------
+    StoreError
+        If there is none, or a file cannot be read.
+    """
+    parts = parts_of(path)
+    if not parts:
+        message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
+        raise StoreError(message)
+    seen: set[str] = set()
+    for part in parts:
+        for row in read_part(part).to_pylist():
+            if row["query_id"] not in seen:
+                seen.add(row["query_id"])
+                yield prediction_of(row)
+
+
+def read_part(path: Path) -> pa.Table:
+    """A parquet file whole.
+
+    Raises
+    ------
+    StoreError
+        If it is not there, truncated, or no parquet file.
+    """
+    try:
+        return pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        text = " ".join(str(error).split())[:200]
+        message = f"{path} cannot be read ({text}): write it again"
+        raise StoreError(message) from error
+
+
+def merge_runs(runs: Sequence[Path], into: Path) -> int:
+    """Write the predictions of several folders or files into one file, sorted by query; how many there are.
+
+    Of two for one query the first counts, in the order of `runs`. The same predictions give the same file, whatever
+    parts they came in.
+
+    Raises
+    ------
+    StoreError
+        If there are none, a file cannot be read, or the new one cannot be written.
+    """
+    found: dict[str, Prediction] = {}
+    for path in runs:
+        for prediction in read_predictions(path):
+            found.setdefault(prediction.query_id, prediction)
+    rows = [prediction_row(found[name]) for name in sorted(found)]
+    scratch = into.with_name(f".{into.name}.partial")
+    try:
+        into.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA), scratch, compression="zstd")
+        _flush(scratch)
+        scratch.rename(into)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        message = f"{into} cannot be written ({error.strerror or error}): check your rights and the free space"
+        raise StoreError(message) from error
+    return len(rows)
+
+
+def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
+    """Ids of the queries a run has answered; those with a status in `again` do not count."""
+    left_out = set(again)
+    found: set[str] = set()
+    for part in parts_of(folder):
+        table = read_part(part).select(["query_id", "status"])
+        pairs = zip(table["query_id"].to_pylist(), table["status"].to_pylist(), strict=True)
+        found |= {name for name, status in pairs if status not in left_out}
+    return found
+
+
+def write_run(folder: Path, about: Mapping[str, Any]) -> None:
+    """Write `run.json`, in place of an older one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    scratch = folder / f".{RUN}.{os.getpid()}"
+    scratch.write_text(json.dumps(dict(about), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    scratch.rename(folder / RUN)
+
+
+def read_run(folder: Path) -> dict[str, Any] | None:
+    """What `run.json` says, or None where there is none.
+
+    Raises
+    ------
+    StoreError
+        If it is damaged.
+    """
+    path = folder / RUN
+    if not path.is_file():
+        return None
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        message = f"{path} is damaged: remove it and run again, the parts beside it are kept"
+        raise StoreError(message) from error

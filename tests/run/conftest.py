@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small task with its truths, and the hostile matchers beside it."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.tasks import make_tasks
+
+TOWN = "town-riverside"
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory):
+    """A folder with out/ and hostile.py in it."""
+    root = tmp_path_factory.mktemp("run")
+    wanted = Wanted(
+        suites=("false-unknown",),
+        regions=(TOWN,),
+        split="crossfit",
+        count=3,
+        seed=4,
+        out=root / "out",
+        may_be_fewer=True,
+    )
+    for request in plan_requests(wanted, tell=lambda _: None):
+        make_tasks(request, tell=lambda _: None)
+    shutil.copy(Path(__file__).with_name("hostile.py"), root / "hostile.py")
+    return root
+
+
+@pytest.fixture
+def place(made, monkeypatch):
+    """That folder as the working one, on the import path of whoever is started from here."""
+    monkeypatch.chdir(made)
+    monkeypatch.syspath_prepend(str(made))
+    return made
+
+
+@pytest.fixture
+def task(place):
+    return place / "out" / "tasks" / "false-unknown" / TOWN

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+# ruff: noqa: ARG002, T201 - the door has its arguments, and some of these print
+"""Matchers that break what they can; each is run by a test, none is installed."""
+
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+
+from sasgeo_bench.matcher import Match, MatcherCard
+from sasgeo_bench.pose import Pose
+
+SAID = {"version": "1", "title": "Hostile", "source": "original", "ours": "all", "licence": "Apache-2.0"}
+
+
+class Plain:
+    """Answers the middle of the disc, or the first candidates; and is a little slow, so that it can be killed."""
+
+    card = MatcherCard(name="plain", tracks=("localization", "retrieval"), **SAID)
+
+    def prepare(self, region, training):
+        self.region = region
+
+    def match(self, query, *, top_k):
+        time.sleep(0.01)
+        if query.candidates:
+            poses = query.candidates[:top_k]
+            return Match(poses=poses, scores=[-float(at) for at in range(len(poses))])
+        x, y = query.prior.center_m or (0.0, 0.0)
+        seen = float((query.evidence.cells == 1).mean())
+        return Match(poses=[Pose(easting_m=x, northing_m=y, yaw_deg=0.0)], scores=[seen], diagnostics={"seen": seen})
+
+
+class Slow(Plain):
+    """As plain, but slow enough to be killed in the middle."""
+
+    def match(self, query, *, top_k):
+        time.sleep(0.1)
+        return super().match(query, top_k=top_k)
+
+
+class Hangs(Plain):
+    def match(self, query, *, top_k):
+        while True:
+            time.sleep(1)
+
+
+class HangsInPrepare(Plain):
+    def prepare(self, region, training):
+        time.sleep(1000)
+
+
+class Segfaults(Plain):
+    def match(self, query, *, top_k):
+        os.kill(os.getpid(), signal.SIGSEGV)
+        time.sleep(5)
+
+
+class Exits(Plain):
+    def match(self, query, *, top_k):
+        print("last words")
+        sys.stdout.flush()
+        os._exit(3)
+
+
+class Raises(Plain):
+    def match(self, query, *, top_k):
+        message = "no idea\nwhere this is"
+        raise ValueError(message)
+
+
+class RaisesInPrepare(Plain):
+    def prepare(self, region, training):
+        message = "no index today"
+        raise ValueError(message)
+
+
+class Leaks(Plain):
+    def match(self, query, *, top_k):
+        held = []
+        while True:
+            held.append(b"x" * 2**23 + bytes(len(held)))
+
+
+class Forks(Plain):
+    def match(self, query, *, top_k):
+        for _ in range(20):
+            if os.fork() == 0:
+                time.sleep(1000)
+        return super().match(query, top_k=top_k)
+
+
+class Prints(Plain):
+    def match(self, query, *, top_k):
+        for _ in range(100):
+            print("x" * 100_000)
+        return super().match(query, top_k=top_k)
+
+
+class ScoresNan(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=[Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)], scores=[float("nan")])
+
+
+class ReturnsText(Plain):
+    def match(self, query, *, top_k):
+        return "here"
+
+
+class ReturnsMany(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=[Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)] * 1_000_000, scores=[0.0] * 1_000_000)
+
+
+class ReadsTruth(Plain):
+    def match(self, query, *, top_k):
+        for path in sys.path:
+            for truth in (Path(path) / "out" / "truth").rglob("*.parquet"):
+                truth.read_bytes()
+                message = "read the truth"
+                raise RuntimeError(message)
+        return super().match(query, top_k=top_k)
+
+
+class ListsFolders(Plain):
+    """Says which of the folders beside the map it can read or write."""
+
+    def match(self, query, *, top_k):
+        found = {}
+        for path in sys.path:
+            out = Path(path) / "out"
+            for name in ("truth", "runs"):
+                try:
+                    found[f"{name} files"] = float(len([*(out / name).rglob("*.parquet")]))
+                except OSError:
+                    found[f"{name} files"] = 0.0
+        return Match(poses=(), scores=(), diagnostics=found)
+
+
+class WritesResults(Plain):
+    def match(self, query, *, top_k):
+        for path in sys.path:
+            tasks = Path(path) / "out" / "tasks"
+            if tasks.is_dir():
+                (tasks / "mine").write_text("x")
+        return super().match(query, top_k=top_k)
+
+
+class Connects(Plain):
+    def match(self, query, *, top_k):
+        with socket.socket() as link:
+            link.settimeout(1)
+            link.connect(("192.0.2.1", 80))
+        return super().match(query, top_k=top_k)
+
+
+class TellsEnvironment(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=(), scores=(), diagnostics=dict.fromkeys(os.environ, 0.0))
+
+
+class LiesOnTheWire(Plain):
+    """Writes to the socket of its own process."""
+
+    def match(self, query, *, top_k):
+        for number in range(3, 64):
+            try:
+                os.write(number, b"\x7f\xff\xff\xff\x00\x00\x00\x00" + b"x" * 100)
+            except OSError:
+                continue
+        return super().match(query, top_k=top_k)
+
+
+class NoMatcher:
+    """Has a card and no verbs."""
+
+    card = Plain.card
+
+
+class NoCard:
+    """Has the verbs and no card."""
+
+    prepare = Plain.prepare
+    match = Plain.match
+
+
+class BadCard(Plain):
+    """Has a card that says nothing of its licence; the class cannot even be made."""
+
+    def __init__(self):
+        self.card = MatcherCard(name="bad", tracks=("retrieval",), **{**SAID, "licence": " "})
+
+
+class WantsImages(Plain):
+    card = MatcherCard(name="wants-images", tracks=("localization", "retrieval"), needs=("image",), **SAID)

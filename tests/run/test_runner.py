@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run gives a row for every query, whatever happens to it: cut off, split, on other processes, on a full disk."""
+
+import errno
+import os
+import random
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.run.runner import RunRequest, plan_run, run
+from sasgeo_bench.run.worker import Limits
+from sasgeo_bench.store import rundir, taskdir
+
+
+def request_of(task, out, name="Plain", **changes):
+    request = RunRequest(spec=f"hostile:{name}", tasks=(task,), out=out, limits=Limits(match_s=5.0))
+    return replace(request, **changes)
+
+
+def run_all(request):
+    plan = plan_run(request)
+    report = run(plan, tell=lambda _: None)
+    return report, plan.parts[0].folder
+
+
+def table(*paths):
+    """All rows by query, without what differs from run to run: the time they took."""
+    found = {item.query_id: replace(item, latency_s=None) for path in paths for item in rundir.read_predictions(path)}
+    return [found[name] for name in sorted(found)]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(made, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        patch.syspath_prepend(str(made))
+        task = made / "out" / "tasks" / "false-unknown" / "town-riverside"
+        return run_all(request_of(task, tmp_path_factory.mktemp("undisturbed")))
+
+
+def test_every_query_has_a_row_and_run_json_says_how(task, undisturbed):
+    report, folder = undisturbed
+    ids = taskdir.read_ids(task)
+    assert [item.query_id for item in table(folder)] == sorted(ids)
+    assert report.counts == {"ok": len(ids)}
+    about = rundir.read_run(folder)
+    assert about["matcher"]["name"] == "plain"
+    assert about["queries_sha256"] == taskdir.read_task(task)["files"]["queries.parquet"]["sha256"]
+    assert about["peak_bytes"] > 0
+    assert about["prepare_s"] >= 0
+    assert all(item.latency_s > 0.009 for item in rundir.read_predictions(folder))
+
+
+def test_two_processes_give_what_one_does(task, undisturbed, tmp_path):
+    _, folder = run_all(request_of(task, tmp_path, jobs=2))
+    assert table(folder) == table(undisturbed[1])
+
+
+def test_two_shards_merged_give_what_one_run_does(task, undisturbed, tmp_path):
+    folders = [run_all(request_of(task, tmp_path / str(index), shard=(index, 2)))[1] for index in (1, 2)]
+    assert all(len(table(folder)) < len(table(undisturbed[1])) for folder in folders)
+    merged = (tmp_path / "both.parquet", tmp_path / "again.parquet")
+    assert rundir.merge_runs(folders, merged[0]) == len(taskdir.read_ids(task))
+    rundir.merge_runs(folders[::-1], merged[1])
+    assert merged[0].read_bytes() == merged[1].read_bytes()
+    assert table(merged[0]) == table(undisturbed[1])
+
+
+def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
+    first, folder = run_all(request_of(task, tmp_path, limit=3))
+    assert first.counts == {"ok": 3}
+    assert plan_run(request_of(task, tmp_path, limit=3)).parts[0].left == ()
+    second, _ = run_all(request_of(task, tmp_path, limit=5))
+    assert second.counts == {"ok": 2}
+    assert len(table(folder)) == 5
+
+
+def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
+    _, folder = run_all(request_of(task, tmp_path, name="Raises", limit=2))
+    assert {item.status for item in table(folder)} == {"crash"}
+    assert plan_run(request_of(task, tmp_path, name="Raises", limit=2)).parts[0].left == ()
+    assert len(plan_run(request_of(task, tmp_path, name="Raises", limit=2, again=("crash",))).parts[0].left) == 2
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.slow)])
+def test_killed_at_random_moments_a_run_ends_with_the_same_rows(place, task, undisturbed, tmp_path, kills):
+    folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
+    command = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()", "run", "--matcher", "hostile:Slow"]
+    command += ["--tasks", str(task), "--out", str(tmp_path), "--match-s", "5", "--jobs", "2"]
+    chance = random.Random(7)  # noqa: S311 - moments, no secrets
+    every, cut_off = len(taskdir.read_ids(task)), 0
+    for _ in range(kills):
+        (folder / "run.json").unlink(missing_ok=True)
+        process = subprocess.Popen(command, cwd=place, env=env_with(place), stderr=subprocess.DEVNULL)  # noqa: S603
+        while process.poll() is None and not (folder / "run.json").is_file():
+            time.sleep(0.05)
+        time.sleep(chance.uniform(0.5, 4.0))
+        process.kill()
+        process.wait()
+        done = len(rundir.ids_done(folder)) if folder.is_dir() else 0
+        cut_off += 0 < done < every
+        if done == every:
+            for part in rundir.parts_of(folder):
+                part.unlink()  # done already: begin anew, so that there is something to kill
+    finished = subprocess.run(command, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
+    assert finished.returncode == 0, finished.stderr
+    assert cut_off > 0
+    assert table(folder) == table(undisturbed[1])
+
+
+def env_with(place):
+    return os.environ | {"PYTHONPATH": f"{place}:{os.environ.get('PYTHONPATH', '')}"}
+
+
+def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypatch):
+    _, folder = run_all(request_of(task, tmp_path, limit=2))
+    before = table(folder)
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(StoreError, match=r"No space left on device.*it goes on there"):
+        run_all(request_of(task, tmp_path, limit=4))
+    monkeypatch.undo()
+    assert table(folder) == before
+    assert not [path for path in folder.iterdir() if path.name.endswith(".partial")]
+
+
+def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path):
+    report, folder = run_all(request_of(task, tmp_path, name="WantsImages", limit=3))
+    assert report.counts == {"not applicable": 3}
+    assert {item.message for item in table(folder)} == {"no image"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"shard": (3, 2)}, ConfigError, "--shard must be i/n"),
+        ({"jobs": 0}, ConfigError, "--jobs must be at least 1"),
+        ({"top_k": 0}, ConfigError, "--top-k must be at least 1"),
+        ({"spec": "hostile:NoCard"}, MatchError, "card is a NoneType"),
+        ({"spec": "no_such_matcher"}, MatchError, "there is no matcher"),
+        ({"spec": "no_such_module:Class"}, MatchError, "cannot be imported"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_is_written(task, tmp_path, changes, error, words):
+    with pytest.raises(error, match=words):
+        plan_run(request_of(task, tmp_path, **changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_answers_to_other_queries_are_not_added_to(task, tmp_path):
+    _, folder = run_all(request_of(task, tmp_path, limit=1))
+    about = rundir.read_run(folder)
+    rundir.write_run(folder, about | {"queries_sha256": "0" * 64})
+    with pytest.raises(StoreError, match="holds answers to other queries"):
+        plan_run(request_of(task, tmp_path, limit=1))
+
+
+def test_another_version_of_a_matcher_has_a_folder_of_its_own(place, task, tmp_path):
+    first = plan_run(request_of(task, tmp_path)).parts[0].folder
+    source = place / "hostile.py"
+    text = source.read_text(encoding="utf-8")
+    try:
+        source.write_text(text + "\n# changed\n", encoding="utf-8")
+        second = plan_run(request_of(task, tmp_path)).parts[0].folder
+    finally:
+        source.write_text(text, encoding="utf-8")
+    assert first != second
+    assert plan_run(request_of(task, tmp_path)).parts[0].folder == first

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A matcher may do what it likes: it costs its own rows, and nothing of it is left."""
+
+import os
+import re
+
+import psutil
+import pytest
+
+from sasgeo_bench.run import sandbox
+from sasgeo_bench.run.worker import Limits, Reach, Worker
+from sasgeo_bench.store import taskdir
+
+QUICK = Limits(match_s=2.0, prepare_s=20.0, memory_bytes=768 * 2**20)
+HAS_LANDLOCK = sandbox.landlock_version() > 0
+shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlock to refuse files with")
+
+
+def ask(place, task, name, *, limits=QUICK, times=1, is_shut_in=True):
+    """The replies of a hostile matcher to the first query, and its worker after its end."""
+    query = taskdir.query_bytes(next(iter(taskdir.read_queries(task))))
+    region = place / "out" / "regions" / task.name
+    reach = Reach(readable=[region], hidden=[place / "out" / "truth", place / "out" / "runs"], is_shut_in=is_shut_in)
+    with Worker(spec=f"hostile:{name}", reach=reach, limits=limits) as worker:
+        ready = worker.prepare(region)
+        if ready.status != "ok":
+            return [ready], worker
+        return [worker.match(query, top_k=5) for _ in range(times)], worker
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "words"),
+    [
+        ("Plain", "ok", ""),
+        ("Hangs", "timeout", "no answer within 2 s"),
+        ("Segfaults", "crash", "died by SIGSEGV"),
+        ("Exits", "crash", "ended with exit status 3: last words"),
+        ("Raises", "crash", "ValueError: no idea where this is"),
+        ("RaisesInPrepare", "crash", "ValueError: no index today"),
+        ("Leaks", "crash", "MiB of memory, at most 768 are allowed|out of memory"),
+        ("Forks", "ok", ""),
+        ("Prints", "ok", ""),
+        ("ScoresNan", "invalid", "score is nan, expected a finite number"),
+        ("ReturnsText", "invalid", "match.. returned str, expected"),
+        ("ReturnsMany", "invalid", "returned 1000000 poses, expected at most top_k = 5"),
+        ("LiesOnTheWire", "crash", "an answer of 2147483647 bytes"),
+        ("NoMatcher", "invalid", "NoMatcher is not a matcher, it has no prepare and no match"),
+        ("NoCard", "invalid", "card is a NoneType, expected a"),
+        ("BadCard", "invalid", "licence is empty"),
+        ("NoSuchClass", "invalid", "cannot be imported"),
+    ],
+)
+def test_whatever_a_matcher_does_becomes_a_status_and_a_line(place, task, name, status, words):
+    (reply,), _ = ask(place, task, name)
+    assert reply.status == status, reply.message
+    assert re.search(words, reply.message), reply.message
+    assert "\n" not in reply.message
+
+
+def test_a_map_that_takes_too_long_is_a_timeout(place, task):
+    (reply,), _ = ask(place, task, "HangsInPrepare", limits=Limits(prepare_s=3.0))
+    assert (reply.status, reply.message) == ("timeout", "no answer within 3 s")
+
+
+def test_after_a_crash_the_next_query_has_a_fresh_process(place, task):
+    replies, worker = ask(place, task, "Exits", times=3)
+    assert [reply.status for reply in replies] == ["crash"] * 3
+    assert worker.starts == 3
+
+
+@shut_in
+def test_the_truth_is_out_of_reach(place, task):
+    (reply,), worker = ask(place, task, "ReadsTruth")
+    assert "read the truth" not in reply.message
+    (listed,), _ = ask(place, task, "ListsFolders")
+    assert listed.match.diagnostics["truth files"] == 0
+    assert worker.isolation["truth"] != "not protected"
+
+
+def test_without_the_shutting_in_the_truth_would_be_read(place, task):
+    # So that the test above cannot pass by looking in the wrong place.
+    (reply,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
+    assert "read the truth" in reply.message
+
+
+@shut_in
+def test_results_cannot_be_written(place, task):
+    (reply,), _ = ask(place, task, "WritesResults")
+    assert reply.status == "refused"
+    assert not (place / "out" / "tasks" / "mine").exists()
+
+
+@shut_in
+def test_there_is_no_network(place, task):
+    (reply,), worker = ask(place, task, "Connects")
+    assert reply.status in {"refused", "crash"}
+    assert worker.isolation["network"] != "not cut"
+
+
+def test_the_environment_says_nothing_of_where_it_runs(place, task, monkeypatch):
+    monkeypatch.setenv("SASGEO_OUT", str(place))
+    monkeypatch.setenv("MY_SECRET", "1")
+    (reply,), _ = ask(place, task, "TellsEnvironment")
+    assert {"HOME", "PATH"} <= set(reply.match.diagnostics)
+    assert not {"SASGEO_OUT", "SASGEO_EXTRACTS", "MY_SECRET", "PYTHONPATH"} & set(reply.match.diagnostics)
+
+
+@pytest.mark.parametrize("name", ["Forks", "Hangs", "Plain"])
+def test_nothing_is_left_of_a_matcher(place, task, name):
+    before = {child.pid for child in psutil.Process(os.getpid()).children(recursive=True)}
+    _, worker = ask(place, task, name)
+    after = psutil.Process(os.getpid()).children(recursive=True)
+    assert [child for child in after if child.pid not in before] == []
+    assert worker.peak_bytes > 50 * 2**20

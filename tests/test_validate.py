@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A predictions file is the contract of a submission: every violation is named by row and column."""
+
+from dataclasses import replace
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.tasks import make_tasks
+from sasgeo_bench.validate import validate
+
+POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory):
+    out = tmp_path_factory.mktemp("validate")
+    wanted = Wanted(suites=("false-unknown",), regions=("town-riverside",), split="crossfit", count=1, seed=3, out=out)
+    return make_tasks(plan_requests(wanted, tell=lambda _: None)[0], tell=lambda _: None)[0].folder
+
+
+@pytest.fixture
+def answers(task):
+    return [Prediction(query_id=name, candidates=((POSE, 1.0),), confidence=0.5) for name in taskdir.read_ids(task)]
+
+
+def faults(tmp_path, task, predictions):
+    path = tmp_path / "mine.parquet"
+    rows = [rundir.prediction_row(item) for item in predictions]
+    pq.write_table(pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA), path)
+    return [(item.row, item.column, item.found, item.expected) for item in validate(path, [task])]
+
+
+def test_a_sound_file_has_no_violation(tmp_path, task, answers):
+    assert faults(tmp_path, task, answers) == []
+    withheld = replace(answers[0], candidates=(), confidence=0.0)
+    late = replace(answers[1], candidates=(), confidence=None, status="timeout", message="late")
+    assert faults(tmp_path, task, [withheld, late, *answers[2:]]) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "column", "found"),
+    [
+        ({"confidence": 1.5}, "confidence", "confidence is 1.5"),
+        ({"confidence": float("nan")}, "confidence", "confidence is nan"),
+        ({"candidates": ((POSE, float("inf")),)}, "candidates", "score is inf"),
+        ({"candidates": ((POSE, 1.0), (POSE, 2.0))}, "candidates", "scores rise from 1 to 2 at place 1"),
+        ({"status": "fine"}, "status", "'fine'"),
+        ({"status": "crash"}, "candidates", "1 poses"),
+        ({"latency_s": -1.0}, "latency_s", "-1.0"),
+        ({"query_id": "0" * 24}, "query_id", f"'{'0' * 24}'"),
+        ({"diagnostics": {"margin": float("nan")}}, "diagnostics", "diagnostics['margin'] is nan"),
+    ],
+)
+def test_a_fault_is_named_by_its_row_and_column(tmp_path, task, answers, change, column, found):
+    broken = [*answers[:2], replace(answers[2], **change), *answers[3:]]
+    listed = faults(tmp_path, task, broken)
+    assert listed[0][:3] == (2, column, found)
+    assert listed[0][3]
+
+
+def test_a_pose_without_a_place_is_named(tmp_path, task, answers):
+    path = tmp_path / "mine.parquet"
+    rows = [rundir.prediction_row(item) for item in answers]
+    rows[1]["candidates"][0]["easting_m"] = float("nan")
+    rows[2]["candidates"][0]["score"] = None
+    pq.write_table(pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA), path)
+    listed = [(item.row, item.column) for item in validate(path, [task])]
+    assert listed == [(1, "candidates"), (2, "candidates")]
+
+
+def test_missing_and_double_rows_are_named(tmp_path, task, answers):
+    listed = faults(tmp_path, task, [*answers[1:], answers[1]])
+    assert [item[:2] for item in listed] == [(len(answers) - 1, "query_id"), (-1, "query_id")]
+    assert answers[0].query_id in listed[1][2]
+
+
+def test_columns_that_are_missing_or_of_another_kind_are_named(tmp_path, task, answers):
+    path = tmp_path / "mine.parquet"
+    full = pa.Table.from_pylist([rundir.prediction_row(item) for item in answers], schema=rundir.PREDICTION_SCHEMA)
+    pq.write_table(full.drop_columns(["confidence"]), path)
+    assert ("confidence", "nothing") in [(item.column, item.found) for item in validate(path, [task])]
+    pq.write_table(full.set_column(0, "query_id", pa.array(range(len(answers)))), path)
+    assert ("query_id", "int64") in [(item.column, item.found) for item in validate(path, [task])]
+
+
+def test_a_truncated_file_gets_one_line(tmp_path, task, answers):
+    faults(tmp_path, task, answers)
+    path = tmp_path / "mine.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(StoreError, match="cannot be read"):
+        list(validate(path, [task]))
+    with pytest.raises(StoreError, match="holds no predictions"):
+        list(rundir.read_predictions(tmp_path / "nowhere"))

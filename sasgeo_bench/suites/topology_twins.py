@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `topology-twins`: a copy of the place whose roads do not meet where they met, or meet elsewhere."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from sasgeo_bench.suites.base import Scene, Site, SuiteCard, Variant
+from sasgeo_bench.evidence import Evidence
+from sasgeo_bench.suites.base import Scene, Seeds, Site, SuiteCard, Variant, perceived
 from sasgeo_bench.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of
 from sasgeo_bench.twin import Change, open_gaps, stagger
 
@@ -17,6 +20,7 @@ LEAST_JUNCTIONS: Final = 2
 _PAIR_M: Final = 125.0  # between two junctions that a view holds both
 _SEEN_M: Final = 90.0
 _FEWEST_X: Final = 2
+_ONE_PATCH_CELLS: Final = 4  # cells that differ this near to each other belong to one junction
 
 
 def _junctions(scene: Scene) -> NDArray[np.float64]:
@@ -41,14 +45,50 @@ def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
     return lambda piece: open_gaps(piece, near, gap_m=GAP_M, rng=rng)
 
 
-SUITE: Final = TwinSuite(
+class TopologyTwins(TwinSuite):
+    """As every twin suite; layers show each junction as it is at the true place or as it is at the twin, by lot.
+
+    A gap is a few cells wide, yet at the exact pose a few cells that perception left alone are enough to tell the two
+    places apart. So that layers cannot, they have each junction either way, as a detector of that resolution would.
+    """
+
+    def see(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Evidence:
+        """Perceive the layers with each junction as in one of the two places."""
+        easting_m, northing_m = scene.twins[site.index][0]
+        twin = replace(site.pose, easting_m=easting_m, northing_m=northing_m)
+        own, other = (
+            scene.world.view(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+            for pose in (site.pose, twin)
+        )
+        clean = either(own, other, seeds.rng("junctions", variant.view_cells))
+        return perceived(scene.world, site, variant, seeds, clean=clean)
+
+
+def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence:
+    """Where two views differ, take each patch of cells from the one or the other.
+
+    Examples
+    --------
+    >>> cells = np.repeat(np.array([0, 1], dtype=np.uint8), 9).reshape(2, 1, 1, 9)
+    >>> one, two = (Evidence(classes=("a",), cells=item, cell_size_m=1.0) for item in cells)
+    >>> sorted({int(either(one, two, np.random.default_rng(seed)).cells.sum()) for seed in range(20)})  # one patch
+    [0, 9]
+    """
+    differ = (own.cells != other.cells).any(axis=0)
+    near = ndimage.binary_dilation(differ, structure=np.ones((3, 3), dtype=bool), iterations=_ONE_PATCH_CELLS // 2)
+    patch, count = ndimage.label(near, structure=np.ones((3, 3)))
+    is_other = np.concatenate(([False], rng.random(count) < 0.5))[patch]  # noqa: PLR2004 - half of them
+    return own.replace(np.where(is_other, other.cells, own.cells))
+
+
+SUITE: Final = TopologyTwins(
     card=SuiteCard(
         name="topology-twins",
         version=1,
         title="Topology twins (G2)",
         what="A twin of the place in which one road at each junction stops two metres short of the other, or in which "
         "every X-junction is two T-junctions five metres apart; at every second site the other way round.",
-        separates="Connectivity of perceived vectors from rasters, in which the gap is as wide as perception's own.",
+        separates="Connectivity of perceived vectors from rasters, in which each junction looks one way or the other.",
         falsifier="Vectors whose detector closes such gaps show both places alike: no gain over the control.",
         strength_unit="1 with perceived vectors",
         tracks=("retrieval", "localization"),

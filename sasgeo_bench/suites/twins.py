@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant, perceived
@@ -116,7 +117,7 @@ class TwinSuite(Suite):
 
     def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
         """See the true place; the control has no vectors, the falsifier's do not tell the two places apart."""
-        seen = perceived(scene.world, site, variant, seeds)
+        seen = self.see(scene, site, variant, seeds)
         if variant.role == "control":
             return Draft(evidence=seen)
         vectors = perceive_vectors(
@@ -127,6 +128,10 @@ class TwinSuite(Suite):
             rng=seeds.rng("vectors", variant.view_cells),
         )
         return Draft(evidence=seen, vectors=vectors)
+
+    def see(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Evidence:
+        """Perceive the layers at the true place."""
+        return perceived(scene.world, site, variant, seeds)
 
     def _told_nothing(self, scene: Scene, site: Site) -> Pose:
         """The site where it is the place that the falsifier's vectors are of, else its twin."""

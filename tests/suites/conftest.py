@@ -26,6 +26,7 @@ from sasgeo_bench.twin import paste
 # Sides of the region and of the town behind its name: "large" has room for the copies of several sites, "huge" for
 # three of each, and the map of a "short" one ends short of its grid.
 SIDES_M = {"medium": (1024.0, 1280.0), "large": (1792.0, 2048.0), "huge": (2560.0, 2816.0), "short": (1536.0, 1280.0)}
+DATED = ("town-suburb",)  # towns that are built at older dates too
 OLDER = (dt.date(2014, 1, 1), dt.date(2019, 1, 1))  # of a town of 2025
 # Where each suite finds what it needs; what is not named here is drawn of the suburb.
 TOWN_OF = {
@@ -107,14 +108,13 @@ def scene(town) -> Callable[..., Scene]:
         if suite:
             return replace(of_town(name), view_reach_m=_view_reach_m(SUITES[suite]))
         state = State.of(town(name))
-        has_dates = " " not in name
         return Scene(
             map=state,
             world=state,
             blocks=blocks_of(state.region, state.grid),
             view_reach_m=MAIN_REACH_M,
             scenes=town(name).manifest.scenes,
-            others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if has_dates else (),
+            others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if name in DATED else (),
             elsewhere=State.of(town("town-riverside")),
             ageing=Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="here", redrawn=0.2),
         )

@@ -265,7 +265,7 @@ def test_aliases_lie_as_far_off_their_lines_as_sites_do_and_all_around_them_is_m
     made = carried("stable-not-distinctive")
     lines = straight_places(made.scene)[:, :2]
     off_m = {"sites": [], "twins": []}
-    for root in range(20):
+    for root in range(10):
         seeds = replace(made.seeds, root=root)
         sites = choose_sites(
             made.scene, made.suite, count=99, seeds=seeds, group=made.suite.card.group, may_be_fewer=True
@@ -279,7 +279,7 @@ def test_aliases_lie_as_far_off_their_lines_as_sites_do_and_all_around_them_is_m
             for point in np.array(points):
                 assert made.scene.map.is_mapped(point, made.scene.view_reach_m)
                 off_m[name].append(np.hypot(*(lines - point).T).min())
-    assert min(map(len, off_m.values())) > 40
+    assert min(map(len, off_m.values())) > 30
     assert np.mean(off_m["twins"]) == pytest.approx(np.mean(off_m["sites"]), rel=0.2)
     assert np.median(off_m["twins"]) > 5  # not on the line, where no site is
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import shapely
 
-from sasgeo_bench.evidence import UNKNOWN
+from sasgeo_bench.evidence import UNKNOWN, Evidence
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.suites.base import Seeds, changed_share
 from sasgeo_bench.suites.mining import least_apart_m
 from sasgeo_bench.suites.sites import choose_sites
+from sasgeo_bench.suites.topology_twins import either
 from sasgeo_bench.suites.twins import OFF_M, find_targets
 from sasgeo_bench.suites.vectors import VectorNoise, as_features, perceive_vectors
 from sasgeo_bench.suites.volatile_lure import STABLE, VOLATILE
@@ -153,7 +154,7 @@ def same_shapes(one, other):
 # Which of two places is the original
 
 
-def lots(made, roots=40):
+def lots(made, roots=24):
     """Sites before and after the lot, for many seeds: the map is not edited, where pastes would lie is enough."""
     group = made.suite.card.group
     for root in range(roots):
@@ -170,7 +171,7 @@ def test_by_lot_the_true_place_is_any_of_the_places_that_look_alike(carried, nam
     made = carried(name)
     found = list(lots(made))
     share = 1 / (1 + made.suite.copies)
-    assert len(found) > 30
+    assert len(found) >= 20
     is_original = np.array([not site.is_copy for _, site, _ in found])
     assert is_original.mean() == pytest.approx(share, abs=2.6 * np.sqrt(share * (1 - share) / len(found)))
     bounds = {block.id: block.bounds_m for block in made.plain.blocks}
@@ -217,7 +218,7 @@ def rim_ends(features, place, suite, scene):
 def test_roads_that_go_on_across_the_rim_tell_the_original_but_not_the_truth(carried):
     made = carried("topology-twins")
     group, tells_original, tells_truth = made.suite.card.group, [], []
-    for root in range(16):
+    for root in range(10):
         seeds = Seeds(root=root, names=("rims",))
         sites = choose_sites(made.plain, made.suite, count=4, seeds=seeds, group=group, may_be_fewer=True)
         edit = made.suite.edit(made.plain, sites, seeds)
@@ -230,7 +231,7 @@ def test_roads_that_go_on_across_the_rim_tell_the_original_but_not_the_truth(car
             if site.index % 2 == 0:  # at the others both are cut
                 tells_original.append(1 - points if site.is_copy else points)
     assert np.mean(tells_original) > 0.85
-    assert 0.35 < np.mean(tells_truth) < 0.65
+    assert 0.3 < np.mean(tells_truth) < 0.7
 
 
 @pytest.mark.parametrize("name", TWINS)
@@ -260,6 +261,46 @@ def test_all_that_any_view_shows_is_within_what_is_copied(carried, name):
             differ = {layer for layer in truth.classes if (truth.layer(layer) != twin.layer(layer)).any()}
             roads = {"road_major", "road_minor", "path_track"} if name == "topology-twins" else set()
             assert differ <= roads | ({"bridge"} if name == "grade-separation" else set())
+
+
+def agreement(seen, mapped):
+    """Share of cells that are as mapped: the plainest of scores."""
+    known = (seen.cells != UNKNOWN) & (mapped.cells != UNKNOWN)
+    return float((known & (seen.cells == mapped.cells)).sum() / known.sum())
+
+
+def test_agreement_of_cells_at_the_exact_pose_does_not_tell_topology_twins_apart(carried):
+    made = carried("topology-twins")
+    control = next(item for item in made.suite.variants if item.role == "control")
+    prefers_truth = []
+    for site, pose in pairs(made):
+        # Either of the two as the true place: perception overlooks more than it makes up, so one of them is likelier.
+        for true, other in ((site.pose, pose), (pose, site.pose)):
+            twins = {site.index: ((other.easting_m, other.northing_m),)}
+            of = replace(made, scene=replace(made.scene, twins=twins))
+            truth, twin = (view(made.scene.map, at) for at in (true, other))
+            for root in range(15):
+                seen = replace(of, seeds=replace(made.seeds, root=root)).draw(replace(site, pose=true), control)
+                gain = agreement(seen.evidence, truth) - agreement(seen.evidence, twin)
+                prefers_truth.append((np.sign(gain) + 1) / 2)
+    assert np.mean(prefers_truth) == pytest.approx(0.5, abs=0.13)
+
+
+def test_layers_of_topology_twins_show_every_junction_as_at_one_of_both_places():
+    plain, changed = np.zeros((2, 1, 60, 60), dtype=np.uint8)
+    for row in (10, 30, 50):
+        for col in (10, 30, 50):
+            changed[0, row : row + 2, col : col + 3] = 1
+    own, other = (Evidence(classes=("road_minor",), cells=cells, cell_size_m=1.0) for cells in (plain, changed))
+    shown = []
+    for seed in range(40):
+        cells = either(own, other, np.random.default_rng(seed)).cells
+        patches = [cells[0, row : row + 2, col : col + 3] for row in (10, 30, 50) for col in (10, 30, 50)]
+        assert all(patch.min() == patch.max() for patch in patches)
+        assert cells.sum() == sum(patch.sum() for patch in patches)
+        shown.append([patch.max() for patch in patches])
+    assert np.mean(shown) == pytest.approx(0.5, abs=0.08)
+    assert np.abs(np.corrcoef(np.array(shown).T) - np.eye(9)).max() < 0.6  # each by itself
 
 
 # Falsifiers

@@ -96,7 +96,8 @@ def test_vectors_lie_on_the_cells_of_the_view(scene, yaw_deg, scale, seed):
     vectors = perceive_vectors(state, pose, side_m=192.0, noise=EXACT, rng=np.random.default_rng(0))
     view = state.view(pose, size_cells=192, cell_size_m=1.0)
     hits = [hit for name in ("road_minor", "road_major", "building") for hit in on_cells(vectors, view, name)]
-    assert np.mean(hits or [1.0]) > 0.97
+    # A point at the very edge of a road may fall on the cell beside it.
+    assert hits.count(False) <= max(2, 0.03 * len(hits))
 
 
 def on_cells(vectors, view, name):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import UNKNOWN
-from sasgeo_bench.matcher import Match, candidate_index
+from sasgeo_bench.matcher import Match
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Query
 
@@ -33,7 +33,7 @@ def ranked_candidates(
     query : Query
         One of retrieval.
     scores : sequence of float or None
-        One for each candidate; those with None are left out, and so is a candidate that is given twice.
+        One for each candidate; those with None are left out.
     top_k : int
         How many to give.
     poses : sequence of Pose, optional
@@ -41,11 +41,7 @@ def ranked_candidates(
     diagnostics : dict of str to float, optional
         To give with them.
     """
-    chosen = [
-        at
-        for at, score in enumerate(scores)
-        if score is not None and candidate_index(query.candidates[at], query.candidates) == at
-    ]
+    chosen = [at for at, score in enumerate(scores) if score is not None]
     chosen = sorted(chosen, key=lambda at: -(scores[at] or 0.0))[:top_k]
     turned = [
         replace(query.candidates[at], yaw_deg=poses[at].yaw_deg, scale=poses[at].scale)

@@ -11,7 +11,7 @@ from sasgeo_baselines.global_descriptor import GlobalDescriptor
 from sasgeo_baselines.map_density_prior import MapDensityPrior
 from sasgeo_baselines.places import Sums
 
-from sasgeo_bench.matcher import MatcherCard, candidate_index, check_match
+from sasgeo_bench.matcher import MatcherCard, candidates_at, check_match
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.store.taskdir import read_queries, read_truths
@@ -97,7 +97,7 @@ def test_dense_matchers_find_what_has_no_errors(name, region, queries, truths) -
             continue
         best = matcher.match(query, top_k=5).poses[0]
         if query.track == "retrieval":
-            assert candidate_index(best, query.candidates) == truth.candidate
+            assert candidates_at(best, query.candidates)[0] == truth.candidate
         elif query.evidence.shape[0] == 192:
             away_m = np.hypot(best.easting_m - truth.pose.easting_m, best.northing_m - truth.pose.northing_m)
             assert away_m <= 1.0

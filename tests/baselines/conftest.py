@@ -79,10 +79,10 @@ def made() -> SimpleNamespace:
 
 @pytest.fixture(scope="session")
 def town_tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Root with town-riverside and the suite `clean` at one site."""
+    """Root with town-grid and the suite `clean` at one site."""
     out = tmp_path_factory.mktemp("baselines") / "out"
-    shutil.copytree(towns / "regions" / "town-riverside", out / "regions" / "town-riverside")
-    wanted = Wanted(suites=("clean",), regions=("town-riverside",), split="crossfit", count=1, seed=0, out=out)
+    shutil.copytree(towns / "regions" / "town-grid", out / "regions" / "town-grid")
+    wanted = Wanted(suites=("clean",), regions=("town-grid",), split="crossfit", count=1, seed=0, out=out)
     for request in plan_requests(wanted, tell=lambda _: None):
         make_tasks(request, tell=lambda _: None)
     return out

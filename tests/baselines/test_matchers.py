@@ -29,21 +29,19 @@ def make(name: str):
 
 @pytest.fixture(scope="module")
 def region(town_tasks):
-    return read_region(town_tasks / "regions" / "town-riverside")
+    return read_region(town_tasks / "regions" / "town-grid")
 
 
 @pytest.fixture(scope="module")
 def queries(town_tasks):
     return [
-        query
-        for query in read_queries(town_tasks / "tasks" / "clean" / "town-riverside")
-        if query.evidence.shape[0] < 384
+        query for query in read_queries(town_tasks / "tasks" / "clean" / "town-grid") if query.evidence.shape[0] < 384
     ]
 
 
 @pytest.fixture(scope="module")
 def truths(town_tasks):
-    return {item.query_id: item for item in read_truths(town_tasks / "truth" / "clean" / "town-riverside")}
+    return {item.query_id: item for item in read_truths(town_tasks / "truth" / "clean" / "town-grid")}
 
 
 @pytest.mark.parametrize("name", REGISTERED)

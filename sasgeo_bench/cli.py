@@ -55,7 +55,7 @@ TOP_DROPS: Final = 12
 PIPE_WIDTH: Final = 200
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)
-errors = Console(stderr=True, soft_wrap=True, highlight=False)
+errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
 RegionFolders = Annotated[list[Path] | None, typer.Option("--regions", help="folder with region files of your own")]
@@ -284,6 +284,7 @@ def inspect_command(
     if (folder / TASK).is_file():
         _inspect_task(folder, out, query=query, rows=rows)
         return
+    _check_target(target, out)
     if target.endswith(".toml") or target in list_split_files():
         _inspect_split(target, out, region_folders or [])
         return
@@ -292,6 +293,18 @@ def inspect_command(
     _print(_summary(manifest, folder))
     _print(_class_table(manifest))
     _print(_reasons(manifest))
+
+
+def _check_target(target: str, out: Path) -> None:
+    """Refuse a task that is not there by naming those that are."""
+    suite, _, region = target.partition("/")
+    if suite not in SUITES or (region and Path(target).is_dir()):
+        return
+    made = sorted(path.parent.name for path in (out / "tasks" / suite).glob(f"*/{TASK}"))
+    near = [name for name in made if name.split("+")[0].split("@")[0] == region.split("+")[0].split("@")[0]] or made
+    there = ", ".join(f"{suite}/{name}" for name in near[:8]) or "none of this suite: make-queries first"
+    message = f"{out / 'tasks'} holds no task {target}; there is {there}"
+    raise ConfigError(message)
 
 
 def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
@@ -392,8 +405,10 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
     missing = [region for region in split.spec.region_ids if region not in built]
     if missing:
         _tell(f"{len(missing)} regions are not built and not searched: {', '.join(missing)}")
-    if not built:
-        message = f"no region of split {split.spec.id!r} is built in {out / 'regions'}: build-region them first"
+    if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:  # noqa: PLR2004
+        message = (
+            f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
+        )
         raise ConfigError(message)
     maps = {region: constellations(read_features(out / "regions" / region)) for region in built}
     faults = [
@@ -484,7 +499,7 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
 
 def _shard(text: str) -> tuple[int, int]:
     index, _, count = text.partition("/")
-    if not (index.isdigit() and count.isdigit()):
+    if not (index.isdecimal() and count.isdecimal() and text.isascii()):
         message = f"--shard must be i/n, as in 1/2, got {text!r}"
         raise ConfigError(message)
     return int(index), int(count)

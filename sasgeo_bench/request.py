@@ -142,12 +142,18 @@ def check_count(count: int) -> None:
 
 def check_roots(out: Path) -> None:
     """Refuse to write truths where those who may see the tasks would find them."""
-    tasks, truth = (out / name for name in ("tasks", "truth"))
-    inside = truth.resolve().is_relative_to(tasks.resolve())
-    above = next((folder for folder in out.resolve().parents if (folder / taskdir.TASK).is_file()), None)
-    if inside or above is not None or (out / taskdir.TASK).is_file():
-        where = tasks if inside else above or out
-        message = f"{truth} lies inside {where}, where the queries are: choose another --out"
+    check_apart(out / "tasks", out / "truth")
+    above = next((folder for folder in (out, *out.resolve().parents) if (folder / taskdir.TASK).is_file()), None)
+    if above is not None:
+        message = f"{out / 'truth'} lies inside {above}, where the queries are: choose another --out"
+        raise ConfigError(message)
+
+
+def check_apart(tasks: Path, truth: Path) -> None:
+    """Refuse folders of tasks and of truths of which one lies within the other, links followed."""
+    one, two = tasks.resolve(), truth.resolve()
+    if two.is_relative_to(one) or one.is_relative_to(two):
+        message = f"{truth} lies inside {tasks}, where the queries are: choose another --out"
         raise ConfigError(message)
 
 

@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plugin package to begin with: complete, small, and good enough to pass the conformance kit at once."""
 
+import keyword
 import re
+import sys
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError
 
-_NAME: Final = re.compile(r"^[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*$")
+_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
+_LONGEST: Final = 60
+_TAKEN: Final = frozenset(
+    {*sys.stdlib_module_names, "numpy", "sasgeo_bench", "sasgeo_baselines", "tests", "con", "nul"}
+)
 
 _PYPROJECT: Final = """\
 [build-system]
@@ -138,7 +144,11 @@ def plugin_files(name: str) -> dict[str, str]:
     >>> sorted(plugin_files("my-matcher"))[:3]
     ['README.md', 'pyproject.toml', 'src/my_matcher/__init__.py']
     """
-    if not _NAME.match(name):
+    module = name.replace("-", "_")
+    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
+        message = f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name"
+        raise ConfigError(message)
+    if not _NAME.fullmatch(name):
         message = (
             f"a matcher's name has lower-case letters, digits, hyphens and underscores, as in my-matcher; got {name!r}"
         )

@@ -24,7 +24,7 @@ from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
-from sasgeo_bench.request import Request, Tell, aged_dates, check_count, check_roots
+from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sheet import Panel
@@ -77,10 +77,15 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
 
 
 def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
+    if request.group is not None and suite.card.has_own_priors:
+        message = f"suite {suite.card.name!r} is about what is known before: leave --prior out"
+        raise ConfigError(message)
     scene, base = read_scene(request, suite, tell)
     reason = suite.lack(scene)
     if reason is not None:
-        message = f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason}"
+        message = (
+            f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason} (--skip passes on to the next suite)"
+        )
         raise ConfigError(message)
     group = request.group or suite.card.group
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
@@ -226,6 +231,10 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         task_folder = request.out / "tasks" / name / region
         truth_folder = request.out / "truth" / name / region
         about = _about(request, drawer, region, sites, own)
+        check_apart(request.out / "tasks", truth_folder)
+        check_apart(task_folder, request.out / "truth")
+        taskdir.check_ours(task_folder, (taskdir.QUERIES, taskdir.TASK))
+        taskdir.check_ours(truth_folder, (taskdir.TRUTH, taskdir.TRUTH_OF))
         try:
             with (
                 regiondir.locked(task_folder, tell=tell),
@@ -268,7 +277,7 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
         "split_sha256": hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
         "sites": len(sites),
         "views_cells": sorted({job.variant.view_cells for job in jobs}),
-        "prior_group": (request.group or card.group).name,
+        "epsg": state.grid.epsg,
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
     }
 

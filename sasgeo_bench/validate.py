@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.errors import MatchError, PoseError
+from sasgeo_bench.errors import MatchError, PoseError, StoreError
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import STATUSES
@@ -62,6 +62,9 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     queries = {query.query_id: query for task in tasks for query in taskdir.read_queries(task)}
     seen: dict[str, str] = {}
     files = rundir.parts_of(path)
+    if not files:
+        message = f"{path} holds no predictions: name a predictions file, or the folder of a run"
+        raise StoreError(message)
     for file in files:
         table = rundir.read_part(file)
         faults = list(_schema_faults(file.name, table))

@@ -15,7 +15,7 @@ from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.matcher import MatcherCard, check_match, lacks
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.results import Prediction, matcher_hash, one_line
+from sasgeo_bench.results import STATUSES, Prediction, matcher_hash, one_line
 from sasgeo_bench.run.worker import Limits, Reach, Reply, Worker
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import locked, read_manifest
@@ -23,6 +23,8 @@ from sasgeo_bench.store.regiondir import locked, read_manifest
 PART_ROWS: Final = 64
 PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
 TOLD_S: Final = 10.0
+_MOST_S: Final = 7 * 86_400.0
+_LEAST_BYTES, _MOST_BYTES = 64 * 2**20, 2**42
 
 Tell = Callable[[str], None]
 
@@ -111,18 +113,31 @@ def plan_run(request: RunRequest) -> RunPlan:
     if not 1 <= index <= count:
         message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
         raise ConfigError(message)
-    for name, value in (("--jobs", request.jobs), ("--top-k", request.top_k)):
-        if value < 1:
+    limits = request.limits
+    numbers = (("--jobs", request.jobs), ("--top-k", request.top_k), ("--limit", request.limit))
+    for name, value in numbers:
+        if value is not None and value < 1:
             message = f"{name} must be at least 1, got {value}"
             raise ConfigError(message)
+    for name, seconds in (("--match-s", limits.match_s), ("--prepare-s", limits.prepare_s)):
+        if not 0 < seconds <= _MOST_S:
+            message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
+            raise ConfigError(message)
+    if not _LEAST_BYTES <= limits.memory_bytes <= _MOST_BYTES:
+        allowed = f"between {_LEAST_BYTES >> 20} and {_MOST_BYTES >> 20}"
+        message = f"--memory-mb must lie {allowed}, got {limits.memory_bytes >> 20}"
+        raise ConfigError(message)
+    strange = next((status for status in request.again if status not in STATUSES), None)
+    if strange is not None:
+        message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"
+        raise ConfigError(message)
     tasks = [_task(folder) for folder in request.tasks]
     with Worker(spec=request.spec, reach=_reach(request, None), limits=request.limits) as worker:
         reply = worker.load()
         if reply.status != "ok" or reply.card is None:
             raise MatchError(reply.message or f"{request.spec}: the plugin says nothing of itself")
         card, code, isolation = reply.card, reply.code, dict(worker.isolation)
-    limits = asdict(request.limits)
-    settings = json.dumps({"top_k": request.top_k, "limits": limits}, sort_keys=True)
+    settings = json.dumps({"top_k": request.top_k, "limits": asdict(limits)}, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
     parts = tuple(_part(request, card, found, *task) for task in tasks)
     return RunPlan(request=request, card=card, hash=found, isolation=isolation, parts=parts)

@@ -5,6 +5,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -90,7 +91,8 @@ def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
         message = f"{target} cannot be written ({error}): check the free space and the rights of its folder"
         raise StoreError(message) from error
     finally:
-        scratch.unlink(missing_ok=True)
+        with suppress(OSError):  # where a file stands for a folder there is nothing to remove
+            scratch.unlink(missing_ok=True)
     return target
 
 

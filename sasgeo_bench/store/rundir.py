@@ -91,12 +91,19 @@ def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
         _flush(scratch)
         scratch.rename(path)
     except OSError as error:
-        scratch.unlink(missing_ok=True)
+        _remove(scratch)
         message = (
             f"{folder} cannot be written ({error.strerror or error}): free some space and run again, it goes on there"
         )
         raise StoreError(message) from error
     return path
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink()
+    except OSError:
+        return
 
 
 def _flush(path: Path) -> None:
@@ -126,7 +133,11 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         raise StoreError(message)
     seen: set[str] = set()
     for part in parts:
-        for row in read_part(part).to_pylist():
+        table = read_part(part)
+        if table.column_names != PREDICTION_SCHEMA.names or not pa.types.is_string(table.schema.field("query_id").type):
+            message = f"{part} holds no predictions: 'validate' says what is missing"
+            raise StoreError(message)
+        for row in table.to_pylist():
             if row["query_id"] not in seen:
                 seen.add(row["query_id"])
                 yield prediction_of(row)
@@ -159,6 +170,9 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
     StoreError
         If there are none, a file cannot be read, or the new one cannot be written.
     """
+    if into.exists() and not _is_ours(into):
+        message = f"{into} is no predictions file and would be lost: name another one"
+        raise StoreError(message)
     found: dict[str, Prediction] = {}
     for path in runs:
         for prediction in read_predictions(path):
@@ -171,10 +185,17 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
         _flush(scratch)
         scratch.rename(into)
     except OSError as error:
-        scratch.unlink(missing_ok=True)
+        _remove(scratch)
         message = f"{into} cannot be written ({error.strerror or error}): check your rights and the free space"
         raise StoreError(message) from error
     return len(rows)
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        return path.is_file() and pq.read_schema(path).names == PREDICTION_SCHEMA.names
+    except (OSError, pa.ArrowException):
+        return False
 
 
 def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:

@@ -80,14 +80,17 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
     """
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     columns = (*_COLUMNS, "perceived vectors") if has_vectors else _COLUMNS
-    width, height = 2.6 + _CELL_INCHES * len(columns), 1.0 + (_CELL_INCHES + 0.1) * len(panels)
+    width, height = 2.6 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
-    legend = "pink: only seen   blue: only mapped   grey: unknown   light grey: agree"
+    legend = (
+        "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"
+    )
     figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=8, color="#444444")
+    _draw_legend(figure, width, height)
     for at, panel in enumerate(panels):
-        bottom = height - 0.95 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
+        bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
         text = "\n".join(line for part in _words(panel) for line in wrap(part, 30))
         figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=7.5)
         pictures = (*_pictures(panel), None)[: len(columns)]
@@ -107,6 +110,16 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
                 chart.set_title(name, fontsize=9, pad=3)
     figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
     figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+
+
+def _draw_legend(figure: Figure, width: float, height: float) -> None:
+    """The colours of the classes, in one line below the title's."""
+    left = 0.15
+    for item in load_taxonomy().classes:
+        name = item.name.replace("_", " ")
+        figure.text(left / width, 1 - 0.66 / height, "\u25a0", va="top", fontsize=9, color=item.colour)
+        figure.text((left + 0.13) / width, 1 - 0.67 / height, name, va="top", fontsize=7, color="#444444")
+        left += 0.26 + 0.062 * len(name)
 
 
 def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:

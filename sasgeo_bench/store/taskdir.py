@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +27,7 @@ TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
 SCHEMA_VERSION: Final = 1
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of a suite or a region: one folder, never a way out
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
 
@@ -228,6 +230,7 @@ def write_task(
         How many were written.
     """
     counts: dict[str, int] = {}
+    groups: set[str] = set()
     total = 0
     frozen = hashlib.sha256()
     with ExitStack() as stack:
@@ -240,6 +243,7 @@ def write_task(
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
             for query, _ in part:
                 counts[query.track] = counts.get(query.track, 0) + 1
+                groups.add(query.prior_group)
                 frozen.update(query.query_id.encode() + _candidate_bytes(query))
             total += len(part)
     record = file_record(task_folder / QUERIES)
@@ -248,6 +252,7 @@ def write_task(
         "task_version": TASK_VERSION,
         **about,
         "counts": counts,
+        "prior_groups": sorted(groups),
         "candidates_sha256": frozen.hexdigest(),
         "files": {QUERIES: record.model_dump()},
         "licence": LICENCE,
@@ -302,9 +307,16 @@ def read_task(folder: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content["schema_version"]
         missing = [name for name in _SAID if name not in content] or [QUERIES][QUERIES in content["files"] :]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        message = f"{path} is damaged ({error!r}): make the queries again"
+        names = [str(content[name]) for name in ("suite", "region") if not missing]
+        if not missing and not isinstance(content["files"][QUERIES]["sha256"], str):
+            missing = [QUERIES]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        text = " ".join(repr(error).split())[:200]
+        message = f"{path} is damaged ({text}): make the queries again"
         raise StoreError(message) from error
+    if any(not _NAME.fullmatch(name) for name in names):
+        message = f"{path} is damaged (suite and region are {names}): make the queries again"
+        raise StoreError(message)
     if found != SCHEMA_VERSION:
         message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: make the queries again"
         raise StoreError(message)
@@ -312,6 +324,23 @@ def read_task(folder: Path) -> dict[str, Any]:
         message = f"{path} is damaged (it does not say {', '.join(missing)}): make the queries again"
         raise StoreError(message)
     return dict(content)
+
+
+def check_ours(folder: Path, names: Sequence[str]) -> None:
+    """Refuse to put a folder in place of one that holds something which is not ours.
+
+    Raises
+    ------
+    StoreError
+        Naming it.
+    """
+    if folder.exists() and not folder.is_dir():
+        message = f"{folder} is a file: move it away, a task goes there"
+        raise StoreError(message)
+    other = next((path for path in sorted(folder.glob("*")) if path.name not in names), None)
+    if other is not None:
+        message = f"{other} is no part of a task and would be lost: move it away"
+        raise StoreError(message)
 
 
 def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
@@ -336,7 +365,8 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     faults += [f"{other.name}: not part of a task" for other in sorted(task_folder.rglob("*")) if other not in known]
     found = file_record(path)
     if found.model_dump() != said:  # what is in it is not worth a look
-        return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {said}", *faults]
+        was = f"{said['bytes']} bytes, {said['sha256']}"
+        return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}", *faults]
     counts: dict[str, int] = {}
     names = []
     for query in read_queries(task_folder):

@@ -170,7 +170,8 @@ class Draft:
 class SuiteCard:
     """What a suite does and why, for people.
 
-    `separates` says what should differ if the mechanism works; `falsifier` which variant must show no gain.
+    `separates` says what should differ if the mechanism works; `falsifier` which variant must show no gain. Where
+    `has_own_priors`, what is known before is what the suite is about, and no other group can be asked for.
     """
 
     name: str
@@ -181,6 +182,7 @@ class SuiteCard:
     falsifier: str
     strength_unit: str
     tracks: tuple[Track, ...] = ("localization",)
+    has_own_priors: bool = False
     group: PriorGroup = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)  # noqa: RUF009 - frozen
     min_density: float = 0.03
 

@@ -45,6 +45,7 @@ SUITE: Final = CleanSuite(
     ),
     variants=(
         *controls(views=VIEW_CELLS),
+        Variant(role="falsifier", kind="no error"),
         *ladder("perception", ERROR_FACTORS, small=SMALL_FACTORS, large=(1.0, 3.0)),
     ),
     change=lambda variant, evidence, rng: evidence,  # noqa: ARG005 - `draw` does it all

@@ -43,6 +43,7 @@ SUITE: Final = NoPriorsSuite(
         separates="Invariant proposals of the graph from searches that enumerate headings and scales.",
         falsifier="With priors given the same views must show no gain of the graph's proposals.",
         strength_unit="1 where nothing is known",
+        has_own_priors=True,
         group=PriorGroup(radius_m=None, yaw="unknown", scale_sigma=SCALE_SIGMA),
     ),
     variants=(

@@ -114,7 +114,7 @@ def test_a_sheet_has_a_row_for_each_query_and_a_column_more_for_vectors(rows, ha
     write_sheet(path, title="Some", panels=[panel(has_vectors=has_vectors)] * rows)
     height, width, _ = cv2.imread(str(path)).shape
     assert width == pytest.approx(100 * (2.6 + 2.1 * (5 if has_vectors else 4)), abs=1)
-    assert height == pytest.approx(100 * (1.0 + 2.2 * rows), abs=1)
+    assert height == pytest.approx(100 * (1.2 + 2.2 * rows), abs=1)
 
 
 def test_a_sheet_shows_a_query_without_a_place_and_is_the_same_each_time(tmp_path):

@@ -118,7 +118,7 @@ def _print_draws(region: str, out: Path, extracts: list[Path], runs: int) -> Non
 def _print_mining(region: str, out: Path, extracts: list[Path]) -> None:
     scene, _ = read_scene(request_for(region, "clean", SITES, out, extracts), find_suite("clean"), lambda _: None)
     start = time.perf_counter()
-    windows = describe(scene.map, side_m=float(VIEW_CELLS))
+    windows = describe(scene.map, side_m=float(VIEW_CELLS), clear_m=scene.view_reach_m)
     places = windows.points_m[:: max(1, len(windows.points_m) // MINED)][:MINED]
     for easting_m, northing_m in places.tolist():
         mine(windows, (easting_m, northing_m), count=200)

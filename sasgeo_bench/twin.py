@@ -292,7 +292,8 @@ def level_crossings(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     table["level"] = np.zeros(len(table), dtype=np.int16)
     table["is_bridge"] = np.zeros(len(table), dtype=bool)
     shapes = table.geometry.to_numpy().copy()
-    roads = np.flatnonzero(table["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy())
+    is_road = table["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    roads = np.flatnonzero(is_road & (shapely.get_dimensions(shapes) == 1))  # a square is a road too, and no line
     tree = shapely.STRtree(shapes[roads])
     first, second = tree.query(shapes[roads], predicate="crosses")
     meeting: dict[int, list[shapely.Geometry]] = {}

@@ -312,3 +312,17 @@ def test_an_edited_table_is_a_feature_table():
     features = gpd.GeoDataFrame(pd.concat([village()], ignore_index=True), geometry="geometry", crs=32632)
     after = paste(features, [Paste(source_m=(0, 0), target_m=(900, 0), radius_m=60.0, change=level_crossings)])
     assert after.dtypes.to_dict() == village().dtypes.to_dict()
+
+
+def test_a_square_that_is_a_road_stays_as_it_is_where_bridges_come_down():
+    import geopandas as gpd  # noqa: PLC0415
+
+    columns = {"class": "road_minor", "level": [0, 1, 0], "is_bridge": [False, True, False]}
+    shapes = [
+        shapely.LineString([(0, 0), (40, 0)]),
+        shapely.LineString([(20, -20), (20, 20)]),
+        shapely.box(10, -5, 30, 5),
+    ]
+    flat = level_crossings(gpd.GeoDataFrame(columns, geometry=shapes, crs=32632))
+    assert flat.geometry.iloc[2].equals(shapes[2])
+    assert len(flat.geometry.iloc[0].coords) == 3

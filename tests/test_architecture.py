@@ -81,7 +81,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "validate": None,
     "scaffold": None,
     "testing": None,
-    "cli": None,
+    "cli": ("console", "regions", "ageing", "queries", "looking", "matchers", "runs", "program"),
 }
 
 # The rooms that touch the disk, and the few calls others may make, each with its reason.

@@ -152,7 +152,7 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
 
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(wheel).namelist())
-    expected = {"sasgeo_bench/py.typed", "sasgeo_bench/taxonomy.toml", "sasgeo_bench/cli.py"}
+    expected = {"sasgeo_bench/py.typed", "sasgeo_bench/taxonomy.toml", "sasgeo_bench/cli/program.py"}
     expected.add("sasgeo_bench/ageing/ratebook.toml")
     for folder in SHIPPED:
         expected |= {f"sasgeo_bench/shipped/{folder}/{path.name}" for path in (ROOT / folder).iterdir()}

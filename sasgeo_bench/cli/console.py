@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all commands share: the two outlets, the common options, and reading what was typed."""
+
+import datetime as dt
+import sys
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.extract.scan import Box
+
+EXIT_USER: Final = 2
+PIPE_WIDTH: Final = 200
+
+errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+
+Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
+RegionFolders = Annotated[list[Path] | None, typer.Option("--regions", help="folder with region files of your own")]
+ExtractFolders = Annotated[
+    list[Path] | None,
+    typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
+]
+
+
+def read_date(text: str | None) -> dt.date | None:
+    """Read the value of --date, None where it was left out."""
+    return read_day(text, flag="--date") if text else None
+
+
+def read_day(text: str, *, flag: str) -> dt.date:
+    """Read a day as in 2021-10-28; a refusal names the flag."""
+    try:
+        return dt.date.fromisoformat(text)
+    except ValueError as error:
+        message = f"{flag} must be a date as in 2021-10-28, got {text!r}"
+        raise ConfigError(message) from error
+
+
+def read_box(text: str | None) -> Box | None:
+    """Read west,south,east,north in degrees, None where it was left out."""
+    if text is None:
+        return None
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError:
+        west, south, east, north = 0.0, 0.0, 0.0, 0.0
+    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees on a sphere
+        message = f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
+        raise ConfigError(message)
+    return (west, south, east, north)
+
+
+def tell(line: str) -> None:
+    """Print one line to stderr."""
+    errors.print(line, markup=False)
+
+
+def print_table(table: Table) -> None:
+    """Print to stdout: as wide as the terminal there, unwrapped into a file or pipe."""
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH, markup=False)
+    with console.capture() as captured:
+        console.print(table)
+    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()) + "\n")

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that look at what was made, and hold it against what it should be."""
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.table import Table
+
+from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, tell
+from sasgeo_bench.duplicates import constellations, search_split
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.region import Manifest
+from sasgeo_bench.split import make_split
+from sasgeo_bench.store.catalog import (
+    find_split_file,
+    list_region_files,
+    list_split_files,
+    read_region_file,
+    read_split_file,
+)
+from sasgeo_bench.store.regiondir import differing_files, read_features, read_manifest
+from sasgeo_bench.store.sheet import write_sheet
+from sasgeo_bench.store.splitmap import write_split_map
+from sasgeo_bench.store.taskdir import TASK, read_task
+from sasgeo_bench.suites.all_suites import SUITES
+from sasgeo_bench.tasks import check_task, has_truths, panels
+
+TOP_DROPS: Final = 12
+
+
+def inspect_command(
+    target: Annotated[str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one")],
+    query: Annotated[str | None, typer.Option(help="of a task: this query alone, by the beginning of its id")] = None,
+    rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12,
+    region_folders: RegionFolders = None,
+    out: Out = Path("out"),
+) -> None:
+    """Say what is in a region, a task or a split; of a task draw a contact sheet, of a split its map."""
+    folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
+    if (folder / TASK).is_file():
+        _inspect_task(folder, out, query=query, rows=rows)
+        return
+    _check_target(target, out)
+    if target.endswith(".toml") or target in list_split_files():
+        _inspect_split(target, out, region_folders or [])
+        return
+    folder = Path(target) if Path(target).is_dir() else out / "regions" / target
+    manifest = read_manifest(folder)
+    print_table(_summary(manifest, folder))
+    print_table(_class_table(manifest))
+    print_table(_reasons(manifest))
+
+
+def _check_target(target: str, out: Path) -> None:
+    """Refuse a task that is not there by naming those that are."""
+    suite, _, region = target.partition("/")
+    if suite not in SUITES or (region and Path(target).is_dir()):
+        return
+    made = sorted(path.parent.name for path in (out / "tasks" / suite).glob(f"*/{TASK}"))
+    near = [name for name in made if name.split("+")[0].split("@")[0] == region.split("+")[0].split("@")[0]] or made
+    there = ", ".join(f"{suite}/{name}" for name in near[:8]) or "none of this suite: make-queries first"
+    message = f"{out / 'tasks'} holds no task {target}; there is {there}"
+    raise ConfigError(message)
+
+
+def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
+    """Print what a task is and draw its contact sheet."""
+    about = read_task(folder)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in about.items():
+        table.add_row(
+            name, ", ".join(f"{key} {item}" for key, item in value.items()) if isinstance(value, dict) else str(value)
+        )
+    print_table(table)
+    truth_folder = out / "truth" / about["suite"] / about["region"]
+    chosen = panels(folder, truth_folder, out=out, count=rows, query_id=query)
+    path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
+    typer.echo(f"contact sheet: {path}")
+
+
+def _inspect_split(target: str, out: Path, folders: list[Path]) -> None:
+    """Print the places of a split and draw their map."""
+    grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
+    split = make_split(read_split_file(find_split_file(target)), grids)
+    typer.echo(split.to_text())
+    path = out / "sheets" / f"split-{split.spec.id}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_split_map(path, split)
+    typer.echo(f"map of parts: {path}")
+
+
+def _summary(manifest: Manifest, folder: Path) -> Table:
+    extract, coverage = manifest.extract, manifest.coverage
+    graph = ", ".join(f"{name} {count}" for name, count in manifest.graph_counts.items())
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row("region", f"{manifest.id}: {manifest.title}")
+    table.add_row("folder", str(folder))
+    table.add_row("scenes", ", ".join(manifest.scenes))
+    table.add_row("extract", f"{extract.file}, as of {extract.date}, SHA-256 {extract.sha256}")
+    table.add_row(
+        "grid", f"{manifest.rows} x {manifest.cols} cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}"
+    )
+    table.add_row("mapped", f"{coverage.share:.1%} of the grid ({coverage.source}); the rest is unknown, not absent")
+    table.add_row("graph", graph)
+    table.add_row("preview", str(folder / "preview.png"))
+    table.add_row("licence", f"{manifest.licence}, {manifest.attribution}")
+    return table
+
+
+def _class_table(manifest: Manifest) -> Table:
+    table = Table("class", "objects", box=None, pad_edge=False)
+    for name, count in manifest.counts.items():
+        table.add_row(name, str(count))
+    return table
+
+
+def _reasons(manifest: Manifest) -> Table:
+    table = Table("in and around the grid", "objects", box=None, pad_edge=False)
+    for title, reasons in (("not visible", manifest.hidden), ("dropped", manifest.drops), ("mended", manifest.notes)):
+        listed = list(reasons.items())
+        for reason, count in listed[:TOP_DROPS]:
+            table.add_row(f"{title}: {reason}", str(count))
+        if len(listed) > TOP_DROPS:
+            rest = sum(count for _, count in listed[TOP_DROPS:])
+            table.add_row(f"{title}: {len(listed) - TOP_DROPS} more reasons (region.json)", str(rest))
+    for warning in manifest.warnings:
+        table.add_row(f"warning: {warning}", "")
+    return table
+
+
+def verify_command(
+    target: Annotated[str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one")],
+    region_folders: RegionFolders = None,
+    out: Out = Path("out"),
+) -> None:
+    """Hold a region or a task against its hashes; search the parts of a split for ground they share."""
+    task_folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
+    if (task_folder / TASK).is_file():
+        with_truths = "every query has its truth" if has_truths(task_folder, out=out) else "its truths are not here"
+        faults, good = check_task(task_folder, out=out), f"all files are as task.json says, and {with_truths}"
+    elif target.endswith(".toml") or target in list_split_files():
+        faults, good = _shared_ground(target, out, region_folders or [])
+    else:
+        folder = Path(target) if Path(target).is_dir() else out / "regions" / target
+        faults, good = differing_files(folder), "all files are as the manifest says"
+    for line in faults:
+        typer.echo(line)
+    if faults:
+        raise typer.Exit(EXIT_USER)
+    typer.echo(f"{target}: {good}")
+
+
+def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[str], str]:
+    """Ground that parts of a split share, and what was searched."""
+    grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
+    split = make_split(read_split_file(find_split_file(target)), grids)
+    built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]
+    missing = [region for region in split.spec.region_ids if region not in built]
+    if missing:
+        tell(f"{len(missing)} regions are not built and not searched: {', '.join(missing)}")
+    if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:  # noqa: PLR2004
+        message = (
+            f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
+        )
+        raise ConfigError(message)
+    maps = {region: constellations(read_features(out / "regions" / region)) for region in built}
+    faults = [
+        f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
+        for item in search_split(split, maps)
+    ]
+    return faults, f"no two parts share ground, {len(built)} regions searched"

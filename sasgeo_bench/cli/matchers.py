@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands for authors of matchers."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from sasgeo_bench.cli.console import EXIT_USER, print_table, tell
+from sasgeo_bench.plugins import list_entry_points
+from sasgeo_bench.scaffold import plugin_files
+from sasgeo_bench.store.pluginfiles import write_plugin
+from sasgeo_bench.testing import check_matcher
+
+
+def list_matchers_command() -> None:
+    """List the matchers that are installed, and where each comes from."""
+    table = Table("matcher", "package", "class", box=None, pad_edge=False)
+    for name, point in list_entry_points().items():
+        table.add_row(name, point.dist.name if point.dist is not None else "", point.value)
+    print_table(table)
+
+
+def new_matcher_command(
+    name: Annotated[str, typer.Argument(help="of the matcher, as in my-matcher")],
+    folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
+) -> None:
+    """Write a plugin package that passes check-matcher at once, for you to put your method into."""
+    files = plugin_files(name)
+    target = folder or Path(name)
+    write_plugin(target, files)
+    typer.echo(f"{target}: {len(files)} files; next: pip install -e {target} && sasgeo-bench check-matcher {name}")
+
+
+def check_matcher_command(
+    matcher: Annotated[str, typer.Argument(help="name from list-matchers, or module:Class")],
+) -> None:
+    """Try a matcher on a tiny town and say, row by row, whether it keeps to what all of them keep to."""
+    table = Table("check", "outcome", "found", box=None, pad_edge=False)
+    failed = 0
+    for check in check_matcher(matcher):
+        failed += check.outcome == "fail"
+        table.add_row(check.name, check.outcome, check.found)
+    print_table(table)
+    if failed:
+        tell(f"{matcher}: {failed} checks failed")
+        raise typer.Exit(EXIT_USER)

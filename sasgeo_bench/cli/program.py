@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program `sasgeo-bench`: parses, calls, prints. Results go to stdout, everything else to stderr."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import typer
+from rich.table import Table
+
+from sasgeo_bench.cli.ageing import compare_ageing_command, measure_ageing_command
+from sasgeo_bench.cli.console import EXIT_USER, ExtractFolders, Out, errors, print_table
+from sasgeo_bench.cli.looking import inspect_command, verify_command
+from sasgeo_bench.cli.matchers import check_matcher_command, list_matchers_command, new_matcher_command
+from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
+from sasgeo_bench.cli.regions import build_region_command, list_regions_command
+from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
+from sasgeo_bench.doctor import examine
+from sasgeo_bench.errors import SasgeoError
+
+EXIT_INTERRUPTED: Final = 130
+
+
+def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:
+    """Say which versions, folders and extracts are found, and what is missing."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, finding in examine(extracts or (), out=out):
+        table.add_row(name, finding)
+    print_table(table)
+
+
+# In the order of the work, as --help shows them.
+COMMANDS: Final[dict[str, Callable[..., None]]] = {
+    "doctor": doctor_command,
+    "list-regions": list_regions_command,
+    "build-region": build_region_command,
+    "measure-ageing": measure_ageing_command,
+    "compare-ageing": compare_ageing_command,
+    "list-suites": list_suites_command,
+    "make-queries": make_queries_command,
+    "inspect": inspect_command,
+    "verify": verify_command,
+    "list-matchers": list_matchers_command,
+    "new-matcher": new_matcher_command,
+    "check-matcher": check_matcher_command,
+    "run": run_command,
+    "merge": merge_command,
+    "validate": validate_command,
+}
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)
+for _name, _command in COMMANDS.items():
+    app.command(_name)(_command)
+
+
+def main() -> None:
+    """Run the program: 0 done, 2 the user's mistake on one line, 1 our bug with a traceback."""
+    try:
+        app()
+    except SasgeoError as error:
+        errors.print(f"sasgeo-bench: {error}", markup=False)
+        sys.exit(EXIT_USER)
+    except SystemExit as leaving:
+        if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word
+            errors.print("sasgeo-bench: interrupted; what was there before is as it was")
+        raise

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that run matchers and check their predictions."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sasgeo_bench.cli.console import EXIT_USER, Out, tell
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.run.runner import RunRequest, plan_run, run
+from sasgeo_bench.run.worker import Limits
+from sasgeo_bench.store.rundir import merge_runs
+from sasgeo_bench.validate import validate
+
+
+def run_command(  # noqa: PLR0913 - a command has as many flags as its users need
+    *,
+    matcher: Annotated[str, typer.Option(help="name from list-matchers, or module:Class")],
+    tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated")],
+    top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25,
+    jobs: Annotated[int, typer.Option(help="processes at once")] = 1,
+    shard: Annotated[str, typer.Option(help="i/n: answer the i-th of n parts of the queries")] = "1/1",
+    limit: Annotated[int | None, typer.Option(help="queries of each task at most")] = None,
+    match_s: Annotated[float, typer.Option(help="seconds for one query")] = Limits().match_s,
+    prepare_s: Annotated[float, typer.Option(help="seconds for one map")] = Limits().prepare_s,
+    memory_mb: Annotated[int, typer.Option(help="MiB for all processes of the matcher")] = Limits().memory_bytes
+    // 2**20,
+    again: Annotated[list[str] | None, typer.Option(help="ask rows of this status again, as in timeout")] = None,
+    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in; run.json says so")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is left to do, and stop")] = False,
+    out: Out = Path("out"),
+) -> None:
+    """Ask a matcher every query of some tasks; goes on where an earlier run was cut off."""
+    request = RunRequest(
+        spec=matcher,
+        tasks=tasks,
+        out=out,
+        top_k=top_k,
+        limits=Limits(match_s=match_s, prepare_s=prepare_s, memory_bytes=memory_mb * 2**20),
+        jobs=jobs,
+        shard=_shard(shard),
+        limit=limit,
+        again=tuple(again or ()),
+        is_shut_in=not trusted,
+    )
+    plan = plan_run(request)
+    if dry_run:
+        typer.echo(plan.to_text())
+        return
+    report = run(plan, tell=tell)
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
+    tell(f"{plan.card.name} {plan.card.version}: {counts}")
+    for folder in report.folders:
+        typer.echo(str(folder))
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and text.isascii()):
+        message = f"--shard must be i/n, as in 1/2, got {text!r}"
+        raise ConfigError(message)
+    return int(index), int(count)
+
+
+def merge_command(
+    *,
+    runs: Annotated[list[Path], typer.Option(help="folder of parts, or file; may be repeated")],
+    into: Annotated[Path, typer.Option(help="predictions file to write")],
+) -> None:
+    """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
+    count = merge_runs(runs, into)
+    typer.echo(f"{into}: {count} predictions")
+
+
+def validate_command(
+    *,
+    predictions: Annotated[Path, typer.Option(help="predictions file, or the folder of a run")],
+    tasks: Annotated[list[Path], typer.Option(help="task folder; may be repeated")],
+) -> None:
+    """List everything in which predictions are not what the tasks ask for."""
+    count = 0
+    for violation in validate(predictions, tasks):
+        typer.echo(violation.to_text())
+        count += 1
+    if count:
+        tell(f"{predictions}: {count} violations")
+        raise typer.Exit(EXIT_USER)
+    typer.echo(f"{predictions}: answers every query of {len(tasks)} tasks, and nothing else")

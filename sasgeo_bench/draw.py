@@ -88,6 +88,7 @@ class Drawer:
         if draft.away_m:
             rng = seeds.rng("away", group.name, job.variant.name)
             prior = away(prior, pose, away_m=draft.away_m, share_of=self._share_of_disc(state), rng=rng)
+            draft = replace(draft, measured=draft.measured | {"away_m": round(_outside_m(prior, pose), 1)})
         decoys = self._mined(state, site, job.variant.side_m)
         places: tuple[Pose, ...] = ()
         right = -1
@@ -148,8 +149,8 @@ class Drawer:
             strength_unit=self.suite.card.strength_unit,
             unknown_share=draft.evidence.unknown_share,
             changed_share=changed,
-            feature_density=site.density,
-            alias_index=decoys.alias_index,
+            feature_density=site.density if draft.density is None else draft.density,
+            alias_index=decoys.alias_index if draft.has_pose and draft.pose is None else None,
             block=site.block,
             scene=",".join(self.scene.scenes),
             measured=draft.measured,
@@ -279,6 +280,12 @@ def away(
     apart_m = radius_m + away_m * rng.uniform(1.0, 1.5, _TURNS)
     centres = [_around(pose, *pair) for pair in zip(apart_m.tolist(), turns.tolist(), strict=True)]
     return replace(prior, center_m=min(centres, key=lambda center: abs(share_of(center, radius_m) - before)))
+
+
+def _outside_m(prior: Prior, pose: Pose) -> float:
+    """How far a pose lies outside of a prior's disc."""
+    center_m = prior.center_m or (pose.easting_m, pose.northing_m)
+    return math.hypot(pose.easting_m - center_m[0], pose.northing_m - center_m[1]) - (prior.radius_m or 0.0)
 
 
 def _around(pose: Pose, apart_m: float, turn: float) -> tuple[float, float]:

@@ -149,9 +149,11 @@ class Truth:
         Step of the suite's ladder, in `strength_unit`; 0 for controls.
     strength_unit : str
         Unit of the strength.
-    unknown_share, changed_share, feature_density, alias_index : float
+    unknown_share, changed_share, feature_density : float
         Share of unknown cells; share of known cells that differ from the map at the truth; share of cells with a road,
-        building or other drawn thing on the map; likeness of the most similar other place, 0..1.
+        building or other drawn thing on the map of the place that is seen.
+    alias_index : float, optional
+        Likeness of the most similar other place, 0..1; None where the view was not taken at the site.
     block : str
         Evaluation block of the centre; resampling is by block.
     scene : str
@@ -172,7 +174,7 @@ class Truth:
     unknown_share: float
     changed_share: float
     feature_density: float
-    alias_index: float
+    alias_index: float | None
     block: str
     scene: str
     measured: dict[str, float] = field(default_factory=dict)

@@ -118,15 +118,15 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         message = f"split {request.split.spec.id!r} does not speak of region {request.region.id!r}"
         raise ConfigError(message)
     state = State.of(base)
+    needs = suite.card.needs
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
-    if suite.card.name == "real-age":
-        dates = aged_dates(request.region)
+    if "older maps" in needs:
         others = tuple(
             State.of(_built(request, request.region, date, tell), name=f"{request.region.id}@{date.isoformat()}")
-            for date in dates
+            for date in aged_dates(request.region)
         )
-    if suite.card.name == "absent" and request.elsewhere is not None:
+    if "another region" in needs and request.elsewhere is not None:
         elsewhere = State.of(_built(request, request.elsewhere, None, tell))
     scene = Scene(
         map=state,
@@ -136,7 +136,7 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         scenes=base.manifest.scenes,
         others=others,
         elsewhere=elsewhere,
-        ageing=_ageing(request.region) if suite.card.name == "synthetic-age" else None,
+        ageing=_ageing(request.region) if "rates of ageing" in needs else None,
     )
     return scene, base
 

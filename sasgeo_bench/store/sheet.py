@@ -152,6 +152,7 @@ def _draw_vectors(chart: Axes, query: Query) -> None:
 def _words(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
+    alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
     measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items())
     return (
         f"{truth.role}: {truth.kind}",
@@ -160,7 +161,7 @@ def _words(panel: Panel) -> tuple[str, ...]:
         f"priors {query.prior_group}; {len(query.candidates)} candidates"
         + (f", {len(query.vectors)} vectors" if query.vectors is not None else ""),
         "present" if truth.is_present else "ABSENT",
-        f"unknown {truth.unknown_share:.2f}, changed {truth.changed_share:.2f}, alias {truth.alias_index:.2f}",
+        f"unknown {truth.unknown_share:.2f}, changed {truth.changed_share:.2f}{alias}",
         f"measured: {measured}" if measured else "",
         f"{truth.block}, {query.query_id[:8]}",
     )

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import Evidence
-from sasgeo_bench.pose import Pose
 from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, SuiteCard, Variant, controls, perceived
 
 PATCH_CELLS: Final = 24
@@ -32,9 +31,7 @@ class AbsentSuite(Suite):
         seen = perceived(scene.world, site, variant, seeds)
         if variant.kind == "outside":
             # The disc that is searched lies so far off that the view's footprint is beyond it.
-            return Draft(
-                evidence=seen, is_present=False, away_m=2 * variant.side_m, measured={"away_m": 2 * variant.side_m}
-            )
+            return Draft(evidence=seen, is_present=False, away_m=2 * variant.side_m)
         if variant.kind == "feature-poor":
             return _feature_poor(scene, site, variant, seeds)
         if variant.kind == "wrong place" and scene.elsewhere is not None:
@@ -43,6 +40,7 @@ class AbsentSuite(Suite):
                 evidence=perceived(scene.elsewhere, other, variant, seeds),
                 is_present=False,
                 has_pose=False,
+                density=other.density,
                 measured={"density": other.density},
             )
         if variant.kind == "corrupted view":
@@ -59,13 +57,17 @@ def _feature_poor(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> D
     """
     poor = _poor_place(scene, site, variant, seeds)
     if poor is not None:
-        there = replace(site, pose=poor)
-        return Draft(evidence=perceived(scene.world, there, variant, seeds), pose=poor, measured={"is_real_place": 1.0})
+        return Draft(
+            evidence=perceived(scene.world, replace(site, pose=poor.pose), variant, seeds),
+            pose=poor.pose,
+            density=poor.density,
+            measured={"is_real_place": 1.0},
+        )
     seen = perceived(scene.world, site, variant, seeds)
-    return Draft(evidence=strip(seen), measured={"is_real_place": 0.0})
+    return Draft(evidence=strip(seen), density=0.0, measured={"is_real_place": 0.0})
 
 
-def _poor_place(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Pose | None:
+def _poor_place(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Site | None:
     """A place in the site's block whose square is mapped and holds hardly anything drawn."""
     block = next(item for item in scene.blocks if item.id == site.block)
     west, south, east, north = block.bounds_m
@@ -73,8 +75,12 @@ def _poor_place(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Pos
     half = round(variant.side_m / 2 / state.grid.cell_size_m)
     for _ in range(_TRIES):
         point = rng.uniform((west, south), (east, north))
-        if state.is_mapped(point, scene.view_reach_m) and _density(state, point, half) <= _MOST_DRAWN:
-            return replace(site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
+        if not state.is_mapped(point, scene.view_reach_m):
+            continue
+        density = _density(state, point, half)
+        if density <= _MOST_DRAWN:
+            pose = replace(site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
+            return replace(site, pose=pose, density=density)
     return None
 
 
@@ -137,6 +143,7 @@ SUITE: Final = AbsentSuite(
         separates="Rejection: a matcher that answers here makes a false fix.",
         falsifier="The control of each site is present and must not be withheld more often than elsewhere.",
         strength_unit="1 where it cannot be found",
+        needs=("another region",),
     ),
     variants=(
         *controls(),

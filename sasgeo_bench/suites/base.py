@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from typing import Final, Literal
 
 import geopandas as gpd
 import numpy as np
@@ -27,6 +27,7 @@ from sasgeo_bench.twin import Paste
 
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
+Need = Literal["older maps", "another region", "rates of ageing"]
 DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 
 
@@ -148,7 +149,8 @@ class Draft:
     `vectors` lie in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
     where it was not taken in this map. For retrieval, `is_removed` leaves the true place out of the candidates,
     `neighbours_m` puts a cluster of places in place of each, and `has_twins` says whether the site's twins are among
-    them. `away_m` puts the searched disc so far from the truth that it lies outside. `group` overrides the prior group.
+    them. `away_m` puts the searched disc at least so far from the truth that it lies outside. `group` overrides the prior
+    group. `density` is that of the place that is seen, where that is not the site.
     """
 
     evidence: Evidence
@@ -161,6 +163,7 @@ class Draft:
     has_twins: bool = True
     away_m: float = 0.0
     group: PriorGroup | None = None
+    density: float | None = None
     season: str = ""
     changed_share: float | None = None
     measured: dict[str, float] = field(default_factory=dict)
@@ -171,7 +174,8 @@ class SuiteCard:
     """What a suite does and why, for people.
 
     `separates` says what should differ if the mechanism works; `falsifier` which variant must show no gain. Where
-    `has_own_priors`, what is known before is what the suite is about, and no other group can be asked for.
+    `has_own_priors`, what is known before is what the suite is about, and no other group can be asked for. `needs` is
+    what its scene must hold beside a map.
     """
 
     name: str
@@ -182,6 +186,7 @@ class SuiteCard:
     falsifier: str
     strength_unit: str
     tracks: tuple[Track, ...] = ("localization",)
+    needs: tuple[Need, ...] = ()
     has_own_priors: bool = False
     group: PriorGroup = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)  # noqa: RUF009 - frozen
     min_density: float = 0.03
@@ -197,7 +202,6 @@ class Edit:
     """
 
     sites: tuple[Site, ...]
-
     map_pastes: tuple[Paste, ...]
     world_pastes: tuple[Paste, ...] | None
     twins: dict[int, tuple[tuple[float, float], ...]]

@@ -89,6 +89,7 @@ SUITE: Final = RealAgeSuite(
         separates="Stability from uniform weights: stable classes should carry what volatile ones lost.",
         falsifier="The same views against the map of the same day.",
         strength_unit="years between map and world",
+        needs=("older maps",),
     ),
     variants=(*controls(views=(96, 192, 384)), *ladder("S1", AGES_YEARS, small=AGES_YEARS, large=(10.0,))),
 )

@@ -108,6 +108,7 @@ SUITE: Final = SyntheticAgeSuite(
         separates="Stability from uniform weights where no second date is there; to be read beside real-age.",
         falsifier="No year has passed: scores as in the control.",
         strength_unit="years between map and world",
+        needs=("rates of ageing",),
     ),
     variants=(
         *controls(views=VIEW_CELLS),

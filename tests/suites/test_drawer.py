@@ -212,6 +212,28 @@ def test_the_disc_of_a_view_outside_is_on_the_map_and_far_from_the_view(drawn):
         assert 2 * 192 - 0.2 <= off_m - 500 <= 3 * 192 + 0.2
 
 
+def test_a_truth_says_how_far_outside_of_the_disc_its_view_lies(drawn):
+    _, _, drafts = drawn("absent")
+    outside = [(query.prior, truth) for query, truth in drafts if truth.kind == "outside"]
+    assert outside
+    for prior, truth in outside:
+        off_m = np.hypot(prior.center_m[0] - truth.pose.easting_m, prior.center_m[1] - truth.pose.northing_m)
+        assert truth.measured["away_m"] == pytest.approx(off_m - 500, abs=0.1)
+
+
+def test_density_is_of_the_place_that_is_seen_and_likeness_of_the_site_alone(drawn):
+    made, _, drafts = drawn("absent")
+    for pair in by_site(drafts):
+        told = {truth.kind: truth for _, truth in pair}
+        site = told["control"].feature_density
+        assert told["feature-poor"].feature_density <= 0.003 < site
+        assert told["wrong place"].feature_density == told["wrong place"].measured["density"] != site
+        assert {told[kind].feature_density for kind in ("outside", "corrupted view")} == {site}
+        at_site = {kind for kind, truth in told.items() if truth.alias_index is not None}
+        moved = told["feature-poor"].measured["is_real_place"] == 1
+        assert at_site == set(told) - {"wrong place"} - ({"feature-poor"} if moved else set())
+
+
 def test_a_disc_counts_as_much_as_of_it_is_mapped(drawn):
     made, drawer, _ = drawn("absent")
     share_of = drawer._share_of_disc(made.scene.map)

@@ -16,7 +16,6 @@ from sasgeo_bench.pose import Pose, inverse
 ABSENT: Final = 0
 PRESENT: Final = 1
 UNKNOWN: Final = 2
-CERTAIN: Final = 255  # confidence is stored in steps of 1/255
 
 _STATES: Final = 3
 _MOST_CLASSES: Final = 31
@@ -40,7 +39,7 @@ class Evidence:
     cell_size_m : float
         Metres on the ground a side of a cell, for scale 1.
     confidence : ndarray of uint8, shape (C, rows, cols), optional
-        0..CERTAIN for how sure perception is of each cell.
+        0..255 for how sure perception is of each cell.
 
     Raises
     ------

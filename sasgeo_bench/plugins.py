@@ -79,6 +79,7 @@ def _load(spec: str, group: str, kind: str) -> Callable[[], Any]:
     target = _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
 
     def make() -> Any:  # noqa: ANN401 - whatever the plugin is
+        """Make one, telling in a line what went wrong."""
         try:
             return target()
         except Exception as error:

@@ -345,6 +345,7 @@ class Search:
         near = Disc(center_m=(mode.pose.easting_m, mode.pose.northing_m), radius_m=_MARGIN_M)
 
         def score_of(pose: Pose) -> float:
+            """Score a pose of the mode's neighbourhood; NOWHERE beyond it."""
             if not (low <= pose.scale <= high and near.has(pose) and disc.has(pose)):
                 return NOWHERE
             return patch.score(level.samples, pose, least_overlap=self.plan.least_overlap)

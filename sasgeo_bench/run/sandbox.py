@@ -10,7 +10,6 @@ import errno
 import os
 import resource
 import signal
-import socket
 import struct
 import sys
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,6 @@ CLONE_NEWPID: Final = 0x20000000
 CLONE_NEWNET: Final = 0x40000000
 MS_REC_PRIVATE: Final = 0x4000 | 0x40000
 PR_SET_PDEATHSIG: Final = 1
-PR_SET_DUMPABLE: Final = 4
 PR_SET_NO_NEW_PRIVS: Final = 38
 _BY_SIGNAL: Final = 128  # an exit status beyond this says which signal, as shells have it
 LANDLOCK_CREATE: Final = 444
@@ -308,13 +306,3 @@ def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
     yield real, LIST_RIGHT
     for name in names:
         yield from around(f"{real.rstrip('/')}/{name}", hidden)
-
-
-def has_network() -> bool:
-    """Whether a socket can be bound outside of the process's own host; for tests and `doctor`."""
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect(("192.0.2.1", 9))  # an address for documents; nothing is sent
-    except OSError:
-        return False
-    return True

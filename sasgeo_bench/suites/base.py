@@ -149,8 +149,8 @@ class Draft:
     `vectors` lie in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
     where it was not taken in this map. For retrieval, `is_removed` leaves the true place out of the candidates,
     `neighbours_m` puts a cluster of places in place of each, and `has_twins` says whether the site's twins are among
-    them. `away_m` puts the searched disc at least so far from the truth that it lies outside. `group` overrides the prior
-    group. `density` is that of the place that is seen, where that is not the site.
+    them. `away_m` puts the searched disc at least so far from the truth that it lies outside. `group` overrides the
+    prior group. `density` is that of the place that is seen, where that is not the site.
     """
 
     evidence: Evidence
@@ -291,9 +291,6 @@ class Seeds:
     def under(self, *names: object) -> "Seeds":
         """Seeds of something within."""
         return Seeds(root=self.root, names=(*self.names, *map(str, names)))
-
-
-BASE_PERCEPTION: Final = Perception(error_factor=1.0)
 
 
 def perceived(

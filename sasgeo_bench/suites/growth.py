@@ -69,8 +69,8 @@ SUITE: Final = GrowthSuite(
         name="growth",
         version=1,
         title="Growth (S3)",
-        what="For each building on the map 0.5 to 4 others have appeared nearby, on free ground; all is seen with twice "
-        "the detector's error.",
+        what="For each building on the map 0.5 to 4 others have appeared nearby, on free ground; all is seen with "
+        "twice the detector's error.",
         separates="Matchers that weigh what is seen and not mapped by its class from those that punish it alike.",
         falsifier="Nothing has appeared: scores as in the control.",
         strength_unit="new buildings for each on the map",

@@ -14,7 +14,6 @@ from sasgeo_bench.twin import Change, split_long
 
 HOUSE_M: Final = 7.0
 LEAST_AREA_M2: Final = 160.0
-LEAST_SIDE_M: Final = 14.0
 _NEAR_M: Final = 70.0
 _LEAST_HALLS: Final = 2
 

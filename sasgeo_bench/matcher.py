@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The doors: what a matcher and a rejector are, what they say of themselves, and what they answer."""
+"""The door: what a matcher is, what it says of itself, and what it answers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -70,16 +70,8 @@ class MatcherCard:
 
     def __post_init__(self) -> None:
         """Refuse a card that does not say what a reader of the board needs."""
-        for name in ("name", "version", "title", "source", "ours", "licence"):
-            value = getattr(self, name)
-            if not isinstance(value, str) or not value.strip():
-                message = f"card: {name} is empty, say it in one line"
-                raise MatchError(message)
-        if not all(
-            letter.isascii() and (letter.islower() or letter.isdigit() or letter in "-_") for letter in self.name
-        ):
-            message = f"card: name {self.name!r} may hold lower-case letters, digits, hyphens and underscores only"
-            raise MatchError(message)
+        check_said(self)
+        check_name(self.name)
         for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
             wrong = next((item for item in getattr(self, name) if item not in known), None)
             if wrong is not None:
@@ -88,6 +80,22 @@ class MatcherCard:
         if not self.tracks:
             message = "card: tracks is empty, name retrieval, localization or both"
             raise MatchError(message)
+
+
+def check_said(card: object) -> None:
+    """Refuse a card on which one of the fields that every card has says nothing."""
+    for name in ("name", "version", "title", "source", "ours", "licence"):
+        value = getattr(card, name)
+        if not isinstance(value, str) or not value.strip():
+            message = f"card: {name} is empty, say it in one line"
+            raise MatchError(message)
+
+
+def check_name(name: str) -> None:
+    """Refuse a name that could not be a folder's or a flag's."""
+    if not all(letter.isascii() and (letter.islower() or letter.isdigit() or letter in "-_") for letter in name):
+        message = f"card: name {name!r} may hold lower-case letters, digits, hyphens and underscores only"
+        raise MatchError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -263,6 +271,6 @@ def lacks(card: MatcherCard, query: Query) -> str | None:
         "scale": True,
         "vectors": query.vectors is not None,
         "image": False,
-        "training": True,
+        "training": False,
     }
     return next((f"no {need}" for need in card.needs if not has[need]), None)

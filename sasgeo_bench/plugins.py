@@ -4,17 +4,19 @@
 import difflib
 import importlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import Matcher, MatcherCard
+from sasgeo_bench.rejector import Rejector, RejectorCard
 from sasgeo_bench.results import one_line
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 BUILT_IN: Final = "sasgeo-baselines"  # the distribution whose names win
+ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
@@ -23,12 +25,15 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     Warns
     -----
     UserWarning
-        Where a name stands twice.
+        Where a name stands twice, or is that of the runner's own control.
     """
     found: dict[str, EntryPoint] = {}
     points = sorted(entry_points(group=group), key=lambda point: (_home(point) != BUILT_IN, _home(point), point.value))
     for point in points:
-        if point.name not in found:
+        if group == MATCHERS and point.name == ORACLE:
+            message = f"{_home(point)} ({point.value}) is not used: {ORACLE!r} is the name of a control of the runner"
+            warnings.warn(message, stacklevel=2)
+        elif point.name not in found:
             found[point.name] = point
         elif found[point.name].value != point.value:
             kept, lost = _home(found[point.name]), _home(point)
@@ -61,17 +66,40 @@ def load_matcher(spec: str) -> Matcher:
         ...
     sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list-matchers shows all; or module:Class)
     """
-    matcher = _load(spec, MATCHERS, "matcher")()
-    card = getattr(matcher, "card", None)
-    if not isinstance(card, MatcherCard):
-        message = f"{spec}: card is a {type(card).__name__}, expected a sasgeo_bench.matcher.MatcherCard"
+    matcher: Matcher = _load(spec, MATCHERS, "matcher")()
+    _check(spec, matcher, MatcherCard, "matcher", ("prepare", "match"))
+    return matcher
+
+
+def load_rejector(spec: str) -> Rejector:
+    """Import a rejector and make one.
+
+    Parameters
+    ----------
+    spec : str
+        A name, or "module:Class".
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name, it cannot be imported or made, is not a rejector, or has no sound card.
+    """
+    rejector: Rejector = _load(spec, REJECTORS, "rejector")()
+    _check(spec, rejector, RejectorCard, "rejector", ("fit", "p_false"))
+    return rejector
+
+
+def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequence[str]) -> None:
+    """Refuse what has not the card and the verbs of its kind."""
+    card = getattr(plugin, "card", None)
+    if not isinstance(card, card_type):
+        expected = f"{card_type.__module__}.{card_type.__name__}"
+        message = f"{spec}: card is a {type(card).__name__}, expected a {expected}"
         raise MatchError(message)
-    missing = [name for name in ("prepare", "match") if not callable(getattr(matcher, name, None))]
+    missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
     if missing:
-        message = f"{spec}: {type(matcher).__name__} is not a matcher, it has no {' and no '.join(missing)}"
+        message = f"{spec}: {type(plugin).__name__} is not a {kind}, it has no {' and no '.join(missing)}"
         raise MatchError(message)
-    found: Matcher = matcher
-    return found
 
 
 def _load(spec: str, group: str, kind: str) -> Callable[[], Any]:

@@ -63,6 +63,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "matcher": None,
     "results": None,
+    "rejector": None,
     "store": (
         *("layerfile", "regiondir", "taskdir", "rundir", "pluginfiles"),
         *("preview", "sheet", "splitmap", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
@@ -74,7 +75,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "doctor": None,
     "sasgeo": ("weights", "raster", "graph", "temporal", "joint", "integrity"),
     "plugins": None,
-    "run": ("sandbox", "wire", "serve", "child", "worker", "runner"),
+    "run": ("sandbox", "wire", "serve", "child", "worker", "oracle", "plan", "answers", "cluster", "runner"),
     "metrics": ("ranking", "pose", "integrity", "sequence", "cost", "intervals", "compare"),
     "report": ("tables", "plots", "site"),
     "pipeline": None,

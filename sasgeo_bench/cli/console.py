@@ -4,10 +4,12 @@
 import datetime as dt
 import sys
 from pathlib import Path
-from typing import Annotated, Final
+from types import TracebackType
+from typing import Annotated, Final, Self
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from sasgeo_bench.errors import ConfigError
@@ -57,6 +59,43 @@ def read_box(text: str | None) -> Box | None:
 def tell(line: str) -> None:
     """Print one line to stderr."""
     errors.print(line, markup=False)
+
+
+class Bars:
+    """Progress of a run as a bar for each task; for a terminal."""
+
+    def __init__(self) -> None:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+        )
+        self._bars = Progress(*columns, console=errors)
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Self:
+        """Show the bars from here on."""
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave them as they are."""
+        self._bars.stop()
+
+    def begin(self, label: str, total: int) -> None:
+        """Add a bar."""
+        self._tasks[label] = self._bars.add_task("/".join(label.split("/")[-2:]), total=total, rate="")
+
+    def advance(self, label: str, count: int) -> None:
+        """Move a bar on."""
+        task = self._tasks[label]
+        self._bars.advance(task, count)
+        speed = self._bars.tasks[self._bars.task_ids.index(task)].speed
+        self._bars.update(task, rate="" if speed is None else f"{speed:.1f}/s")
 
 
 def print_table(table: Table) -> None:

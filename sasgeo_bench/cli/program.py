@@ -12,7 +12,12 @@ from rich.table import Table
 from sasgeo_bench.cli.ageing import compare_ageing_command, measure_ageing_command
 from sasgeo_bench.cli.console import EXIT_USER, ExtractFolders, Out, errors, print_table
 from sasgeo_bench.cli.looking import inspect_command, verify_command
-from sasgeo_bench.cli.matchers import check_matcher_command, list_matchers_command, new_matcher_command
+from sasgeo_bench.cli.matchers import (
+    check_matcher_command,
+    list_matchers_command,
+    list_rejectors_command,
+    new_matcher_command,
+)
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
 from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
@@ -42,6 +47,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "inspect": inspect_command,
     "verify": verify_command,
     "list-matchers": list_matchers_command,
+    "list-rejectors": list_rejectors_command,
     "new-matcher": new_matcher_command,
     "check-matcher": check_matcher_command,
     "run": run_command,

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that run matchers and check their predictions."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import EXIT_USER, Out, tell
+from sasgeo_bench.cli.console import EXIT_USER, Bars, Out, tell
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.run.runner import RunRequest, plan_run, run
+from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store.rundir import merge_runs
 from sasgeo_bench.validate import validate
@@ -20,6 +22,9 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated")],
     top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25,
     jobs: Annotated[int, typer.Option(help="processes at once")] = 1,
+    dask: Annotated[
+        str | None, typer.Option(help="address of a dask scheduler, or local:N for N processes of this machine")
+    ] = None,
     shard: Annotated[str, typer.Option(help="i/n: answer the i-th of n parts of the queries")] = "1/1",
     limit: Annotated[int | None, typer.Option(help="queries of each task at most")] = None,
     match_s: Annotated[float, typer.Option(help="seconds for one query")] = Limits().match_s,
@@ -39,6 +44,7 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
         top_k=top_k,
         limits=Limits(match_s=match_s, prepare_s=prepare_s, memory_bytes=memory_mb * 2**20),
         jobs=jobs,
+        dask=dask,
         shard=_shard(shard),
         limit=limit,
         again=tuple(again or ()),
@@ -48,7 +54,11 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     if dry_run:
         typer.echo(plan.to_text())
         return
-    report = run(plan, tell=tell)
+    if sys.stderr.isatty():
+        with Bars() as bars:
+            report = run(plan, tell=tell, progress=bars)
+    else:
+        report = run(plan, tell=tell)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
     tell(f"{plan.card.name} {plan.card.version}: {counts}")
     for folder in report.folders:

@@ -1,186 +1,65 @@
 # SPDX-License-Identifier: Apache-2.0
 """A matcher over tasks: whatever happens, a row for every query, and a run that goes on where it was cut off."""
 
-import hashlib
-import json
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.matcher import MatcherCard, check_match, lacks
-from sasgeo_bench.query import Query
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.results import STATUSES, Prediction, matcher_hash, one_line
-from sasgeo_bench.run.worker import Limits, Reach, Reply, Worker
+from sasgeo_bench.run.answers import Cost, answer, pool_costs
+from sasgeo_bench.run.cluster import answer_on, connected
+from sasgeo_bench.run.plan import RunPart, RunPlan
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.regiondir import locked, read_manifest
+from sasgeo_bench.store.regiondir import locked
 
-PART_ROWS: Final = 64
-PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
 TOLD_S: Final = 10.0
-_MOST_S: Final = 7 * 86_400.0
-_LEAST_BYTES, _MOST_BYTES = 64 * 2**20, 2**42
 
 Tell = Callable[[str], None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunRequest:
-    """What is asked for.
+class Progress(Protocol):
+    """Whoever shows how far a run is."""
 
-    Parameters
-    ----------
-    spec : str
-        A matcher's name, or module:Class.
-    tasks : sequence of Path
-        Task folders, out/tasks/<suite>/<region>.
-    out : Path
-        Root; rows go to out/runs/<matcher>/<hash>/<suite>/<region>.
-    top_k : int
-        Poses asked of each query.
-    limits : Limits
-        What the matcher may take.
-    jobs : int
-        Processes at once.
-    shard : tuple of int
-        (i, n), from 1: this run answers the i-th of n parts of the queries.
-    limit : int, optional
-        Queries of each task at most.
-    again : sequence of str
-        Statuses whose rows are asked again.
-    is_shut_in : bool
-        False runs code that is trusted without isolation, and says so.
+    def begin(self, label: str, total: int) -> None:
+        """Begin a task of so many queries."""
+        ...
+
+    def advance(self, label: str, count: int) -> None:
+        """Take note that so many more have a row."""
+        ...
+
+
+class Lines:
+    """Progress as a line every ten seconds.
+
+    Examples
+    --------
+    >>> Lines(print, every_s=0.0).begin("clean/vaduz", 2)
     """
 
-    spec: str
-    tasks: Sequence[Path]
-    out: Path
-    top_k: int = 25
-    limits: Limits = field(default_factory=Limits)
-    jobs: int = 1
-    shard: tuple[int, int] = (1, 1)
-    limit: int | None = None
-    again: Sequence[str] = ()
-    is_shut_in: bool = True
+    def __init__(self, tell: Tell, *, every_s: float = TOLD_S) -> None:
+        self._tell, self._every_s = tell, every_s
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._done: dict[str, int] = {}
+        self._told = time.monotonic()
 
+    def begin(self, label: str, total: int) -> None:
+        """Begin a task."""
+        self._begun[label], self._done[label] = (time.monotonic(), total), 0
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunPart:
-    """One task of a run: its folder of rows, and the queries that are left to ask."""
-
-    task: Path
-    folder: Path
-    region: Path
-    left: tuple[str, ...]
-    done: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunPlan:
-    """What a run will do, after the plugin's card was read in a process of its own."""
-
-    request: RunRequest
-    card: MatcherCard
-    hash: str
-    isolation: dict[str, str]
-    parts: tuple[RunPart, ...]
-
-    def to_text(self) -> str:
-        """A line for each task."""
-        lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
-        lines += [f"  {part.folder}: {len(part.left)} queries left, {part.done} done" for part in self.parts]
-        return "\n".join(lines)
-
-
-def plan_run(request: RunRequest) -> RunPlan:
-    """Read the card and the tasks, and find out what is left to do.
-
-    Raises
-    ------
-    MatchError
-        If the plugin cannot be loaded or its card is not sound.
-    ConfigError
-        If the shard or a number makes no sense.
-    StoreError
-        If a task is missing, of another version, or its map is.
-    """
-    index, count = request.shard
-    if not 1 <= index <= count:
-        message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
-        raise ConfigError(message)
-    limits = request.limits
-    numbers = (("--jobs", request.jobs), ("--top-k", request.top_k), ("--limit", request.limit))
-    for name, value in numbers:
-        if value is not None and value < 1:
-            message = f"{name} must be at least 1, got {value}"
-            raise ConfigError(message)
-    for name, seconds in (("--match-s", limits.match_s), ("--prepare-s", limits.prepare_s)):
-        if not 0 < seconds <= _MOST_S:
-            message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
-            raise ConfigError(message)
-    if not _LEAST_BYTES <= limits.memory_bytes <= _MOST_BYTES:
-        allowed = f"between {_LEAST_BYTES >> 20} and {_MOST_BYTES >> 20}"
-        message = f"--memory-mb must lie {allowed}, got {limits.memory_bytes >> 20}"
-        raise ConfigError(message)
-    strange = next((status for status in request.again if status not in STATUSES), None)
-    if strange is not None:
-        message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"
-        raise ConfigError(message)
-    tasks = [_task(folder) for folder in request.tasks]
-    with Worker(spec=request.spec, reach=_reach(request, None), limits=request.limits) as worker:
-        reply = worker.load()
-        if reply.status != "ok" or reply.card is None:
-            raise MatchError(reply.message or f"{request.spec}: the plugin says nothing of itself")
-        card, code, isolation = reply.card, reply.code, dict(worker.isolation)
-    settings = json.dumps({"top_k": request.top_k, "limits": asdict(limits)}, sort_keys=True)
-    found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    parts = tuple(_part(request, card, found, *task) for task in tasks)
-    return RunPlan(request=request, card=card, hash=found, isolation=isolation, parts=parts)
-
-
-def _task(folder: Path) -> tuple[Path, dict[str, Any]]:
-    about = taskdir.read_task(folder)
-    return folder, about
-
-
-def _reach(request: RunRequest, region: Path | None) -> Reach:
-    """The map may be read; truths, and whatever other runs wrote, may not."""
-    roots = {folder.resolve().parent.parent.parent for folder in request.tasks} | {request.out.resolve()}
-    hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards")]
-    readable = [] if region is None else [region.resolve()]
-    return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
-
-
-def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about: dict[str, Any]) -> RunPart:
-    folder = request.out / "runs" / card.name / found / about["suite"] / about["region"]
-    before = rundir.read_run(folder)
-    now = about["files"][taskdir.QUERIES]["sha256"]
-    if before is not None and before.get("queries_sha256") != now:
-        message = (
-            f"{folder} holds answers to other queries than {task} does now: move it away, or make the old queries again"
-        )
-        raise StoreError(message)
-    region = task.resolve().parent.parent.parent / "regions" / about["region"]
-    if read_manifest(region).fingerprint != about["map_fingerprint"]:
-        message = f"{region} was built anew since the queries of {task} were made: make them again"
-        raise StoreError(message)
-    ids = taskdir.read_ids(task)
-    index, count = request.shard
-    mine = [name for name in ids if _shard_of(name, count) == index - 1]
-    mine = mine if request.limit is None else mine[: request.limit]
-    done = rundir.ids_done(folder, again=request.again) if folder.is_dir() else set()
-    left = tuple(name for name in mine if name not in done)
-    return RunPart(task=task, folder=folder, region=region, left=left, done=len(mine) - len(left))
-
-
-def _shard_of(query_id: str, count: int) -> int:
-    """Which of `count` parts a query belongs to; it depends on the id alone."""
-    return int.from_bytes(hashlib.sha256(query_id.encode()).digest()[:8], "big") % count
+    def advance(self, label: str, count: int) -> None:
+        """Say how far it is, how fast, and how long it will take, if the last line is old enough."""
+        now, (begun, total) = time.monotonic(), self._begun[label]
+        self._done[label] += count
+        if now - self._told < self._every_s:
+            return
+        self._told = now
+        done = self._done[label]
+        rate = done / max(now - begun, 1e-9)
+        self._tell(f"{label}: {done} of {total}, {rate:.1f} a second, {(total - done) / rate:.0f} s left")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,7 +70,7 @@ class RunReport:
     folders: tuple[Path, ...]
 
 
-def run(plan: RunPlan, *, tell: Tell) -> RunReport:
+def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunReport:
     """Ask everything that is left.
 
     Parameters
@@ -200,46 +79,83 @@ def run(plan: RunPlan, *, tell: Tell) -> RunReport:
         From `plan_run`.
     tell : callable
         Gets a line now and then.
+    progress : Progress, optional
+        Is told of every row; lines by `tell` unless given.
 
     Returns
     -------
     RunReport
         What was added.
+
+    Raises
+    ------
+    StoreError
+        If rows cannot be written; those that were stay, and a second run goes on there.
+    ConfigError
+        If a cluster was named that is not there.
     """
-    counts: dict[str, int] = {}
+    progress = progress or Lines(tell)
     for part in plan.parts:
         if not part.left:
             tell(f"{part.folder}: nothing left, {part.done} done")
-            continue
-        with locked(part.folder, tell=tell):
-            _run_part(plan, part, counts, tell)
-    return RunReport(counts=counts, folders=tuple(part.folder for part in plan.parts))
+    parts = [part for part in plan.parts if part.left]
+    costs: list[Cost] = []
+    if plan.request.dask is not None and parts:
+        costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
+    else:
+        costs += [_run_here(plan, part, tell, progress) for part in parts]
+    return RunReport(counts=pool_costs(costs).counts, folders=tuple(part.folder for part in plan.parts))
 
 
-def _run_part(plan: RunPlan, part: RunPart, counts: dict[str, int], tell: Tell) -> None:
-    """Ask the queries of one task, by as many processes as are wanted."""
-    writer = _Writer(part.folder, total=len(part.left), tell=tell)
-    questions = _Questions(part.task, part.left)
-    jobs = min(plan.request.jobs, len(part.left))
-    workers = [
-        Worker(spec=plan.request.spec, reach=_reach(plan.request, part.region), limits=plan.request.limits)
-        for _ in range(jobs)
-    ]
-    _say(plan, part, workers, {})
-    try:
-        with ThreadPoolExecutor(max_workers=jobs) as pool:
-            costs = list(pool.map(lambda worker: _ask_all(plan, part, worker, questions, writer), workers))
-    finally:
-        questions.stop()
-        writer.flush()
-    _say(plan, part, workers, costs[0])
-    for status, count in writer.counts.items():
-        counts[status] = counts.get(status, 0) + count
+def _run_here(plan: RunPlan, part: RunPart, tell: Tell, progress: Progress) -> Cost:
+    """Ask the queries of one task on this machine."""
+    label = str(part.folder)
+    with locked(part.folder, tell=tell):
+        before = _begin(plan, part, progress)
+        jobs = plan.request.jobs
+        cost = answer(plan, part, part.left, jobs=jobs, watch=lambda count: progress.advance(label, count))
+        _say(plan, part, cost, before)
+    return cost
 
 
-def _say(plan: RunPlan, part: RunPart, workers: Sequence[Worker], cost: dict[str, Any]) -> None:
-    """Write `run.json`."""
+def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
+    """Ask the queries of all tasks on a cluster at once."""
+    costs: list[list[Cost]] = [[] for _ in parts]
+    left = [len(part.left) for part in parts]
+    with ExitStack() as locks:
+        client = locks.enter_context(connected(address))
+        for part in parts:
+            locks.enter_context(locked(part.folder, tell=tell))
+        before = [_begin(plan, part, progress) for part in parts]
+        for number, count, cost in answer_on(client, plan, parts):
+            costs[number].append(cost)
+            left[number] -= count
+            progress.advance(str(parts[number].folder), count)
+            if not left[number]:
+                _say(plan, parts[number], pool_costs(costs[number]), before[number])
+    return [pool_costs(items) for items in costs]
+
+
+def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
+    """Say that a task begins; what earlier runs of it took."""
+    progress.begin(str(part.folder), len(part.left))
+    said = rundir.read_run(part.folder) or {}
+    before = Cost(
+        prepare_s=said.get("prepare_s"),
+        index_bytes=said.get("index_bytes"),
+        cpu_s=said.get("cpu_s", 0.0),
+        peak_bytes=said.get("peak_bytes", 0),
+        isolation=said.get("isolation", {}),
+    )
+    _say(plan, part, before, Cost())
+    return before
+
+
+def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
+    """Write `run.json`: what the run is, and what it and the runs before it have taken."""
     about = taskdir.read_task(part.task)
+    told: dict[str, Any] = asdict(pool_costs([before, cost]))
+    del told["counts"]
     rundir.write_run(
         part.folder,
         {
@@ -254,114 +170,10 @@ def _say(plan: RunPlan, part: RunPart, workers: Sequence[Worker], cost: dict[str
             "map_fingerprint": about["map_fingerprint"],
             "top_k": plan.request.top_k,
             "limits": asdict(plan.request.limits),
-            "isolation": plan.isolation or {"files": "trusted code, not shut in"},
             "warm_up": "one query of each process is asked twice and timed the second time",
             "map_bytes": sum(path.stat().st_size for path in part.region.iterdir() if path.is_file()),
-            "peak_bytes": max((worker.peak_bytes for worker in workers), default=0),
-            **cost,
+            **told,
             "licence": LICENCE,
             "attribution": ATTRIBUTION,
         },
     )
-
-
-def _ask_all(
-    plan: RunPlan, part: RunPart, worker: Worker, questions: "_Questions", writer: "_Writer"
-) -> dict[str, Any]:
-    """One process: prepare, then query after query."""
-    with worker:
-        ready = worker.prepare(part.region)
-        is_warm = False
-        for query, blob in questions:
-            reason = lacks(plan.card, query)
-            if reason is not None:
-                writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
-                continue
-            reply = ready
-            if ready.status == "ok":
-                if not is_warm:
-                    worker.match(blob, top_k=plan.request.top_k)
-                    is_warm = True
-                reply = worker.match(blob, top_k=plan.request.top_k)
-            writer.add(_prediction(query, reply, plan.request.top_k))
-    return {"prepare_s": ready.seconds, "index_bytes": ready.grown_bytes}
-
-
-def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
-    """A row out of a reply, checked once more on this side."""
-    if reply.status != "ok":
-        return Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
-    if reply.match is None:
-        return Prediction(query_id=query.query_id, status="invalid", message="no answer in an answer")
-    try:
-        match = check_match(reply.match, query, top_k=top_k)
-    except MatchError as error:
-        return Prediction(query_id=query.query_id, status="invalid", message=one_line(str(error)))
-    return Prediction(
-        query_id=query.query_id,
-        candidates=tuple(zip(match.poses, match.scores, strict=True)),
-        confidence=match.confidence,
-        diagnostics=match.diagnostics,
-        latency_s=reply.seconds,
-    )
-
-
-class _Questions:
-    """The queries that are left, one at a time to whoever asks; a row group in memory."""
-
-    def __init__(self, task: Path, left: Sequence[str]) -> None:
-        self._lock = threading.Lock()
-        self._rows = taskdir.read_some(task, frozenset(left))
-        self._is_stopped = False
-
-    def __iter__(self) -> Iterator[tuple[Query, bytes]]:
-        """Give each query to one of those that ask."""
-        while True:
-            with self._lock:
-                if self._is_stopped:
-                    return
-                item = next(self._rows, None)
-            if item is None:
-                return
-            yield item
-
-    def stop(self) -> None:
-        """Give nothing more."""
-        self._is_stopped = True
-
-
-class _Writer:
-    """Rows of one task: gathered, written a part at a time, counted, and told of."""
-
-    def __init__(self, folder: Path, *, total: int, tell: Tell) -> None:
-        self.counts: dict[str, int] = {}
-        self._folder, self._total, self._tell = folder, total, tell
-        self._lock = threading.Lock()
-        self._rows: list[Prediction] = []
-        self._begun = self._written = self._told = time.monotonic()
-
-    def add(self, prediction: Prediction) -> None:
-        """Take a row."""
-        with self._lock:
-            self._rows.append(prediction)
-            self.counts[prediction.status] = self.counts.get(prediction.status, 0) + 1
-            now = time.monotonic()
-            if len(self._rows) >= PART_ROWS or now - self._written > PART_S:
-                self._write()
-            if now - self._told > TOLD_S:
-                self._told = now
-                done = sum(self.counts.values())
-                rate = done / (now - self._begun)
-                left_s = (self._total - done) / rate
-                self._tell(f"{self._folder}: {done} of {self._total}, {rate:.1f} a second, {left_s:.0f} s left")
-
-    def flush(self) -> None:
-        """Write what is left."""
-        with self._lock:
-            self._write()
-
-    def _write(self) -> None:
-        if self._rows:
-            rundir.write_part(self._folder, self._rows)
-        self._rows = []
-        self._written = time.monotonic()

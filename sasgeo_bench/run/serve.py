@@ -64,12 +64,13 @@ class Server:
             seconds = time.perf_counter() - start
             return {"status": "ok", "seconds": seconds, "grown_bytes": max(0, _resident_bytes() - before)}
         query = query_from(blob)
-        start = time.perf_counter()
+        start, start_cpu = time.perf_counter(), time.process_time()
         found = self.matcher.match(query, top_k=message["top_k"])
-        seconds = time.perf_counter() - start
+        seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
         return {
             "status": "ok",
             "seconds": seconds,
+            "cpu_s": cpu_s,
             "match": match_row(check_match(found, query, top_k=message["top_k"])),
         }
 

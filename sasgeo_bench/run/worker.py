@@ -63,7 +63,7 @@ class Reach:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """What came of a question: a status, a line that says why, the seconds it took inside, the answer.
+    """What came of a question: a status, a line that says why, seconds and processor seconds inside, the answer.
 
     Of a plugin that was loaded: its card, and a hash of its code; of a map: by how much memory grew.
     """
@@ -71,6 +71,7 @@ class Reply:
     status: Status
     message: str = ""
     seconds: float | None = None
+    cpu_s: float = 0.0
     match: Match | None = None
     card: MatcherCard | None = None
     code: str = ""
@@ -94,6 +95,7 @@ class Worker:
     limits: Limits
     isolation: dict[str, str] = field(default_factory=dict)
     peak_bytes: int = 0
+    cpu_s: float = 0.0
     starts: int = 0
     _process: subprocess.Popen[bytes] | None = None
     _channel: socket.socket | None = None
@@ -130,6 +132,7 @@ class Worker:
             if again.status != "ok":
                 return again
         reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
+        self.cpu_s += reply.cpu_s
         if reply.status in {"timeout", "crash"} and self._is_gone():
             self.end()
         return reply
@@ -293,7 +296,7 @@ def _reply_of(answer: Mapping[str, Any]) -> Reply:
         confidence=None if row["confidence"] is None else float(row["confidence"]),
         diagnostics={str(name): float(value) for name, value in dict(row["diagnostics"]).items()},
     )
-    return Reply(status="ok", seconds=seconds, match=match)
+    return Reply(status="ok", seconds=seconds, cpu_s=max(0.0, float(answer["cpu_s"])), match=match)
 
 
 def _card_of(said: Mapping[str, Any]) -> MatcherCard:

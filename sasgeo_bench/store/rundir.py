@@ -120,7 +120,9 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def read_predictions(path: Path) -> Iterator[Prediction]:
-    """Predictions of a run's folder or of a file; of two for one query, the one written first.
+    """Predictions of a run's folder or of a file, newest first; of two for one query, the one that was written last.
+
+    A folder holds two where a query was asked again.
 
     Raises
     ------
@@ -132,12 +134,12 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)
     seen: set[str] = set()
-    for part in parts:
+    for part in reversed(parts):
         table = read_part(part)
         if table.column_names != PREDICTION_SCHEMA.names or not pa.types.is_string(table.schema.field("query_id").type):
             message = f"{part} holds no predictions: 'validate' says what is missing"
             raise StoreError(message)
-        for row in table.to_pylist():
+        for row in reversed(table.to_pylist()):
             if row["query_id"] not in seen:
                 seen.add(row["query_id"])
                 yield prediction_of(row)

@@ -13,9 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.run.runner import RunRequest, plan_run, run
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.validate import validate
 
 
 def request_of(task, out, name="Plain", **changes):
@@ -85,7 +88,14 @@ def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, name="Raises", limit=2))
     assert {item.status for item in table(folder)} == {"crash"}
     assert plan_run(request_of(task, tmp_path, name="Raises", limit=2)).parts[0].left == ()
-    assert len(plan_run(request_of(task, tmp_path, name="Raises", limit=2, again=("crash",))).parts[0].left) == 2
+    again = plan_run(request_of(task, tmp_path, name="Raises", limit=2, again=("crash",)))
+    assert len(again.parts[0].left) == 2
+    # Asked again, with another outcome: the newer row counts, for readers, for merging and for validating.
+    rundir.write_part(folder, [Prediction(query_id=name) for name in again.parts[0].left])
+    assert {item.status for item in table(folder)} == {"ok"}
+    rundir.merge_runs([folder], tmp_path / "merged.parquet")
+    assert {item.status for item in table(tmp_path / "merged.parquet")} == {"ok"}
+    assert not [fault for fault in validate(folder, [task]) if "again" in fault.found]
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.slow)])

@@ -222,7 +222,7 @@ def test_a_truth_says_how_far_outside_of_the_disc_its_view_lies(drawn):
 
 
 def test_density_is_of_the_place_that_is_seen_and_likeness_of_the_site_alone(drawn):
-    made, _, drafts = drawn("absent")
+    _, _, drafts = drawn("absent")
     for pair in by_site(drafts):
         told = {truth.kind: truth for _, truth in pair}
         site = told["control"].feature_density

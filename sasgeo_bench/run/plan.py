@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run is asked to do, and what of it is left."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench.plugins import ORACLE
+from sasgeo_bench.results import STATUSES, matcher_hash
+from sasgeo_bench.run.oracle import CARD
+from sasgeo_bench.run.worker import Limits, Reach, Worker
+from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.regiondir import read_manifest
+
+_MOST_S: Final = 7 * 86_400.0
+_LEAST_BYTES, _MOST_BYTES = 64 * 2**20, 2**42
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """What is asked for.
+
+    Parameters
+    ----------
+    spec : str
+        A matcher's name, or module:Class.
+    tasks : sequence of Path
+        Task folders, out/tasks/<suite>/<region>.
+    out : Path
+        Root; rows go to out/runs/<matcher>/<hash>/<suite>/<region>.
+    top_k : int
+        Poses asked of each query.
+    limits : Limits
+        What the matcher may take.
+    jobs : int
+        Processes at once.
+    dask : str, optional
+        Address of a dask scheduler, or local:N for N processes of this machine; then `jobs` is 1.
+    shard : tuple of int
+        (i, n), from 1: this run answers the i-th of n parts of the queries.
+    limit : int, optional
+        Queries of each task at most.
+    again : sequence of str
+        Statuses whose rows are asked again.
+    is_shut_in : bool
+        False runs code that is trusted without isolation, and says so.
+    """
+
+    spec: str
+    tasks: Sequence[Path]
+    out: Path
+    top_k: int = 25
+    limits: Limits = field(default_factory=Limits)
+    jobs: int = 1
+    dask: str | None = None
+    shard: tuple[int, int] = (1, 1)
+    limit: int | None = None
+    again: Sequence[str] = ()
+    is_shut_in: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunPart:
+    """One task of a run: its folder of rows, its map, its truths, and the queries that are left to ask."""
+
+    task: Path
+    folder: Path
+    region: Path
+    truth: Path
+    left: tuple[str, ...]
+    done: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPlan:
+    """What a run will do, after the plugin's card was read in a process of its own."""
+
+    request: RunRequest
+    card: MatcherCard
+    hash: str
+    parts: tuple[RunPart, ...]
+
+    def to_text(self) -> str:
+        """A line for each task."""
+        lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
+        lines += [f"  {part.folder}: {len(part.left)} queries left, {part.done} done" for part in self.parts]
+        return "\n".join(lines)
+
+
+def plan_run(request: RunRequest) -> RunPlan:
+    """Read the card and the tasks, and find out what is left to do.
+
+    Raises
+    ------
+    MatchError
+        If the plugin cannot be loaded or its card is not sound.
+    ConfigError
+        If the shard or a number makes no sense.
+    StoreError
+        If a task is missing, of another version, or its map is.
+    """
+    index, count = request.shard
+    if not 1 <= index <= count:
+        message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
+        raise ConfigError(message)
+    limits = request.limits
+    numbers = (("--jobs", request.jobs), ("--top-k", request.top_k), ("--limit", request.limit))
+    for name, value in numbers:
+        if value is not None and value < 1:
+            message = f"{name} must be at least 1, got {value}"
+            raise ConfigError(message)
+    for name, seconds in (("--match-s", limits.match_s), ("--prepare-s", limits.prepare_s)):
+        if not 0 < seconds <= _MOST_S:
+            message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
+            raise ConfigError(message)
+    if not _LEAST_BYTES <= limits.memory_bytes <= _MOST_BYTES:
+        allowed = f"between {_LEAST_BYTES >> 20} and {_MOST_BYTES >> 20}"
+        message = f"--memory-mb must lie {allowed}, got {limits.memory_bytes >> 20}"
+        raise ConfigError(message)
+    strange = next((status for status in request.again if status not in STATUSES), None)
+    if strange is not None:
+        message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"
+        raise ConfigError(message)
+    if request.dask is not None and request.jobs != 1:
+        message = "--jobs and --dask both say how many processes there are: leave one of them out"
+        raise ConfigError(message)
+    if request.dask is not None:  # other processes work in other folders
+        request = replace(request, out=request.out.resolve(), tasks=[task.resolve() for task in request.tasks])
+    tasks = [(folder, taskdir.read_task(folder)) for folder in request.tasks]
+    card, code = _card(request)
+    settings = json.dumps({"top_k": request.top_k, "limits": asdict(limits)}, sort_keys=True)
+    found = matcher_hash(request.spec, card.version, code.encode(), settings)
+    parts = tuple(_part(request, card, found, *task) for task in tasks)
+    return RunPlan(request=request, card=card, hash=found, parts=parts)
+
+
+def _card(request: RunRequest) -> tuple[MatcherCard, str]:
+    """A plugin's card and the hash of its code, told by its own process."""
+    if request.spec == ORACLE:
+        return CARD, ""
+    with Worker(spec=request.spec, reach=reach_of(request, None), limits=request.limits) as worker:
+        reply = worker.load()
+    if reply.status != "ok" or reply.card is None:
+        raise MatchError(reply.message or f"{request.spec}: the plugin says nothing of itself")
+    return reply.card, reply.code
+
+
+def reach_of(request: RunRequest, region: Path | None) -> Reach:
+    """The map may be read; truths, and whatever other runs wrote, may not."""
+    roots = {folder.resolve().parent.parent.parent for folder in request.tasks} | {request.out.resolve()}
+    hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards")]
+    readable = [] if region is None else [region.resolve()]
+    return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
+
+
+def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about: dict[str, Any]) -> RunPart:
+    folder = request.out / "runs" / card.name / found / about["suite"] / about["region"]
+    before = rundir.read_run(folder)
+    now = about["files"][taskdir.QUERIES]["sha256"]
+    if before is not None and before.get("queries_sha256") != now:
+        message = (
+            f"{folder} holds answers to other queries than {task} does now: move it away, or make the old queries again"
+        )
+        raise StoreError(message)
+    root = task.resolve().parent.parent.parent
+    region = root / "regions" / about["region"]
+    if read_manifest(region).fingerprint != about["map_fingerprint"]:
+        message = f"{region} was built anew since the queries of {task} were made: make them again"
+        raise StoreError(message)
+    ids = taskdir.read_ids(task)
+    index, count = request.shard
+    mine = [name for name in ids if _shard_of(name, count) == index - 1]
+    mine = mine if request.limit is None else mine[: request.limit]
+    done = rundir.ids_done(folder, again=request.again) if folder.is_dir() else set()
+    left = tuple(name for name in mine if name not in done)
+    truth = root / "truth" / about["suite"] / about["region"]
+    return RunPart(task=task, folder=folder, region=region, truth=truth, left=left, done=len(mine) - len(left))
+
+
+def _shard_of(query_id: str, count: int) -> int:
+    """Which of `count` parts a query belongs to; it depends on the id alone."""
+    return int.from_bytes(hashlib.sha256(query_id.encode()).digest()[:8], "big") % count

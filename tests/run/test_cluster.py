@@ -10,12 +10,14 @@ import psutil
 import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.run import cluster
 from sasgeo_bench.run.answers import pool_costs
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.tasks import make_tasks
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
 
@@ -131,3 +133,36 @@ def test_workers_that_die_over_and_over_end_the_run_with_one_line(task, tmp_path
     plan = plan_run(request_of(task, tmp_path))
     with pytest.raises(StoreError, match="died over and over"):
         list(cluster.answer_on(Client(), plan, plan.parts))
+
+
+@pytest.mark.slow
+def test_over_500_queries_two_processes_two_shards_and_a_cluster_give_the_same_rows(tmp_path):
+    wanted = Wanted(
+        suites=("occlusion", "clean", "season"),
+        regions=("town-grid",),
+        split="crossfit",
+        count=16,
+        seed=3,
+        out=tmp_path,
+    )
+    requests = plan_requests(replace(wanted, may_be_fewer=True), tell=lambda _: None)
+    tasks = [made.folder for request in requests for made in make_tasks(request, tell=lambda _: None)]
+    assert sum(len(taskdir.read_ids(task)) for task in tasks) > 500
+    ways = {
+        "two processes": [{"jobs": 2}],
+        "two shards": [{"shard": (1, 2)}, {"shard": (2, 2)}],
+        "a cluster": [{"dask": "local:2"}],
+    }
+    files = []
+    for name, changes in ways.items():
+        folders = []
+        for number, change in enumerate(changes):
+            out = tmp_path / name / str(number)
+            plan = plan_run(RunRequest(spec="global_descriptor", tasks=tasks, out=out, **change))
+            run(plan, tell=lambda _: None)
+            folders += [part.folder for part in plan.parts]
+        rundir.merge_runs(folders, tmp_path / f"{name}.parquet")
+        files.append(rows(tmp_path / f"{name}.parquet"))
+    assert len(files[0]) > 500
+    assert files[0] == files[1] == files[2]
+    assert sum(item.status == "ok" for item in files[0].values()) > 500

@@ -46,3 +46,7 @@ class PerturbError(SasgeoError, ValueError):
 
 class MatchError(SasgeoError, ValueError):
     """An answer, a card or a plugin that is not what the door asks for."""
+
+
+class MetricError(SasgeoError, ValueError):
+    """Values, weights or a level that no figure can be computed from."""

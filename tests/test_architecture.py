@@ -76,7 +76,10 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "sasgeo": ("weights", "raster", "graph", "temporal", "joint", "integrity"),
     "plugins": None,
     "run": ("sandbox", "wire", "serve", "child", "worker", "oracle", "plan", "answers", "cluster", "runner"),
-    "metrics": ("ranking", "pose", "integrity", "sequence", "cost", "intervals", "compare"),
+    "metrics": (
+        *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
+        *("sequence", "cost", "intervals", "compare", "power"),
+    ),
     "report": ("tables", "plots", "site"),
     "pipeline": None,
     "validate": None,

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Intervals hold as often as they say, count blocks instead of queries, and share their draws."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest, bootstrap
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.metrics import intervals
+from sasgeo_bench.metrics.decisions import Answers
+from sasgeo_bench.metrics.integrity import aurc
+from sasgeo_bench.metrics.intervals import (
+    ClusterDraws,
+    bootstrap_means,
+    bootstrap_statistic,
+    mean_difference,
+    mean_interval,
+    percentile_interval,
+    statistic_interval,
+    wilson,
+    wilson_mean,
+)
+
+BLOCKS = st.lists(st.sampled_from("abcdef"), min_size=2, max_size=15).filter(lambda blocks: len(set(blocks)) > 1)
+
+
+# Wilson
+
+
+@pytest.mark.parametrize(
+    ("hits", "lo", "hi"), [(129, 0.520, 0.649), (208, 0.907, 0.969), (209, 0.913, 0.972), (210, 0.918, 0.975)]
+)
+def test_the_intervals_of_the_paper(hits, lo, hi) -> None:
+    found = wilson(hits, 220)
+    assert (round(found.lo, 3), round(found.hi, 3)) == (lo, hi)
+
+
+@given(trials=st.integers(1, 400), share=st.floats(0, 1), level=st.sampled_from([0.9, 0.95, 0.99]))
+def test_wilson_is_that_of_scipy(trials, share, level) -> None:
+    hits = round(share * trials)
+    ours = wilson(hits, trials, level=level)
+    theirs = binomtest(hits, trials).proportion_ci(level, method="wilson")
+    assert (ours.lo, ours.hi) == pytest.approx((theirs.low, theirs.high), abs=1e-9)
+    assert ours.lo <= ours.value <= ours.hi
+
+
+def test_wilson_at_its_ends() -> None:
+    # 0 of n: hi = z^2 / (n + z^2).
+    assert wilson(0, 10).lo == 0.0
+    assert wilson(0, 10).hi == pytest.approx(1.959964**2 / (10 + 1.959964**2), abs=1e-6)
+    assert wilson(10, 10).hi == 1.0
+    nothing = wilson(0, 0)
+    assert math.isnan(nothing.value)
+    assert (nothing.lo, nothing.hi) == (0.0, 1.0)
+    assert wilson_mean([]).hi == 1.0
+
+
+def test_shared_hits_and_weights_count_in_proportion() -> None:
+    assert wilson_mean([1.0, 0.25, 0.25, 0.5]) == wilson(2, 4)
+    # Weights 3, 1: (3 + 1)^2 / (9 + 1) = 1.6 trials, of which 3/4 succeed.
+    found = wilson_mean([1.0, 0.0], [3.0, 1.0])
+    expected = wilson(1.2, 1.6)
+    assert (found.value, found.lo, found.hi) == pytest.approx((0.75, expected.lo, expected.hi))
+    assert wilson_mean([1.0, 0.0, 1.0], [5.0, 5.0, 0.0]) == wilson(1, 2)
+    with pytest.raises(MetricError, match="shares"):
+        wilson_mean([2.0])
+    with pytest.raises(MetricError, match="between 0 and the trials"):
+        wilson(3, 2)
+    with pytest.raises(MetricError, match="level"):
+        wilson(1, 2, level=1.0)
+
+
+# Draws
+
+
+@given(blocks=BLOCKS, seed=st.integers(0, 2**40))
+def test_a_draw_takes_as_many_blocks_as_there_are_and_from_each_as_many_queries_as_it_has(blocks, seed) -> None:
+    drawn = ClusterDraws(blocks=blocks, seed=seed, draws=20)
+    weights = np.vstack(list(drawn.weights()))
+    assert weights.shape == (20, len(blocks))
+    names = np.array(blocks)
+    copies = np.stack([weights[:, names == name].sum(axis=1) / (names == name).sum() for name in set(blocks)], axis=1)
+    assert (copies == np.round(copies)).all()
+    assert (copies.sum(axis=1) == len(set(blocks))).all()
+    whole = np.vstack(list(ClusterDraws(blocks=blocks, seed=seed, draws=20, draws_queries=False).weights()))
+    for name in set(blocks):
+        assert (np.ptp(whole[:, names == name], axis=1) == 0).all()
+
+
+def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch) -> None:
+    blocks = list("aabbbc")
+    one, same, other = (ClusterDraws(blocks=blocks, seed=seed, draws=50) for seed in (7, 7, 8))
+    values = np.arange(6.0)
+    assert bootstrap_means(values, one).tolist() == bootstrap_means(values, same).tolist()
+    assert bootstrap_means(values, one).tolist() == bootstrap_means(values, one).tolist()
+    assert bootstrap_means(values, one).tolist() != bootstrap_means(values, other).tolist()
+    monkeypatch.setattr(intervals, "_CHUNK_CELLS", 6 * 8)
+    chunks = list(one.weights())
+    assert [len(chunk) for chunk in chunks] == [8] * 6 + [2]
+    assert not np.array_equal(chunks[0], chunks[1])
+
+
+@pytest.mark.parametrize("draws_queries", [True, False])
+def test_the_spread_of_means_is_what_theory_says(draws_queries) -> None:
+    # B equal blocks of n: variance of block means / B, and with queries drawn the mean variance within / (B n).
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(12, 9)) + rng.normal(size=(12, 1))
+    blocks = np.repeat([f"block {at}" for at in range(12)], 9)
+    drawn = ClusterDraws(blocks=list(blocks), seed=3, draws=20_000, draws_queries=draws_queries)
+    means = bootstrap_means(values.ravel(), drawn)
+    expected = values.mean(axis=1).var() / 12
+    if draws_queries:
+        expected += values.var(axis=1).mean() / (12 * 9)
+    assert means.var() == pytest.approx(expected, rel=0.05)
+    assert means.mean() == pytest.approx(values.mean(), abs=4 * math.sqrt(expected / 20_000))
+
+
+@given(blocks=BLOCKS)
+def test_the_fast_way_and_the_slow_way_agree(blocks) -> None:
+    rng = np.random.default_rng(4)
+    drawn = ClusterDraws(blocks=blocks, seed=1, draws=30)
+    values, weights = rng.random(len(blocks)), rng.integers(0, 2, len(blocks))
+    fast = bootstrap_means(values, drawn, weights)
+
+    def mean(mass: np.ndarray) -> float:
+        return float(mass @ values / mass.sum()) if mass.sum() else math.nan
+
+    np.testing.assert_allclose(bootstrap_statistic(mean, drawn, weights), fast)
+
+
+def test_two_methods_share_their_draws() -> None:
+    rng = np.random.default_rng(5)
+    blocks = [f"{at % 7}" for at in range(60)]
+    ours, theirs = rng.random(60), rng.random(60)
+    drawn = ClusterDraws(blocks=blocks, seed=1, draws=500)
+    apart = bootstrap_means(ours - theirs, drawn)
+    np.testing.assert_allclose(bootstrap_means(ours, drawn) - bootstrap_means(theirs, drawn), apart)
+    side_by_side = bootstrap_means(np.column_stack((ours, theirs)), drawn)
+    np.testing.assert_allclose(side_by_side[:, 0] - side_by_side[:, 1], apart)
+    found = mean_difference(ours, theirs, drawn)
+    assert (found.lo, found.hi) == tuple(np.quantile(apart, [0.025, 0.975], method="inverted_cdf"))
+    assert mean_difference(ours, ours, drawn) == intervals.Interval(value=0.0, lo=0.0, hi=0.0)
+    # A difference that holds for every query is seen however much the queries vary.
+    assert mean_difference(ours + 0.01, ours, drawn).lo == pytest.approx(0.01)
+
+
+def test_with_a_block_for_each_query_the_interval_is_that_of_scipy() -> None:
+    values = np.random.default_rng(6).exponential(size=80)
+    ours = mean_interval(values, ClusterDraws(blocks=[str(at) for at in range(80)], seed=1))
+    theirs = bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(9)).confidence_interval
+    assert (ours.lo, ours.hi) == pytest.approx((theirs.low, theirs.high), rel=0.02)
+
+
+def test_intervals_hold_as_often_as_they_say_and_only_if_blocks_are_counted() -> None:
+    rng = np.random.default_rng(8)
+    blocks = [f"{at // 10}" for at in range(300)]
+    alone = [str(at) for at in range(300)]
+    held, naive = 0, 0
+    for trial in range(150):
+        values = (rng.normal(size=(30, 10)) + rng.normal(size=(30, 1))).ravel()  # mean 0, correlation 1/2
+        for names in (blocks, alone):
+            found = mean_interval(values, ClusterDraws(blocks=names, seed=trial, draws=400))
+            is_held = found.lo <= 0.0 <= found.hi
+            held, naive = held + (is_held and names is blocks), naive + (is_held and names is alone)
+    assert 0.90 <= held / 150 <= 0.99
+    assert naive / 150 < 0.75
+
+
+# Figures with intervals
+
+
+def test_a_figure_of_one_block_has_no_interval() -> None:
+    found = mean_interval([1.0, 0.0], ClusterDraws(blocks=["a", "a"], seed=1, draws=50))
+    assert found.value == 0.5
+    assert math.isnan(found.lo)
+    assert math.isnan(found.hi)
+    nothing = mean_interval([], ClusterDraws(blocks=[], seed=1, draws=50))
+    assert math.isnan(nothing.value)
+    assert math.isnan(nothing.hi)
+
+
+def test_draws_without_a_query_that_counts_are_left_out() -> None:
+    drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=200)
+    means = bootstrap_means([1.0, 0.0], drawn, [1.0, 0.0])
+    assert 0.15 < np.isnan(means).mean() < 0.35  # block b twice
+    assert mean_interval([1.0, 0.0], drawn, [1.0, 0.0]) == intervals.Interval(value=1.0, lo=1.0, hi=1.0)
+    assert math.isnan(percentile_interval(1.0, [math.nan]).lo)
+
+
+def test_any_figure_can_have_an_interval() -> None:
+    rng = np.random.default_rng(9)
+    count = 120
+    right, confidence = rng.random(count) < 0.7, rng.random(count)
+    answers = Answers(
+        confidence=confidence, is_answered=np.ones(count), is_right=right, is_present=np.ones(count, dtype=bool)
+    )
+    sure = Answers(confidence=right + 0.0, is_answered=np.ones(count), is_right=right, is_present=np.ones(count))
+    drawn = ClusterDraws(blocks=[f"{at % 10}" for at in range(count)], seed=1, draws=300)
+    found = statistic_interval(lambda weights: aurc(answers, weights), drawn)
+    assert found.value == aurc(answers)
+    assert 0.0 < found.lo < found.value < found.hi < 1.0
+    apart = statistic_interval(lambda weights: aurc(answers, weights) - aurc(sure, weights), drawn)
+    assert 0.0 < apart.lo < apart.value == pytest.approx(aurc(answers) - aurc(sure))
+
+
+def test_what_cannot_be_is_refused() -> None:
+    drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=5)
+    for values in ([1.0], [1.0, math.inf], [1.0, math.nan], 1.0, [[[1.0]], [[1.0]]]):
+        with pytest.raises(MetricError, match="finite"):
+            bootstrap_means(values, drawn)
+    with pytest.raises(MetricError, match="shape"):
+        mean_difference([1.0, 0.0], [1.0], drawn)
+    with pytest.raises(MetricError, match="draws"):
+        ClusterDraws(blocks=["a"], seed=1, draws=0)
+    with pytest.raises(MetricError, match="weights"):
+        bootstrap_means([1.0, 0.0], drawn, [1.0, -1.0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Query: what a matcher may see. Truth: what only the scorer sees."""
+"""Query: what a matcher may see, and its head without the view. Truth: what only the scorer sees."""
 
 import datetime as dt
 from dataclasses import dataclass, field
@@ -123,6 +123,25 @@ class Query:
     prior_group: str
     candidates: tuple[Pose, ...] = ()
     vectors: gpd.GeoDataFrame | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Head:
+    """A query without what was seen: all that scoring needs of it. Fields are those of a `Query`.
+
+    `view_cells` is the side of the view.
+    """
+
+    query_id: str
+    track: Track
+    suite: str
+    suite_version: int
+    part: str
+    region: str
+    view_cells: int
+    cell_size_m: float
+    prior_group: str
+    candidates: tuple[Pose, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

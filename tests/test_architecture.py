@@ -65,7 +65,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "results": None,
     "rejector": None,
     "store": (
-        *("layerfile", "regiondir", "taskdir", "rundir", "pluginfiles"),
+        *("layerfile", "regiondir", "taskdir", "rundir", "boardfile", "pluginfiles"),
         *("preview", "sheet", "splitmap", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,
@@ -80,7 +80,12 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
         *("sequence", "cost", "intervals", "compare", "power"),
     ),
-    "report": ("tables", "plots", "site"),
+    "score": None,
+    "report": (
+        *("measures", "rows", "strata", "tables", "rejection", "integrity", "costs", "text"),
+        *("plots", "site"),
+    ),
+    "boards": None,
     "pipeline": None,
     "validate": None,
     "scaffold": None,

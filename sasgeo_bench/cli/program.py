@@ -20,7 +20,7 @@ from sasgeo_bench.cli.matchers import (
 )
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
-from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
+from sasgeo_bench.cli.runs import merge_command, run_command, score_command, validate_command
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import SasgeoError
 
@@ -53,6 +53,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "run": run_command,
     "merge": merge_command,
     "validate": validate_command,
+    "score": score_command,
 }
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)

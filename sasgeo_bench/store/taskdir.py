@@ -18,7 +18,7 @@ import shapely
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.evidence import Evidence, pack, unpack
 from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import TASK_VERSION, Query, Truth
+from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.regiondir import file_record
 
@@ -72,6 +72,15 @@ QUERY_SCHEMA: Final = pa.schema(
         ("image", pa.binary()),
     ],
     metadata=_META,
+)
+_HEAD_SCHEMA: Final = pa.schema(
+    [
+        QUERY_SCHEMA.field(name)
+        for name in (
+            *("query_id", "track", "suite", "suite_version", "part", "region"),
+            *("rows", "cell_size_m", "prior_group", "candidates"),
+        )
+    ]
 )
 TRUTH_SCHEMA: Final = pa.schema(
     [
@@ -392,6 +401,22 @@ def _belongs_to(truth_folder: Path) -> str:
         return "unknown"
 
 
+def check_truths(task_folder: Path, truth_folder: Path) -> None:
+    """Refuse truths that are not there, or are those of other queries.
+
+    Raises
+    ------
+    StoreError
+        Naming both folders.
+    """
+    if not (truth_folder / TRUTH).is_file():
+        message = f"{truth_folder} holds no truths of {task_folder}: score where they are, or make the queries again"
+        raise StoreError(message)
+    if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
+        message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
+        raise StoreError(message)
+
+
 def query_bytes(query: Query) -> bytes:
     """One query as it goes to a matcher's process: a row in Arrow's stream format."""
     return _stream(pa.RecordBatch.from_pylist([query_row(query)], schema=QUERY_SCHEMA))
@@ -442,6 +467,13 @@ def read_queries(folder: Path) -> Iterator[Query]:
         yield query_of(row)
 
 
+def read_heads(folder: Path) -> Iterator[Head]:
+    """Queries of a task without their views, in the order of their ids."""
+    for row in _rows(folder / QUERIES, _HEAD_SCHEMA):
+        poses = row.pop("candidates") or ()
+        yield Head(view_cells=row.pop("rows"), candidates=tuple(Pose(**pose) for pose in poses), **row)
+
+
 def read_truths(folder: Path) -> Iterator[Truth]:
     """Truths of a task in the order of the query ids."""
     for row in _rows(folder / TRUTH, TRUTH_SCHEMA):
@@ -459,7 +491,7 @@ def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:
     try:
         with pq.ParquetFile(path) as source:
             _check_columns(path, source.schema_arrow.names, schema.names)
-            for batch in source.iter_batches(batch_size=_ROWS):
+            for batch in source.iter_batches(batch_size=_ROWS, columns=schema.names):
                 yield from batch.to_pylist()
     except StoreError:
         raise

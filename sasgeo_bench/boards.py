@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs, files of predictions and truths -> a board: the order of the steps."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.metrics.intervals import DRAWS
+from sasgeo_bench.plugins import load_rejector
+from sasgeo_bench.query import TASK_VERSION
+from sasgeo_bench.region import DATA_VERSION
+from sasgeo_bench.report.costs import cost_rows
+from sasgeo_bench.report.integrity import integrity_rows
+from sasgeo_bench.report.rejection import judge
+from sasgeo_bench.report.rows import to_frame
+from sasgeo_bench.report.tables import leaderboard
+from sasgeo_bench.report.text import board_latex, board_markdown
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
+from sasgeo_bench.split import Split
+from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.boardfile import write_board
+
+Tell = Callable[[str], None]
+Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
+
+REPRODUCED: Final = "reproduced"
+AS_SUBMITTED: Final = "as submitted"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreRequest:
+    """What is to be put on a board.
+
+    Parameters
+    ----------
+    predictions : sequence of Path
+        Folders of runs (any folder with runs in it), and files of predictions.
+    tasks : sequence of Path
+        Task folders; without any, those that the runs and files answer.
+    root : Path
+        Where tasks/ and truth/ are.
+    split : Split, optional
+        Says which blocks are one place, and which calibrate; needed for rejectors.
+    rejectors : sequence of str
+        Names, or module:Class.
+    board : Path
+        Folder to write.
+    draws : int
+        Of the bootstrap.
+    """
+
+    predictions: Sequence[Path]
+    root: Path
+    board: Path
+    tasks: Sequence[Path] = ()
+    split: Split | None = None
+    rejectors: Sequence[str] = ()
+    draws: int = DRAWS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One contestant: a matcher as it was run, or a file of predictions.
+
+    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them.
+    """
+
+    name: str
+    version: str
+    hash: str
+    how: str
+    sources: tuple[Path, ...]
+    runs: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A board in memory: scored rows by matcher, and the leaderboard."""
+
+    entries: tuple[Entry, ...]
+    scores: dict[str, pd.DataFrame]
+    predictions: dict[str, dict[str, Prediction]]
+    table: pd.DataFrame
+    tasks: tuple[dict[str, Any], ...] = field(default=())
+
+
+def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
+    """Who is to be scored.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Folders with runs somewhere in them, and files of predictions.
+
+    Returns
+    -------
+    tuple of Entry
+        By name; two versions of one matcher are two entries, with the hash in their names.
+
+    Raises
+    ------
+    StoreError
+        If a path holds no predictions.
+    ConfigError
+        If two files have one name.
+    """
+    by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
+    files: list[Entry] = []
+    for path in paths:
+        if path.is_file():
+            files.append(Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,)))
+            continue
+        found = sorted(path.rglob(rundir.RUN))
+        if not found:
+            message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
+            raise StoreError(message)
+        for run in found:
+            about = rundir.read_run(run.parent)
+            if about is not None:
+                card = about["matcher"]
+                by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
+    names = [name for name, _, _ in by_run]
+    entries = [
+        Entry(
+            name=name if names.count(name) == 1 else f"{name} ({digest[:6]})",
+            version=number,
+            hash=digest,
+            how=REPRODUCED,
+            sources=tuple(folder for folder, _ in found),
+            runs=tuple(about for _, about in found),
+        )
+        for (name, number, digest), found in by_run.items()
+    ]
+    entries += files
+    listed = [entry.name for entry in entries]
+    twice = next((name for name in listed if listed.count(name) > 1), None)
+    if twice is not None:
+        message = f"two contestants are named {twice!r}: rename the file of one"
+        raise ConfigError(message)
+    return tuple(sorted(entries, key=lambda entry: entry.name))
+
+
+def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
+    """Score everything and write the board.
+
+    Parameters
+    ----------
+    request : ScoreRequest
+        What is asked for.
+    tell : callable
+        Gets a line now and then.
+
+    Returns
+    -------
+    Board
+        What was written.
+
+    Raises
+    ------
+    StoreError
+        If predictions, tasks or truths are missing, damaged, or of other versions; nothing is written.
+    ConfigError
+        If there is nothing to score, or rejectors are asked for without a split.
+    """
+    judges = _judges(request)
+    entries = find_entries(request.predictions)
+    predictions = {entry.name: _predictions(entry) for entry in entries}
+    folders = list(request.tasks) or list(_answered(entries, predictions, request.root))
+    if not folders:
+        message = "there is nothing to score: no task of this folder is answered by these predictions"
+        raise ConfigError(message)
+    abouts = [_check_task(folder, request.root) for folder in folders]
+    scores = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
+    rows = [leaderboard(scores, draws=request.draws)]
+    for entry in entries:
+        frame = scores[entry.name]
+        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs))))
+        for name, judged_by in judges.items():
+            judged = judged_by(frame, predictions[entry.name])
+            if len(judged):
+                rows.append(to_frame(list(integrity_rows(entry.name, name, judged))))
+        tell(f"{entry.name}: {int(frame['is_answered'].sum())} of {len(frame)} queries answered")
+    table = pd.concat([item for item in rows if len(item)], ignore_index=True)
+    board = Board(entries=entries, scores=scores, predictions=predictions, table=table, tasks=tuple(abouts))
+    _write(request, board)
+    return board
+
+
+def _judges(request: ScoreRequest) -> dict[str, Judge]:
+    """The rejectors by name, each tried once before anything is read."""
+    if not request.rejectors:
+        return {}
+    if request.split is None:
+        message = "rejectors are fitted on the calibration places of a split: name one with --split"
+        raise ConfigError(message)
+    names = {load_rejector(spec).card.name: spec for spec in request.rejectors}
+    makers = {name: partial(load_rejector, spec) for name, spec in names.items()}
+    return {name: partial(judge, make=make, split=request.split) for name, make in makers.items()}
+
+
+def _predictions(entry: Entry) -> dict[str, Prediction]:
+    return {item.query_id: item for source in entry.sources for item in _rows_of(source)}
+
+
+def _rows_of(source: Path) -> Iterator[Prediction]:
+    if source.is_dir() and not rundir.parts_of(source):
+        return  # a run that was cut off before its first row: all of its queries are missing
+    yield from rundir.read_predictions(source)
+
+
+def _answered(
+    entries: Sequence[Entry], predictions: Mapping[str, Mapping[str, Prediction]], root: Path
+) -> Iterator[Path]:
+    """Task folders that runs were made on, and of which files hold an answer."""
+    named = {(about["suite"], about["region"]) for entry in entries for about in entry.runs}
+    held = {name for entry in entries if not entry.runs for name in predictions[entry.name]}
+    for path in sorted((root / "tasks").glob(f"*/*/{taskdir.TASK}")):
+        folder = path.parent
+        is_named = (folder.parent.name, folder.name) in named
+        if is_named or (held and not held.isdisjoint(taskdir.read_ids(folder))):
+            yield folder
+
+
+def _check_task(folder: Path, root: Path) -> dict[str, Any]:
+    """What `task.json` says, after it was held against the version of the scorer and the truths."""
+    about = taskdir.read_task(folder)
+    if about.get("task_version") != TASK_VERSION:
+        found = about.get("task_version")
+        message = f"{folder} is of task version {found}, this scorer reads {TASK_VERSION}: make the queries again"
+        raise StoreError(message)
+    taskdir.check_truths(folder, _truth_folder(about, root))
+    return about
+
+
+def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:
+    return root / "truth" / str(about["suite"]) / str(about["region"])
+
+
+def _scored(
+    entry: Entry,
+    predictions: Mapping[str, Prediction],
+    folders: Sequence[Path],
+    abouts: Sequence[Mapping[str, Any]],
+    request: ScoreRequest,
+) -> pd.DataFrame:
+    """All tasks of one contestant, one row for each query."""
+    ran_on = {(about["suite"], about["region"]): about["queries_sha256"] for about in entry.runs}
+    place_of = {} if request.split is None else request.split.place_of
+    frames = []
+    for folder, about in zip(folders, abouts, strict=True):
+        asked = ran_on.get((about["suite"], about["region"]))
+        if asked is not None and asked != about["files"][taskdir.QUERIES]["sha256"]:
+            message = f"{entry.name} answered other queries than {folder} holds now: run it again"
+            raise StoreError(message)
+        heads = list(taskdir.read_heads(folder))
+        mine = {head.query_id: predictions[head.query_id] for head in heads if head.query_id in predictions}
+        truths = taskdir.read_truths(_truth_folder(about, request.root))
+        frames.append(score_task(heads, truths, mine, place_of=place_of))
+    return settle_not_applicable(pd.concat(frames, ignore_index=True))
+
+
+def _write(request: ScoreRequest, board: Board) -> None:
+    about = {
+        "scorer_version": SCORER_VERSION,
+        "task_version": TASK_VERSION,
+        "data_version": DATA_VERSION,
+        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
+        "split": None if request.split is None else request.split.spec.id,
+        "draws": request.draws,
+        "entries": [
+            {
+                "name": entry.name,
+                "version": entry.version,
+                "hash": entry.hash,
+                "how": entry.how,
+                "card": entry.runs[0]["matcher"] if entry.runs else None,
+                "isolation": entry.runs[0].get("isolation") if entry.runs else None,
+            }
+            for entry in board.entries
+        ],
+        "tasks": [
+            {
+                "suite": item["suite"],
+                "suite_version": item.get("suite_version"),
+                "region": item["region"],
+                "map_date": item.get("map_date"),
+                "queries_sha256": item["files"][taskdir.QUERIES]["sha256"],
+                "map_fingerprint": item["map_fingerprint"],
+            }
+            for item in board.tasks
+        ],
+    }
+    scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
+    write_board(
+        request.board,
+        tables={"leaderboard": board.table, "scores": scores},
+        texts={
+            "leaderboard.md": board_markdown(board.table, about),
+            "leaderboard.tex": board_latex(board.table, about),
+        },
+        about=about,
+    )

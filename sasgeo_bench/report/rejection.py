@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matcher x rejector: fitted on calibration places, thresholds chosen there too, and counted on test places alone."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.metrics.base import Bools, Floats
+from sasgeo_bench.metrics.decisions import Answers
+from sasgeo_bench.metrics.integrity import choose_threshold
+from sasgeo_bench.rejector import Rejector, check_p_false
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.score import NOT_APPLICABLE
+from sasgeo_bench.split import Split
+
+RISKS: Final = (0.01, 0.05)
+_PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
+
+Make = Callable[[], Rejector]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Turn:
+    """One use of a split: which rows are scored, and which calibrate.
+
+    `is_own` is False where none of the fold's own calibration places is on the board, so that all the other places
+    calibrate.
+    """
+
+    test: Bools
+    calibration: Bools
+    is_own: bool
+
+
+def turns(scores: pd.DataFrame, split: Split) -> Iterator[Turn]:
+    """Every use of a split for some scored rows; each row is tested once at most.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Columns place and part.
+    split : Split
+        Hold-out: one turn, by the part of each query. Cross-fit: one for each place on the board.
+
+    Yields
+    ------
+    Turn
+        Masks of shape (N,). A place never calibrates itself.
+    """
+    place, part = scores["place"].to_numpy(), scores["part"].to_numpy()
+    if split.spec.kind == "holdout":
+        yield Turn(test=part == "test", calibration=part == "calibration", is_own=True)
+        return
+    for fold in split.folds:
+        test = place == fold.held_out
+        if not test.any():
+            continue
+        own = np.array([fold.part_of.get(name) == "calibration" for name in place], dtype=bool)
+        yield Turn(test=test, calibration=own if own.any() else ~test, is_own=bool(own.any()))
+
+
+def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make, split: Split) -> pd.DataFrame:
+    """What a rejector says of the answers of one matcher, each by a fit on other places.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Of one matcher; several tracks and prior groups are fitted apart, all suites together.
+    predictions : mapping of str to Prediction
+        The same answers by query id.
+    make : callable
+        Gives a new rejector.
+    split : Split
+        Says which places calibrate.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The rows that were tested, with the columns `p_false` (NaN without an answer), `accepted_<risk>` for each of
+        `RISKS`, and `is_own_calibration`.
+    """
+    frames = []
+    usable = scores[scores["status"] != NOT_APPLICABLE]
+    for _, group in usable.groupby(["track", "prior_group"], sort=True):
+        for turn in turns(group, split):
+            test, calibration = group[turn.test], group[turn.calibration]
+            if len(test) and calibration["is_answered"].any():
+                frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
+    columns = [*scores.columns, "p_false", *(f"accepted_{risk:g}" for risk in RISKS), "is_own_calibration"]
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=columns)
+
+
+def _judged(
+    test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
+) -> pd.DataFrame:
+    p_false = _fit_and_say(make, calibration, test, predictions)
+    held_back = _held_back(make, calibration, predictions)
+    known = answers_of(calibration, held_back)
+    accepted = {}
+    for risk in RISKS:
+        threshold = choose_threshold(known, risk)
+        sure = np.where(np.isnan(p_false), -math.inf, 1.0 - p_false)
+        accepted[f"accepted_{risk:g}"] = test["is_answered"].to_numpy(bool) & (sure >= threshold)
+    return test.assign(p_false=p_false, **accepted)
+
+
+def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
+    """Probabilities on calibration blocks, each by a fit on the other ones; of a single block by its own fit."""
+    names = sorted(set(calibration["block"]))
+    if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
+        return _fit_and_say(make, calibration, calibration, predictions)
+    fold = calibration["block"].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
+    found = np.full(len(calibration), np.nan)
+    for part in sorted(set(fold)):
+        rest, mine = calibration[fold != part], calibration[fold == part]
+        if rest["is_answered"].any():
+            found[fold == part] = _fit_and_say(make, rest, mine, predictions)
+    return found
+
+
+def _fit_and_say(make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
+    """Fit on the answers of some rows; say of others. NaN where there is no answer."""
+    rejector = make()
+    answered = known[known["is_answered"].to_numpy(bool)]
+    rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
+    found = np.full(len(asked), np.nan)
+    is_answered = asked["is_answered"].to_numpy(bool)
+    some = _answers(asked[is_answered], predictions)
+    if some:
+        found[is_answered] = check_p_false(rejector.p_false(some), len(some))
+    return found
+
+
+def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Sequence[Prediction]:
+    return [predictions[name] for name in rows["query_id"]]
+
+
+def answers_of(scores: pd.DataFrame, p_false: Floats) -> Answers:
+    """Scored rows as the integrity figures take them."""
+    return Answers(
+        confidence=1.0 - p_false,
+        is_answered=scores["is_answered"].to_numpy(bool),
+        is_right=scores["is_right"].to_numpy(bool),
+        is_present=scores["is_present"].to_numpy(bool),
+    )

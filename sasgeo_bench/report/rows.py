@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One figure of one matcher, and of which queries it is: the rows of `leaderboard.parquet`."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any, Final, Literal, Self
+
+import pandas as pd
+
+from sasgeo_bench.metrics.intervals import Interval
+from sasgeo_bench.score import MISSING
+
+ALL_SUITES: Final = "all suites"
+
+Better = Literal["higher", "lower"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One figure of one matcher.
+
+    Parameters
+    ----------
+    matcher, rejector : str
+        Whose; the rejector is "" for figures that take every answer.
+    suite, track, prior_group, stratum : str
+        Of which queries. Figures of two prior groups are never ranked against each other.
+    n : int
+        Queries in the denominator; the same for every matcher.
+    answered, missing : int
+        Of these: with an answer, and without any row.
+    blocks, places : int
+        How many of each the queries come from.
+    metric, unit, better : str
+        Of what.
+    value, lo, hi : float
+        The figure and its 95 % interval; NaN where there is none.
+    interval : str
+        How it was found: "blocks" (bootstrap over blocks, then queries), "wilson" (fewer than two blocks, or nothing
+        that varies: then over blocks), or "".
+    is_applicable : bool
+        False where the matcher's card says it cannot; then there is no figure.
+    rank_best, rank_worst : int
+        Ranks it can have among the matchers that are ranked; 0 where it is not.
+    detectable : float
+        Least difference from the best of the others that these queries would show (alpha 5 %, power 80 %); NaN where
+        nothing can be said.
+    """
+
+    matcher: str
+    rejector: str
+    suite: str
+    track: str
+    prior_group: str
+    stratum: str
+    n: int
+    answered: int
+    missing: int
+    blocks: int
+    places: int
+    metric: str
+    unit: str
+    better: str
+    value: float
+    lo: float = math.nan
+    hi: float = math.nan
+    interval: str = ""
+    is_applicable: bool = True
+    rank_best: int = 0
+    rank_worst: int = 0
+    detectable: float = math.nan
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Row))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What all rows about the same queries of one matcher say; see `Row`."""
+
+    matcher: str
+    suite: str
+    track: str
+    prior_group: str
+    stratum: str
+    n: int
+    answered: int
+    missing: int
+    blocks: int
+    places: int
+    rejector: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        scores: pd.DataFrame,
+        *,
+        matcher: str,
+        suite: str,
+        track: str,
+        prior_group: str,
+        stratum: str,
+        rejector: str = "",
+    ) -> Self:
+        """Count some scored rows."""
+        return cls(
+            matcher=matcher,
+            suite=suite,
+            track=track,
+            prior_group=prior_group,
+            stratum=stratum,
+            rejector=rejector,
+            n=len(scores),
+            answered=int(scores["is_answered"].sum()),
+            missing=int((scores["status"] == MISSING).sum()),
+            blocks=int(scores["block"].nunique()),
+            places=int(scores["place"].nunique()),
+        )
+
+    def row(self, metric: str, unit: str, better: Better, found: Interval, how: str = "", **more: Any) -> Row:  # noqa: ANN401
+        """One figure about these queries; `more` are other fields of a `Row`."""
+        said = {name: getattr(self, name) for name in self.__slots__}
+        return Row(
+            **said,
+            metric=metric,
+            unit=unit,
+            better=better,
+            value=found.value,
+            lo=found.lo,
+            hi=found.hi,
+            interval="" if math.isnan(found.lo) else how,
+            **more,
+        )
+
+
+def bare(value: float) -> Interval:
+    """A figure without an interval."""
+    return Interval(value=value, lo=math.nan, hi=math.nan)
+
+
+def to_frame(rows: list[Row]) -> pd.DataFrame:
+    """Rows as a table with the columns of `Row`.
+
+    Examples
+    --------
+    >>> to_frame([]).columns[0]
+    'matcher'
+    """
+    return pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))

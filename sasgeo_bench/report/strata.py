@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a suite that are told apart on a board; which part a query is in never depends on an answer."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.metrics.base import Bools
+
+ALL: Final = "all"
+STRESS: Final = "stress"
+CONTROL: Final = "control"
+_EDGES: Final = {  # fixed, so that boards can be compared
+    "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
+    "changed_share": (0.0, 0.1, 0.2, 0.4, 1.0),
+    "feature_density": (0.0, 0.05, 0.1, 0.2, 1.0),
+    "alias_index": (0.0, 0.7, 0.8, 0.9, 1.0),
+}
+
+
+def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
+    """Names and masks, shape (N,), of every part of one suite that holds a query.
+
+    Roles, then each step of each kind at each size of view, then bins of what was measured at the truth. A kind that is
+    drawn in one step and size has no rows for them apart.
+
+    Examples
+    --------
+    >>> table = {"role": ["control", "stress"], "kind": ["control", "U1"], "strength": [0.0, 0.3]}
+    >>> table |= {"view_cells": [96, 96]}
+    >>> table |= {name: [0.1, 0.5] for name in ("unknown_share", "changed_share", "feature_density", "alias_index")}
+    >>> [name for name, _ in strata(pd.DataFrame(table))][:4]
+    ['all', 'control', 'stress', 'U1']
+    """
+    yield ALL, np.ones(len(scores), dtype=bool)
+    role = scores["role"].to_numpy()
+    for name in (CONTROL, STRESS, "falsifier"):
+        if (role == name).any():
+            yield name, role == name
+    kind, strength = scores["kind"].to_numpy(), scores["strength"].to_numpy(float)
+    cells = scores["view_cells"].to_numpy()
+    for one in dict.fromkeys(sorted(set(kind) - {CONTROL})):
+        mine = kind == one
+        yield one, mine
+        steps = sorted({(step, size) for step, size in zip(strength[mine], cells[mine], strict=True)})
+        if len(steps) > 1:
+            for step, size in steps:
+                yield f"{one} {step:g}, {size} cells", mine & (strength == step) & (cells == size)
+    sizes = sorted(set(cells[role == CONTROL]))
+    if len(sizes) > 1:
+        for size in sizes:
+            yield f"{CONTROL}, {size} cells", (role == CONTROL) & (cells == size)
+    yield from _bins(scores, role != CONTROL)
+
+
+def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:
+    """Bins of what was measured, without the controls."""
+    for column, edges in _EDGES.items():
+        values = scores[column].to_numpy(float)
+        for low, high in pairwise(edges):
+            is_last = high == edges[-1]
+            inside = counted & (values >= low) & ((values <= high) if is_last else (values < high))
+            if inside.any():
+                yield f"{column} {low:g}-{high:g}", inside

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A leaderboard as Markdown, LaTeX and lines for a terminal; the parquet is the master, these say a part of it."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.report.integrity import AS_DRAWN
+from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
+from sasgeo_bench.report.rows import ALL_SUITES
+from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
+from sasgeo_bench.report.tables import UNRANKED
+
+_INTEGRITY: Final = ("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05", "brier", "ece", "cost_20")
+_COSTS: Final = ("latency_p50", "latency_p95", "prepare", "peak_memory", "cpu_per_fix")
+_FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
+
+
+def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Tables for people, each with its title: words instead of numbers, best matcher first.
+
+    Parameters
+    ----------
+    board : pandas.DataFrame
+        From `report.tables.leaderboard`, with whatever rows were added to it.
+
+    Yields
+    ------
+    tuple of str, pandas.DataFrame
+        One for each suite, track and prior group; then rejectors, then costs.
+    """
+    means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
+    for (suite, track, prior_group), part in means.groupby(["suite", "track", "prior_group"], sort=True):
+        title = f"{suite}, {track}, prior group {prior_group}"
+        yield title, _suite_table(part, primary_of(str(track)).name)
+    judged = board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
+    for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True):
+        yield f"Rejection, {track}, prior group {prior_group}, all suites", _judged_table(part)
+    costs = board[(board["rejector"] == "") & (board["suite"] == ALL_SUITES)]
+    if len(costs):
+        yield "Costs", _cost_table(costs)
+
+
+def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
+    """A matcher a line, by what it reaches under stress."""
+    rows = []
+    for matcher, mine in part.groupby("matcher", sort=True):
+        main = _pick(mine, primary, STRESS)
+        main = _pick(mine, primary, "all") if main is None else main
+        if main is None:
+            continue
+        control = _pick(mine, primary, CONTROL)
+        rows.append(
+            {
+                "matcher": matcher,
+                primary: _figure(main) if main["is_applicable"] else "not applicable",
+                "rank": _rank(main),
+                "control": "" if control is None else _figure(control),
+                "detectable": _number(main["detectable"]),
+                "n": str(main["n"]),
+                "missing": str(main["missing"]),
+                "blocks": f"{main['blocks']} in {main['places']} places",
+                "_key": -math.inf if math.isnan(main["value"]) else main["value"],
+            }
+        )
+    table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
+    return table.drop(columns="_key")
+
+
+def _pick(rows: pd.DataFrame, metric: str, stratum: str) -> pd.Series | None:
+    found = rows[(rows["metric"] == metric) & (rows["stratum"] == stratum)]
+    return None if found.empty else found.iloc[0]
+
+
+def _judged_table(part: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for (matcher, rejector), mine in part.groupby(["matcher", "rejector"], sort=True):
+        by_name = {str(row["metric"]): row for _, row in mine.iterrows()}
+        row = {"matcher": matcher, "rejector": rejector}
+        row |= {name: _figure(by_name[name]) if name in by_name else "" for name in _INTEGRITY}
+        rows.append(row | {"n": str(mine["n"].iloc[0]), "_key": by_name["aurc"]["value"]})
+    table = pd.DataFrame(rows).sort_values(["_key", "matcher", "rejector"], kind="stable")
+    return table.drop(columns="_key")
+
+
+def _cost_table(part: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for matcher, mine in part.groupby("matcher", sort=True):
+        row = {"matcher": matcher}
+        for _, one in mine.iterrows():
+            if one["metric"] in _COSTS:
+                name = one["metric"] if one["track"] == "all" else f"{one['metric']}, {one['track']}"
+                row[f"{name} ({one['unit']})"] = _number(one["value"])
+        rows.append(row)
+    return pd.DataFrame(rows).fillna("")
+
+
+def _figure(row: pd.Series) -> str:
+    """A figure with its interval, as in "0.63 [0.55, 0.70]"."""
+    text = _number(row["value"])
+    return text if math.isnan(row["lo"]) else f"{text} [{_number(row['lo'])}, {_number(row['hi'])}]"
+
+
+def _number(value: float) -> str:
+    """Three digits that say something; "-" where there is no number."""
+    if math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "inf"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"  # noqa: PLR2004 - a digit less from ten on
+
+
+def _rank(row: pd.Series) -> str:
+    """A rank or ranks that cannot be told apart; controls have none."""
+    best, worst = int(row["rank_best"]), int(row["rank_worst"])
+    if not best:
+        return "control" if row["matcher"] in UNRANKED else "-"
+    return str(best) if best == worst else f"{best}-{worst}"
+
+
+def warnings_of(board: pd.DataFrame) -> list[str]:
+    """What a reader must know before reading on."""
+    said = []
+    if len(board):
+        blocks, places = int(board["blocks"].max()), int(board["places"].max())
+        if blocks < _FEW_BLOCKS or places < _FEW_PLACES:
+            said.append(
+                f"{blocks} blocks in {places} places: fewer than {_FEW_BLOCKS} in {_FEW_PLACES}, so intervals speak of "
+                "these places and little of others."
+            )
+        # Between them these two count every query once: present places, and absent ones.
+        whole = board[board["metric"].isin((ANSWERED.name, FALSE_ABSENT.name)) & (board["stratum"] == ALL)]
+        for matcher, count in whole.groupby("matcher")["missing"].sum().items():
+            if count:
+                said.append(f"{matcher}: {count} queries have no row and count as misses.")
+    return said
+
+
+_NOTE: Final = (
+    "Intervals are 95 %: a bootstrap over blocks, then queries ({draws} draws), or Wilson's where blocks say nothing. "
+    "A rank is an interval: matchers that share one cannot be told apart. `detectable` is the least difference from "
+    "the best other matcher that these queries would show. Nothing is ranked across prior groups."
+)
+
+
+def board_markdown(board: pd.DataFrame, about: Mapping[str, Any]) -> str:
+    """The board as a document."""
+    lines = [
+        f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
+        "",
+        f"Made by {about['made_by']}. Split: {about['split'] or 'none'}. Data: {ATTRIBUTION}.",
+        "",
+        _NOTE.format(draws=about["draws"]),
+        "",
+        *(f"- {line}" for line in warnings_of(board)),
+        "",
+    ]
+    for title, table in tables_of(board):
+        lines += [f"## {title}", "", *_markdown(table), ""]
+    return "\n".join(lines)
+
+
+def _markdown(table: pd.DataFrame) -> Iterator[str]:
+    yield "| " + " | ".join(map(str, table.columns)) + " |"
+    yield "|" + "---|" * len(table.columns)
+    for row in table.itertuples(index=False):
+        yield "| " + " | ".join(map(str, row)) + " |"
+
+
+_ESCAPED: Final = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#"}
+
+
+def board_latex(board: pd.DataFrame, about: Mapping[str, Any]) -> str:
+    """The tables of the board for a paper; needs the package booktabs."""
+    lines = [f"% {about['made_by']}, scorer version {about['scorer_version']}; {ATTRIBUTION}"]
+    for title, table in tables_of(board):
+        lines += [
+            r"\begin{table}",
+            rf"\caption{{{_tex(title)}}}",
+            rf"\begin{{tabular}}{{{'l' * len(table.columns)}}}",
+            r"\toprule",
+            " & ".join(map(_tex, table.columns)) + r" \\",
+            r"\midrule",
+            *(" & ".join(map(_tex, row)) + r" \\" for row in table.itertuples(index=False)),
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _tex(text: object) -> str:
+    return "".join(_ESCAPED.get(letter, letter) for letter in str(text))
+
+
+def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple[str, pd.DataFrame]]:
+    """What a terminal shows: by track and prior group a matcher a line, a suite a column, primary figure and rank.
+
+    Parameters
+    ----------
+    board : pandas.DataFrame
+        The leaderboard.
+    names : sequence of str
+        Suites to show; without any, all.
+    """
+    means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
+    means = means[means["suite"].isin(names)] if names else means
+    for (track, prior_group), part in means.groupby(["track", "prior_group"], sort=True):
+        primary = primary_of(str(track)).name
+        main = part[part["metric"] == primary]
+        rows = []
+        for matcher, mine in main.groupby("matcher", sort=True):
+            row = {"matcher": str(matcher)}
+            total = []
+            for suite, one in mine.groupby("suite", sort=True):
+                shown = _pick(one, primary, STRESS)
+                shown = _pick(one, primary, "all") if shown is None else shown
+                if shown is not None:
+                    row[str(suite)] = _cell(shown)
+                    total.append(shown["value"])
+            numbers = [value for value in total if not math.isnan(value)]
+            rows.append(row | {"_key": sum(numbers) / len(numbers) if numbers else -1.0})
+        table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
+        yield f"{primary}, {track}, prior group {prior_group} (rank)", table.drop(columns="_key").fillna("")
+
+
+def _cell(row: pd.Series) -> str:
+    if not row["is_applicable"]:
+        return "n/a"
+    return f"{_number(row['value'])} ({_rank(row)})"

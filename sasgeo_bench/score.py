@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predictions held against truths: one scored row for every query, whether it was answered or not."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.matcher import SAME_PLACE_M
+from sasgeo_bench.metrics.pose import first_pose, pose_errors
+from sasgeo_bench.metrics.ranking import MISS, Rank, rank_candidate, rank_of
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.query import Head, Truth
+from sasgeo_bench.results import Prediction
+
+SCORER_VERSION: Final = 1  # raised whenever the same predictions get other figures; rows of two never share a board
+FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false
+MISSING: Final = "missing"  # status of a query without a row
+NOT_APPLICABLE: Final = "not applicable"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Score:
+    """One query of one matcher, scored.
+
+    Parameters
+    ----------
+    query_id, track, suite, suite_version, part, region, prior_group, view_cells, cell_size_m
+        Of the query.
+    pool : int
+        Candidates to choose from; 0 for localization.
+    place : str
+        What stays together in the split; the region where no split is given.
+    block, pair_id, role, kind, strength, strength_unit, scene
+        Of the truth; so are unknown_share, changed_share, feature_density and alias_index.
+    is_present : bool
+        Whether there is something to be right about.
+    status : str
+        Of the prediction, or "missing". "not applicable" only where all queries of the same suite, track and prior
+        group are: else whoever answers could choose what to be asked.
+    is_answered : bool
+        Whether there is a fix that could be accepted.
+    above, tied, right : int
+        Rank of the right candidate (`metrics.ranking.Rank`); 0, 0, 0 for a miss and for localization.
+    position_error_m, yaw_error_deg, log_scale_error : float
+        Of the first pose, for localization of a place that is present; infinite without an answer, else NaN.
+    is_right : bool
+        Whether the fix is the right candidate, or within `FIX_M`; never for an absent place.
+    confidence : float
+        What the matcher says; NaN where it does not.
+    latency_s : float
+        NaN where it is not known.
+    """
+
+    query_id: str
+    track: str
+    suite: str
+    suite_version: int
+    part: str
+    region: str
+    place: str
+    block: str
+    prior_group: str
+    view_cells: int
+    cell_size_m: float
+    pool: int
+    pair_id: str
+    role: str
+    kind: str
+    strength: float
+    strength_unit: str
+    unknown_share: float
+    changed_share: float
+    feature_density: float | None
+    alias_index: float | None
+    scene: str
+    is_present: bool
+    status: str
+    is_answered: bool
+    above: int
+    tied: int
+    right: int
+    position_error_m: float
+    yaw_error_deg: float
+    log_scale_error: float
+    is_right: bool
+    confidence: float
+    latency_s: float
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Score))
+
+
+def score_task(
+    heads: Iterable[Head],
+    truths: Iterable[Truth],
+    predictions: Mapping[str, Prediction],
+    *,
+    place_of: Mapping[str, str] | None = None,
+) -> pd.DataFrame:
+    """Score the predictions of one task.
+
+    Parameters
+    ----------
+    heads : iterable of Head
+        Every query of the task.
+    truths : iterable of Truth
+        Of the same queries.
+    predictions : mapping of str to Prediction
+        By query id; a query without one is a miss.
+    place_of : mapping of str to str, optional
+        Block -> place of the split.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for each query, the columns those of `Score`, in the order of the queries.
+
+    Raises
+    ------
+    MetricError
+        If a query has no truth or a prediction belongs to no query.
+
+    Examples
+    --------
+    >>> score_task([], [], {}).columns[0]
+    'query_id'
+    """
+    by_id = {truth.query_id: truth for truth in truths}
+    asked = list(heads)
+    lost = next((head.query_id for head in asked if head.query_id not in by_id), None)
+    if lost is not None:
+        message = f"query {lost} has no truth: these are the truths of other queries, make the queries again"
+        raise MetricError(message)
+    foreign = next(iter(set(predictions) - {head.query_id for head in asked}), None)
+    if foreign is not None:
+        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
+        raise MetricError(message)
+    rows = [_score(head, by_id[head.query_id], predictions.get(head.query_id), place_of or {}) for head in asked]
+    return pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
+
+
+def _score(head: Head, truth: Truth, prediction: Prediction | None, place_of: Mapping[str, str]) -> Score:
+    fix = first_pose(prediction)
+    rank, errors = MISS, (math.nan, math.nan, math.nan)
+    is_right = False
+    if truth.is_present and head.track == "retrieval":
+        rank = _rank(prediction, truth, head.candidates)
+        is_right = fix is not None and rank.right > 0 and _is_at(fix, head.candidates[truth.candidate])
+    elif truth.is_present and truth.pose is not None:
+        found = pose_errors([fix], [truth.pose])
+        errors = (float(found.position_m[0]), float(found.yaw_deg[0]), float(found.log_scale[0]))
+        is_right = errors[0] <= FIX_M
+    base = head.region.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+    return Score(
+        query_id=head.query_id,
+        track=head.track,
+        suite=head.suite,
+        suite_version=head.suite_version,
+        part=head.part,
+        region=head.region,
+        place=place_of.get(truth.block, base),
+        block=truth.block,
+        prior_group=head.prior_group,
+        view_cells=head.view_cells,
+        cell_size_m=head.cell_size_m,
+        pool=len(head.candidates),
+        pair_id=truth.pair_id,
+        role=truth.role,
+        kind=truth.kind,
+        strength=truth.strength,
+        strength_unit=truth.strength_unit,
+        unknown_share=truth.unknown_share,
+        changed_share=truth.changed_share,
+        feature_density=truth.feature_density,
+        alias_index=truth.alias_index,
+        scene=truth.scene,
+        is_present=truth.is_present,
+        status=MISSING if prediction is None else prediction.status,
+        is_answered=fix is not None,
+        above=rank.above,
+        tied=rank.tied,
+        right=rank.right,
+        position_error_m=errors[0],
+        yaw_error_deg=errors[1],
+        log_scale_error=errors[2],
+        is_right=is_right,
+        confidence=math.nan if prediction is None or prediction.confidence is None else prediction.confidence,
+        latency_s=math.nan if prediction is None or prediction.latency_s is None else prediction.latency_s,
+    )
+
+
+def _rank(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
+    """Rank of the right candidate; the full comparison only where another candidate lies on the same spot."""
+    right = candidates[truth.candidate]
+    twins = sum(_is_at(other, right, within_m=2 * SAME_PLACE_M) for other in candidates)
+    if twins > 1:
+        return rank_candidate(prediction, truth, candidates)
+    if prediction is None or prediction.status != "ok":
+        return MISS
+    scores = [score for _, score in prediction.candidates]
+    return rank_of(scores, [_is_at(pose, right) for pose, _ in prediction.candidates])
+
+
+def _is_at(pose: Pose, place: Pose, *, within_m: float = SAME_PLACE_M) -> bool:
+    return math.hypot(pose.easting_m - place.easting_m, pose.northing_m - place.northing_m) <= within_m
+
+
+def settle_not_applicable(scores: pd.DataFrame) -> pd.DataFrame:
+    """Take "not applicable" for a miss where not all queries of the same suite, track and prior group are.
+
+    A card names what a matcher needs, and that is the same for all of them; a file that leaves out single queries would
+    choose what it is asked.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Of one matcher, all tasks.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A copy with the status "missing" where it was claimed for a part.
+    """
+    claimed = scores["status"] == NOT_APPLICABLE
+    group = [scores["suite"], scores["track"], scores["prior_group"]]
+    is_whole = claimed.groupby(group).transform("all").astype(bool)
+    return scores.assign(status=scores["status"].where(~claimed | is_whole, MISSING))

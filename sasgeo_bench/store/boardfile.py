@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards on disk: `leaderboard.parquet` is the master, all others say the same for other readers."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.store.regiondir import fresh_folder, locked
+
+LEADERBOARD: Final = "leaderboard"
+SCORES: Final = "scores"
+BOARD: Final = "board.json"
+_KNOWN: Final = (
+    *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
+    *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
+    *("figures", "site"),
+)
+
+
+def write_board(
+    folder: Path,
+    *,
+    tables: Mapping[str, pd.DataFrame],
+    texts: Mapping[str, str],
+    about: Mapping[str, Any],
+) -> None:
+    """Write a board, whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+        out/boards/<name>; an older board of the same scorer version there is replaced.
+    tables : mapping of str to pandas.DataFrame
+        Each becomes <name>.parquet; "leaderboard" also a csv.
+    texts : mapping of str to str
+        File name -> text.
+    about : mapping
+        What `board.json` says: versions, hashes, what was scored.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds a board of another scorer version, or something that is no part of a board.
+    """
+    check_board(folder, scorer_version=int(about["scorer_version"]))
+    with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
+        said = {"attribution": ATTRIBUTION, "licence": LICENCE, "scorer_version": str(about["scorer_version"])}
+        for name, frame in tables.items():
+            table = pa.Table.from_pandas(frame, preserve_index=False)
+            pq.write_table(table.replace_schema_metadata(said), scratch / f"{name}.parquet", compression="zstd")
+        tables[LEADERBOARD].to_csv(scratch / f"{LEADERBOARD}.csv", index=False, lineterminator="\n")
+        for name, text in texts.items():
+            (scratch / name).write_text(text, encoding="utf-8")
+        content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
+        (scratch / BOARD).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def check_board(folder: Path, *, scorer_version: int) -> None:
+    """Refuse a folder that a board of this scorer version cannot replace.
+
+    Raises
+    ------
+    StoreError
+        If it holds a board of another scorer version, or something that is no part of a board.
+    """
+    if folder.exists() and not folder.is_dir():
+        message = f"{folder} is a file: move it away, a board goes there"
+        raise StoreError(message)
+    other = next((path for path in sorted(folder.glob("*")) if path.name not in _KNOWN), None)
+    if other is not None:
+        message = f"{other} is no part of a board and would be lost: move it away, or name another board"
+        raise StoreError(message)
+    path = folder / f"{LEADERBOARD}.parquet"
+    if not path.is_file():
+        return
+    found = _version(path)
+    if found != str(scorer_version):
+        message = (
+            f"{folder} holds rows of scorer version {found}, this one is {scorer_version}: figures of two never share "
+            "a board; name another one, or move it away and score again"
+        )
+        raise StoreError(message)
+
+
+def _version(path: Path) -> str:
+    try:
+        said = dict(pq.read_schema(path).metadata or {})
+        return str(said.get(b"scorer_version", b"unknown"), encoding="utf-8")
+    except (OSError, pa.ArrowException):
+        return "unknown"
+
+
+def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
+    """What `board.json` says, and the leaderboard.
+
+    Raises
+    ------
+    StoreError
+        If there is none, or a file is damaged.
+    """
+    try:
+        about = json.loads((folder / BOARD).read_text(encoding="utf-8"))
+        return dict(about), pq.read_table(folder / f"{LEADERBOARD}.parquet").to_pandas()
+    except FileNotFoundError as error:
+        message = f"{folder} holds no board: score some runs first"
+        raise StoreError(message) from error
+    except (OSError, ValueError, TypeError, pa.ArrowException) as error:
+        message = f"{folder} holds a damaged board ({' '.join(str(error).split())[:120]}): score again"
+        raise StoreError(message) from error

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The leaderboard: figures worked out by hand, denominators that never move, ranks that say how sure they are."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.metrics.intervals import wilson
+from sasgeo_bench.report.rows import COLUMNS, to_frame
+from sasgeo_bench.report.strata import strata
+from sasgeo_bench.report.tables import leaderboard
+from sasgeo_bench.report.text import board_latex, board_markdown, summary, warnings_of
+from sasgeo_bench.score import COLUMNS as SCORED
+
+ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
+
+
+def scores(errors_m, *, blocks=4, track="localization", **changes):
+    """Rows of one matcher, one for each error; by default all stress, spread over some blocks, headings right."""
+    count = len(errors_m)
+    errors_m = np.array(errors_m, dtype=float)
+    table = pd.DataFrame(
+        {
+            "query_id": [f"q{at:05d}" for at in range(count)],
+            "track": track,
+            "suite": "occlusion",
+            "suite_version": 1,
+            "part": "crossfit",
+            "region": "vaduz",
+            "place": [f"place{at % 2}" for at in range(count)],
+            "block": [f"b{at % blocks}" for at in range(count)],
+            "prior_group": "r500-weak-s3",
+            "view_cells": 192,
+            "cell_size_m": 1.0,
+            "pool": 0,
+            "pair_id": "p",
+            "role": "stress",
+            "kind": "U1",
+            "strength": 0.3,
+            "strength_unit": "share",
+            "unknown_share": 0.3,
+            "changed_share": 0.0,
+            "feature_density": 0.1,
+            "alias_index": 0.8,
+            "scene": "urban",
+            "is_present": True,
+            "status": "ok",
+            "is_answered": np.isfinite(errors_m),
+            "above": 0,
+            "tied": 0,
+            "right": 0,
+            "position_error_m": errors_m,
+            "yaw_error_deg": np.where(np.isfinite(errors_m), 0.0, np.inf),
+            "log_scale_error": np.where(np.isfinite(errors_m), 0.0, np.inf),
+            "is_right": errors_m <= 25,
+            "confidence": math.nan,
+            "latency_s": 0.1,
+        }
+    )
+    return table.assign(**changes)[list(SCORED)]
+
+
+def pick(board, matcher, metric, stratum="all"):
+    rows = board[(board["matcher"] == matcher) & (board["metric"] == metric) & (board["stratum"] == stratum)]
+    assert len(rows) == 1
+    return rows.iloc[0]
+
+
+def test_figures_are_what_they_are_by_hand():
+    board = leaderboard({"mine": scores([1.0, 8.0, 20.0, 40.0, math.inf, 25.0, 25.1, 5.0])}, draws=200)
+    assert tuple(board.columns) == COLUMNS
+    assert pick(board, "mine", "success_25m")["value"] == 5 / 8
+    assert pick(board, "mine", "success_10m")["value"] == 3 / 8
+    assert pick(board, "mine", "success_5m")["value"] == 2 / 8
+    areas = [1 - error / 50 for error in (1.0, 8.0, 20.0, 40.0, 25.0, 25.1, 5.0)]
+    assert pick(board, "mine", "success_auc_50m")["value"] == pytest.approx(sum(areas) / 8)
+    assert pick(board, "mine", "position_median")["value"] == 20.0
+    assert pick(board, "mine", "position_p90")["value"] == math.inf
+    row = pick(board, "mine", "success_25m")
+    assert (row["n"], row["answered"], row["missing"], row["blocks"], row["places"]) == (8, 7, 0, 4, 2)
+    assert row["lo"] < row["value"] < row["hi"]
+    assert row["interval"] == "blocks"
+
+
+def test_recall_counts_ties_in_proportion():
+    table = scores([math.nan] * 4, track="retrieval", above=[0, 0, 1, 0], tied=[1, 2, 1, 0], right=[1, 1, 1, 0])
+    board = leaderboard({"mine": table}, draws=200)
+    assert pick(board, "mine", "recall_1")["value"] == (1 + 0.5) / 4
+    assert pick(board, "mine", "recall_5")["value"] == 3 / 4
+    assert pick(board, "mine", "mrr")["value"] == (1 + (1 + 1 / 2) / 2 + 1 / 2) / 4
+
+
+def test_the_median_of_errors_has_an_interval_that_holds_it():
+    errors = np.random.default_rng(1).exponential(20.0, 400)
+    board = leaderboard({"mine": scores(errors, blocks=40)}, draws=500)
+    row = pick(board, "mine", "position_median")
+    assert row["lo"] < row["value"] < row["hi"]
+    assert row["hi"] - row["lo"] < 12
+    assert row["lo"] < 20 * math.log(2) < row["hi"]
+
+
+def test_of_one_block_the_interval_is_wilsons_and_ranks_are_open():
+    both = {"a": scores([1.0] * 3 + [99.0], blocks=1), "b": scores([99.0] * 4, blocks=1)}
+    board = leaderboard(both, draws=200)
+    row, expected = pick(board, "a", "success_25m"), wilson(3, 4)
+    assert (row["lo"], row["hi"], row["interval"]) == (expected.lo, expected.hi, "wilson")
+    assert {
+        (pick(board, name, "success_25m")["rank_best"], pick(board, name, "success_25m")["rank_worst"]) for name in both
+    } == {(1, 2)}
+
+
+def test_where_nothing_varies_the_interval_is_as_wide_as_few_blocks_make_it():
+    row = pick(leaderboard({"mine": scores([1.0] * 100, blocks=5)}, draws=200), "mine", "success_25m")
+    assert (row["value"], row["lo"]) == (1.0, wilson(5, 5).lo)
+
+
+def test_ranks_tell_apart_what_differs_and_nothing_else():
+    chance = np.random.default_rng(3)
+    good, same, bad = (np.where(chance.random(600) < share, 1.0, 99.0) for share in (0.8, 0.8, 0.2))
+    tables = {name: scores(errors, blocks=60) for name, errors in (("good", good), ("same", same), ("bad", bad))}
+    board = leaderboard(tables | {"oracle_pose": scores(np.ones(600), blocks=60)}, draws=1000)
+    ranks = {name: tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in tables}
+    assert ranks == {"good": (1, 2), "same": (1, 2), "bad": (3, 3)}
+    assert tuple(pick(board, "oracle_pose", "success_25m")[["rank_best", "rank_worst"]]) == (0, 0)
+    assert 0 < pick(board, "good", "success_25m")["detectable"] < 0.2
+
+
+def test_absent_places_are_no_part_of_success_and_are_counted_apart():
+    table = scores([1.0, 1.0, math.nan, math.nan], is_present=[True, True, False, False], is_answered=[1, 1, 1, 0])
+    board = leaderboard({"mine": table}, draws=200)
+    assert pick(board, "mine", "success_25m")[["value", "n"]].tolist() == [1.0, 2]
+    assert pick(board, "mine", "answered_absent")[["value", "n"]].tolist() == [0.5, 2]
+
+
+def test_a_suite_a_matcher_cannot_has_a_row_without_a_figure_and_no_rank():
+    tables = {"a": scores([1.0, 99.0]), "b": scores([math.inf] * 2, status="not applicable")}
+    board = leaderboard(tables, draws=200)
+    row = pick(board, "b", "success_25m")
+    assert not row["is_applicable"]
+    assert math.isnan(row["value"])
+    assert tuple(pick(board, "a", "success_25m")[["rank_best", "rank_worst"]]) == (1, 1)
+
+
+def test_prior_groups_are_never_ranked_together():
+    groups = ["r500-weak-s3", "rnone-unknown-s15"] * 20
+    tables = {
+        name: scores(errors, prior_group=groups) for name, errors in (("a", [1.0, 99.0] * 20), ("b", [99.0, 1.0] * 20))
+    }
+    board = leaderboard(tables, draws=500)
+    main = board[(board["metric"] == "success_25m") & (board["stratum"] == "all")]
+    assert len(main) == 4
+    assert set(main["n"]) == {20}
+
+
+def test_matchers_scored_on_other_queries_are_refused():
+    with pytest.raises(MetricError, match="b was scored on other queries than a"):
+        leaderboard({"a": scores([1.0, 2.0]), "b": scores([1.0])}, draws=200)
+
+
+def test_the_same_scores_give_the_same_board_in_any_order():
+    table = scores(np.random.default_rng(5).exponential(30, 80))
+    forth = leaderboard({"a": table}, draws=300)
+    back = leaderboard({"a": table.sample(frac=1, random_state=1)}, draws=300)
+    pd.testing.assert_frame_equal(forth, back)
+
+
+def test_every_query_is_in_each_way_to_cut_a_suite():
+    table = scores(
+        np.ones(40), kind=["U1", "U2"] * 20, strength=[0.2, 0.4, 0.4, 0.2] * 10, view_cells=[96] * 20 + [192] * 20
+    )
+    found = dict(strata(table))
+    assert found["all"].all()
+    assert (found["U1"] ^ found["U2"]).all()
+    steps = [mask for name, mask in found.items() if "cells" in name]
+    assert (np.sum(steps, axis=0) == 1).all()
+    bins = [mask for name, mask in found.items() if name.startswith("unknown_share")]
+    assert (np.sum(bins, axis=0) == 1).all()
+
+
+def test_the_texts_say_the_figures_and_what_is_missing():
+    tables = {
+        "mine": scores([1.0, 99.0, math.inf, math.inf], status=["ok", "ok", "missing", "missing"]),
+        "random": scores([99.0] * 4),
+    }
+    board = leaderboard(tables, draws=200)
+    text = board_markdown(board, ABOUT)
+    assert "| mine | 0.250 [" in text
+    assert "mine: 2 queries have no row and count as misses." in text
+    assert "4 blocks in 2 places: fewer than 36 in 12" in text
+    assert "(c) OpenStreetMap contributors" in text
+    latex = board_latex(board, ABOUT)
+    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
+    assert "success_25m" not in latex.replace(r"\_", "~")
+    ((title, short),) = summary(board)
+    assert title == "success_25m, localization, prior group r500-weak-s3 (rank)"
+    assert short["occlusion"].tolist() == ["0.250 (1)", "0.000 (control)"]
+    assert len(warnings_of(board)) == 2
+
+
+def test_a_board_of_nothing_is_an_empty_table():
+    assert to_frame([]).empty
+    assert leaderboard({}).empty
+    assert warnings_of(leaderboard({})) == []

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards from runs and files: the same figures either way; faults are told in one line and nothing is written."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench import boards, cli
+from sasgeo_bench.boards import ScoreRequest, find_entries, make_board
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.run.oracle import right_answer
+from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.runner import run
+from sasgeo_bench.split import SplitFile, make_split
+from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.boardfile import read_board
+from sasgeo_bench.store.catalog import find_region_file, find_split_file, read_region_file, read_split_file
+from sasgeo_bench.tasks import make_tasks
+
+TOWNS = ("town-riverside", "town-suburb")
+
+
+class Doubt:
+    """Doubts every answer as often as answers were false where it was fitted."""
+
+    card = RejectorCard(name="doubt", version="1", title="Doubt", source="original", ours="all", licence="MIT")
+
+    def fit(self, predictions, is_false):
+        assert len(predictions) == len(is_false)
+        self.rate = float(np.mean(is_false))
+
+    def p_false(self, predictions):
+        return np.full(len(predictions), self.rate)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Two towns, a task each in which every fourth place is made absent, a run of the control that has the truth."""
+    out = tmp_path_factory.mktemp("boards") / "out"
+    wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=2, seed=2, out=out, may_be_fewer=True)
+    for request in plan_requests(wanted, tell=lambda _: None):
+        make_tasks(request, tell=lambda _: None)
+    tasks = [out / "tasks" / "clean" / town for town in TOWNS]
+    for town in TOWNS:
+        folder = out / "truth" / "clean" / town
+        truths = [replace(truth, is_present=at % 4 > 0) for at, truth in enumerate(taskdir.read_truths(folder))]
+        rows = [taskdir.truth_row(truth) for truth in truths]
+        pq.write_table(pa.Table.from_pylist(rows, schema=taskdir.TRUTH_SCHEMA), folder / taskdir.TRUTH)
+    run(plan_run(RunRequest(spec="oracle_pose", tasks=tasks, out=out)), tell=lambda _: None)
+    return out
+
+
+@pytest.fixture
+def out(built, tmp_path):
+    shutil.copytree(built, tmp_path / "out", symlinks=True)
+    return tmp_path / "out"
+
+
+@pytest.fixture(scope="module")
+def split():
+    grids = {town: read_region_file(find_region_file(town)).grid() for town in TOWNS}
+    spec = read_split_file(find_split_file("crossfit"))
+    places = [{"name": f"place-{town}", "regions": [town]} for town in TOWNS]
+    said = {"id": "towns", "title": "Towns", "kind": "crossfit", "buffer_m": 0.0, "reach_m": spec.reach_m}
+    return make_split(SplitFile.model_validate(said | {"place": places}), grids)
+
+
+def board_of(out, *predictions, **changes):
+    request = ScoreRequest(
+        predictions=predictions or [out / "runs"], root=out, board=out / "boards" / "mine", draws=200
+    )
+    return make_board(replace(request, **changes), tell=lambda _: None)
+
+
+def primary(board, matcher):
+    rows = board.table[(board.table["matcher"] == matcher) & (board.table["metric"] == "success_25m")]
+    return rows[rows["stratum"] == "all"].iloc[0]
+
+
+def submission(out, path, *, keep=lambda _: True):
+    """A file of right answers to some of the queries."""
+    rows = []
+    for town in TOWNS:
+        truths = {truth.query_id: truth for truth in taskdir.read_truths(out / "truth" / "clean" / town)}
+        for query in taskdir.read_queries(out / "tasks" / "clean" / town):
+            match = right_answer(query, truths[query.query_id])
+            candidates = tuple(zip(match.poses, match.scores, strict=True))
+            rows.append(Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence))
+    part = rundir.write_part(path.parent / "parts", [row for at, row in enumerate(rows) if keep(at)])
+    shutil.move(part, path)
+    return len(rows)
+
+
+def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_path):
+    submission(out, tmp_path / "mine.parquet")
+    board = board_of(out, out / "runs", tmp_path / "mine.parquet")
+    for name in ("oracle_pose", "mine"):
+        assert primary(board, name)["value"] == 1.0
+        absent = board.table[(board.table["matcher"] == name) & (board.table["metric"] == "answered_absent")]
+        assert set(absent["value"]) == {0.0}
+    columns = [name for name in board.scores["mine"].columns if name != "latency_s"]
+    pd.testing.assert_frame_equal(board.scores["mine"][columns], board.scores["oracle_pose"][columns])
+    about, table = read_board(out / "boards" / "mine")
+    assert [(entry["name"], entry["how"]) for entry in about["entries"]] == [
+        ("mine", "as submitted"),
+        ("oracle_pose", "reproduced"),
+    ]
+    assert about["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+    assert len(table) == len(board.table)
+    said = pq.read_schema(out / "boards" / "mine" / "leaderboard.parquet").metadata
+    assert said[b"scorer_version"] == b"1"
+    assert b"OpenStreetMap" in said[b"attribution"]
+
+
+def test_predictions_for_half_of_the_queries_are_misses_for_the_rest(out, tmp_path):
+    count = submission(out, tmp_path / "half.parquet", keep=lambda at: at % 2 == 0)
+    assert count % 2 == 0
+    board = board_of(out, tmp_path / "half.parquet")
+    assert len(board.scores["half"]) == count
+    row = primary(board, "half")
+    assert row["missing"] > 0
+    assert row["value"] == pytest.approx(1 - row["missing"] / row["n"])
+    text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
+    assert f"half: {count // 2} queries have no row and count as misses." in text
+
+
+def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_path, split):
+    submission(out, tmp_path / "mine.parquet")
+    board = board_of(out, tmp_path / "mine.parquet", rejectors=[f"{__name__}:Doubt"], split=split)
+    rows = board.table[board.table["rejector"] == "doubt"]
+    by_name = {row["metric"]: row for _, row in rows[rows["stratum"] == "as drawn"].iterrows()}
+    assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was doubted
+    assert by_name["coverage_at_risk_0.01"]["value"] == pytest.approx(
+        by_name["aurc"]["answered"] / by_name["aurc"]["n"]
+    )
+    assert set(board.scores["mine"]["place"]) == {f"place-{town}" for town in TOWNS}
+    pooled = rows[rows["suite"] == "all suites"]
+    assert {"present 0.9", "present 0.7", "present 0.5"} < set(pooled["stratum"])
+
+
+def test_rejectors_need_a_split_and_must_be_known(out, split):
+    with pytest.raises(ConfigError, match="name one with --split"):
+        board_of(out, rejectors=[f"{__name__}:Doubt"])
+    with pytest.raises(MatchError, match="there is no rejector 'duobt'"):
+        board_of(out, rejectors=["duobt"], split=split)
+    assert not (out / "boards").exists()
+
+
+def edit_json(path, **changes):
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
+
+
+def break_task(out):
+    edit_json(out / "tasks" / "clean" / TOWNS[0] / "task.json", task_version=0)
+
+
+def break_truth(out):
+    edit_json(out / "truth" / "clean" / TOWNS[0] / "truth.json", queries_sha256="0" * 64)
+
+
+def lose_truth(out):
+    (out / "truth" / "clean" / TOWNS[0] / "truth.parquet").unlink()
+
+
+def break_run(out):
+    for path in (out / "runs").rglob("run.json"):
+        edit_json(path, queries_sha256="0" * 64)
+
+
+def cut_part(out):
+    path = next((out / "runs").rglob("part-*.parquet"))
+    path.write_bytes(path.read_bytes()[:200])
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (break_task, "of task version 0, this scorer reads 1"),
+        (break_truth, "holds the truths of other queries"),
+        (lose_truth, "holds no truths of"),
+        (break_run, "answered other queries than"),
+        (cut_part, "cannot be read"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused_and_nothing_is_written(out, damage, words):
+    damage(out)
+    with pytest.raises(StoreError, match=words):
+        board_of(out)
+    assert not (out / "boards").exists()
+
+
+def test_a_board_of_another_scorer_version_is_not_replaced(out, monkeypatch):
+    board_of(out)
+    before = (out / "boards" / "mine" / "leaderboard.parquet").read_bytes()
+    board_of(out)  # of the same version it is
+    monkeypatch.setattr(boards, "SCORER_VERSION", 2)
+    with pytest.raises(StoreError, match="rows of scorer version 1, this one is 2"):
+        board_of(out)
+    assert (out / "boards" / "mine" / "leaderboard.parquet").read_bytes() == before
+
+
+def test_a_folder_with_other_things_is_not_replaced(out):
+    folder = out / "boards" / "mine"
+    folder.mkdir(parents=True)
+    (folder / "thesis.txt").write_text("years of work", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"thesis\.txt is no part of a board"):
+        board_of(out)
+    assert (folder / "thesis.txt").read_text(encoding="utf-8") == "years of work"
+
+
+def test_nothing_to_score_is_told(out, tmp_path):
+    rundir.write_part(tmp_path / "foreign", [Prediction(query_id="f" * 24)])
+    (part,) = rundir.parts_of(tmp_path / "foreign")
+    with pytest.raises(ConfigError, match="nothing to score"):
+        board_of(out, part)
+    with pytest.raises(StoreError, match="holds no run"):
+        board_of(out, tmp_path / "foreign")
+
+
+def test_two_files_of_one_name_are_refused(out, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        submission(out, tmp_path / name / "mine.parquet")
+    with pytest.raises(ConfigError, match="two contestants are named 'mine'"):
+        find_entries([tmp_path / "a" / "mine.parquet", tmp_path / "b" / "mine.parquet"])
+
+
+def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
+    words = ("score", "--predictions", str(out / "runs"), "--out", str(out), "--name", "mine", "--draws", "200")
+    monkeypatch.setattr("sys.argv", ["sasgeo-bench", *words])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code == 0
+    told = capsys.readouterr()
+    assert told.out.splitlines()[-1] == str(out / "boards" / "mine")
+    assert "oracle_pose  1.000 (control)" in told.out
+    assert "fewer than 36 in 12" in told.err
+    assert sorted(path.name for path in Path(told.out.splitlines()[-1]).iterdir()) == [
+        "board.json",
+        "leaderboard.csv",
+        "leaderboard.md",
+        "leaderboard.parquet",
+        "leaderboard.tex",
+        "scores.parquet",
+    ]
+
+
+def test_a_board_may_not_be_named_like_a_path(out, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["sasgeo-bench", "score", "--predictions", str(out / "runs"), "--name", "../x"])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code == 2
+    assert "--name must hold letters" in capsys.readouterr().err

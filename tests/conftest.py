@@ -16,6 +16,7 @@ from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.tasks import make_tasks
+from sasgeo_bench.testing import TinyPlace, tiny_place
 
 # No test depends on how busy the machine is; CI draws the same examples each time, a person's runs go on searching.
 settings.register_profile(
@@ -95,6 +96,12 @@ def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 make_tasks(request, tell=lambda _: None)
 
     return _made_once(tmp_path_factory, "tasks", draw)
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> TinyPlace:
+    """The place of the conformance kit, made in a second by each process; read it, do not write to it."""
+    return tiny_place(tmp_path_factory.mktemp("tiny") / "place")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -7,11 +7,20 @@ import sys
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.plugins import BUILT_IN, ORACLE, list_entry_points
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
+# Modules that a package of this name would hide: of Python, of this package and what it imports, and around them.
 _TAKEN: Final = frozenset(
-    {*sys.stdlib_module_names, "numpy", "sasgeo_bench", "sasgeo_baselines", "tests", "con", "nul"}
+    {
+        *sys.stdlib_module_names,
+        *("affine", "cv2", "filelock", "geopandas", "matplotlib", "numpy", "osmium", "pandas", "pooch", "psutil"),
+        *("pyarrow", "pydantic", "pyproj", "rasterio", "rich", "scipy", "shapely", "tqdm", "typer", "click"),
+        *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "statsmodels"),
+        *("hatchling", "hypothesis", "pip", "pytest", "setuptools"),
+        *("src", "test", "tests", "con", "nul", "aux", "prn"),
+    }
 )
 
 _PYPROJECT: Final = """\
@@ -99,6 +108,8 @@ class {cls}:
         return float(agree.sum() / max(1, either.sum()))
 '''
 
+_IMPORTED: Final = frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", _MATCHER, re.MULTILINE))))
+
 _TEST: Final = '''\
 """The matcher keeps to what every matcher keeps to."""
 
@@ -137,7 +148,7 @@ def plugin_files(name: str) -> dict[str, str]:
     Raises
     ------
     ConfigError
-        If it is no such name.
+        If it is no such name, or taken.
 
     Examples
     --------
@@ -153,12 +164,18 @@ def plugin_files(name: str) -> dict[str, str]:
             f"a matcher's name has lower-case letters, digits, hyphens and underscores, as in my-matcher; got {name!r}"
         )
         raise ConfigError(message)
+    known = list_entry_points().get(name)
+    home = known.dist.name if known is not None and known.dist is not None else ""
+    if name == ORACLE or home == BUILT_IN:
+        message = f"{name!r} is a matcher of sasgeo-bench itself, which would be used instead of yours; choose another"
+        raise ConfigError(message)
     words = re.split(r"[-_]", name)
+    own = "".join(word.capitalize() for word in words)
     said = {
         "name": name,
         "distribution": name.replace("_", "-"),
         "module": name.replace("-", "_"),
-        "cls": "".join(word.capitalize() for word in words),
+        "cls": f"{own}Matcher" if own in _IMPORTED or keyword.iskeyword(own) else own,
         "title": " ".join(words).capitalize(),
     }
     files = {

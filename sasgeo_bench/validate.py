@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import pyarrow as pa
-
 from sasgeo_bench.errors import MatchError, PoseError, StoreError
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
-from sasgeo_bench.query import Query
+from sasgeo_bench.query import TASK_VERSION, Query
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
 
@@ -52,63 +50,45 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     Yields
     ------
     Violation
-        In the order of the rows; queries without a row come last.
+        In the order of the rows; queries without a row come last, unless a file could not be read by its columns.
 
     Raises
     ------
     StoreError
-        If a file cannot be read at all.
+        If a file cannot be read at all, or a task is of another version.
     """
-    queries = {query.query_id: query for task in tasks for query in taskdir.read_queries(task)}
+    queries = {query.query_id: query for task in tasks for query in _queries(task)}
     seen: dict[str, str] = {}
     files = rundir.parts_of(path)
     if not files:
         message = f"{path} holds no predictions: name a predictions file, or the folder of a run"
         raise StoreError(message)
+    unread = 0
     # In a run's folder a query stands twice where it was asked again: the newer row counts.
     for file in reversed(files):
         before = frozenset(seen) if path.is_dir() else frozenset()
         table = rundir.read_part(file)
-        faults = list(_schema_faults(file.name, table))
-        yield from faults
-        if any(fault.expected.startswith("a column") for fault in faults):
-            continue
-        for row, item in enumerate(table.to_pylist()):
+        differing = rundir.differing_columns(table)
+        for column, found, expected in differing:
+            yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
+        unread += bool(differing)
+        for row, item in enumerate([] if differing else table.to_pylist()):
             if item["query_id"] not in before:
                 yield from _row_faults(file.name, row, item, queries, seen)
-    missing = [name for name in queries if name not in seen]
+    missing = [] if unread else [name for name in queries if name not in seen]
     for name in missing:
         yield Violation(
             file=path.name, row=-1, column="query_id", found=f"no row for {name}", expected="one for every query"
         )
 
 
-def _schema_faults(file: str, table: pa.Table) -> Iterator[Violation]:
-    for field in rundir.PREDICTION_SCHEMA:
-        if field.name not in table.column_names:
-            yield Violation(file=file, row=-1, column=field.name, found="nothing", expected=f"a column of {field.type}")
-        elif not _is_like(table.schema.field(field.name).type, field.type):
-            found = str(table.schema.field(field.name).type)
-            yield Violation(file=file, row=-1, column=field.name, found=found, expected=f"a column of {field.type}")
-
-
-def _is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
-    """Whether a column can be read as another: any float for a float, any string for a string, null for anything."""
-    if pa.types.is_null(found) or found.equals(wanted):
-        return True
-    if pa.types.is_floating(wanted):
-        return bool(pa.types.is_floating(found) or pa.types.is_integer(found))
-    if pa.types.is_string(wanted):
-        return bool(pa.types.is_string(found) or pa.types.is_large_string(found))
-    if pa.types.is_list(wanted):
-        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
-        return is_list and pa.types.is_struct(found.value_type) and _has_fields(found.value_type, wanted.value_type)
-    return bool(pa.types.is_map(wanted) and pa.types.is_map(found))
-
-
-def _has_fields(found: pa.StructType, wanted: pa.StructType) -> bool:
-    names = {field.name for field in found}
-    return all(field.name in names and _is_like(found.field(field.name).type, field.type) for field in wanted)
+def _queries(task: Path) -> Iterator[Query]:
+    """Queries of a task, of the version that this program asks."""
+    version = taskdir.read_task(task).get("task_version")
+    if version != TASK_VERSION:
+        message = f"{task} has task version {version!r}, this version asks {TASK_VERSION}: make the queries again"
+        raise StoreError(message)
+    yield from taskdir.read_queries(task)
 
 
 def _row_faults(
@@ -157,8 +137,10 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Query) -
             diagnostics=prediction.diagnostics,
         )
         check_match(match, query, top_k=MOST_CANDIDATES)
-    except (MatchError, PoseError) as error:
-        text = str(error)
-        column = "confidence" if "confidence" in text else "diagnostics" if "diagnostics" in text else "candidates"
-        found, _, expected = text.partition(", expected ")
+    except PoseError as error:
+        expected, _, found = str(error).partition(", got ")
+        yield Violation(file=file, row=row, column="candidates", found=found, expected=expected)
+    except MatchError as error:
+        found, _, expected = str(error).partition(", expected ")
+        column = next((name for name in ("diagnostics", "confidence") if name in found), "candidates")
         yield Violation(file=file, row=row, column=column, found=found, expected=expected or "an answer")

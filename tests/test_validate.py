@@ -56,6 +56,7 @@ def test_a_sound_file_has_no_violation(tmp_path, task, answers):
         ({"latency_s": -1.0}, "latency_s", "-1.0"),
         ({"query_id": "0" * 24}, "query_id", f"'{'0' * 24}'"),
         ({"diagnostics": {"margin": float("nan")}}, "diagnostics", "diagnostics['margin'] is nan"),
+        ({"diagnostics": {"confidence": float("nan")}}, "diagnostics", "diagnostics['confidence'] is nan"),
     ],
 )
 def test_a_fault_is_named_by_its_row_and_column(tmp_path, task, answers, change, column, found):
@@ -73,6 +74,9 @@ def test_a_pose_without_a_place_is_named(tmp_path, task, answers):
     pq.write_table(pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA), path)
     listed = [(item.row, item.column) for item in validate(path, [task])]
     assert listed == [(1, "candidates"), (2, "candidates")]
+    (fault, _) = validate(path, [task])
+    assert fault.to_text().startswith("mine.parquet, row 1, candidates: found Pose(easting_m=nan, ")
+    assert fault.expected == "a pose has finite values"
 
 
 def test_missing_and_double_rows_are_named(tmp_path, task, answers):
@@ -88,6 +92,24 @@ def test_columns_that_are_missing_or_of_another_kind_are_named(tmp_path, task, a
     assert ("confidence", "nothing") in [(item.column, item.found) for item in validate(path, [task])]
     pq.write_table(full.set_column(0, "query_id", pa.array(range(len(answers)))), path)
     assert ("query_id", "int64") in [(item.column, item.found) for item in validate(path, [task])]
+
+
+@pytest.mark.parametrize("change", [{"query_id": None}, {"status": None}])
+def test_a_null_where_something_must_stand_is_named(tmp_path, task, answers, change):
+    listed = faults(tmp_path, task, [replace(answers[0], **change), *answers[1:]])
+    assert listed[0][:3] == (0, *change, "None")
+
+
+def test_more_columns_in_any_order_do_no_harm(tmp_path, task, answers):
+    path = tmp_path / "mine.parquet"
+    rows = [rundir.prediction_row(item) for item in answers]
+    full = pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA)
+    pq.write_table(full.select(full.column_names[::-1]).append_column("rank", pa.array(range(len(rows)))), path)
+    assert list(validate(path, [task])) == []
+    candidates = pa.array([[item | {"rank": 1} for item in row["candidates"]] for row in rows])
+    pq.write_table(full.set_column(1, "candidates", candidates), path)
+    assert list(validate(path, [task])) == []
+    assert {item.candidates for item in rundir.read_predictions(path)} == {((POSE, 1.0),)}
 
 
 def test_a_truncated_file_gets_one_line(tmp_path, task, answers):

@@ -11,16 +11,15 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import PoseError, StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
 
 RUN: Final = "run.json"
 SCHEMA_VERSION: Final = 1
-_CANDIDATE: Final = pa.struct(
-    [(name, pa.float64()) for name in ("easting_m", "northing_m", "yaw_deg", "scale", "score")]
-)
+_POSE: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
+_CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*_POSE, "score")])
 PREDICTION_SCHEMA: Final = pa.schema(
     [
         ("query_id", pa.string()),
@@ -58,11 +57,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
 
 
 def prediction_of(row: Mapping[str, Any]) -> Prediction:
-    """Inverse of `prediction_row`."""
-    poses = tuple(
-        (Pose(**{name: value for name, value in item.items() if name != "score"}), item["score"])
-        for item in row["candidates"] or ()
-    )
+    """Inverse of `prediction_row`; whatever else a candidate holds is passed over."""
+    poses = tuple((Pose(**{name: item[name] for name in _POSE}), item["score"]) for item in row["candidates"] or ())
     return Prediction(
         query_id=row["query_id"],
         candidates=poses,
@@ -82,11 +78,11 @@ def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
     StoreError
         If the disk is full or the folder cannot be written; what was there before is as it was.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     name = f"part-{time.time_ns():020d}-{os.getpid()}"
     scratch, path = folder / f".{name}.partial", folder / f"{name}.parquet"
     table = pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=PREDICTION_SCHEMA)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, scratch, compression="zstd")
         _flush(scratch)
         scratch.rename(path)
@@ -136,13 +132,64 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
     seen: set[str] = set()
     for part in reversed(parts):
         table = read_part(part)
-        if table.column_names != PREDICTION_SCHEMA.names or not pa.types.is_string(table.schema.field("query_id").type):
+        if differing_columns(table):
             message = f"{part} holds no predictions: 'validate' says what is missing"
             raise StoreError(message)
-        for row in reversed(table.to_pylist()):
+        for number, row in reversed(list(enumerate(table.to_pylist()))):
             if row["query_id"] not in seen:
                 seen.add(row["query_id"])
-                yield prediction_of(row)
+                yield _read_row(part, number, row)
+
+
+def _read_row(part: Path, number: int, row: Mapping[str, Any]) -> Prediction:
+    """One row of a file that may be anyone's."""
+    where = f"{part}, row {number}, is no prediction"
+    absent = next((name for name in ("query_id", "status") if row[name] is None), None)
+    if absent is not None:
+        message = f"{where} ({absent} is null): 'validate' says all that is wrong"
+        raise StoreError(message)
+    try:
+        return prediction_of(row)
+    except (PoseError, TypeError) as error:
+        message = f"{where} ({error}): 'validate' says all that is wrong"
+        raise StoreError(message) from error
+
+
+def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
+    """Columns that a table of predictions must hold and this one does not: their names, what is found, and expected.
+
+    More columns, in any order, do no harm.
+
+    Examples
+    --------
+    >>> differing_columns(PREDICTION_SCHEMA.empty_table().drop_columns(["message"]))
+    [('message', 'nothing', 'string')]
+    """
+    found = {field.name: field.type for field in table.schema}
+    return [
+        (field.name, str(found.get(field.name, "nothing")), str(field.type))
+        for field in PREDICTION_SCHEMA
+        if field.name not in found or not _is_like(found[field.name], field.type)
+    ]
+
+
+def _is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
+    """Whether a column can be read as another: any float for a float, any string for a string, null for anything."""
+    if pa.types.is_null(found) or found.equals(wanted):
+        return True
+    if pa.types.is_floating(wanted):
+        return bool(pa.types.is_floating(found) or pa.types.is_integer(found))
+    if pa.types.is_string(wanted):
+        return bool(pa.types.is_string(found) or pa.types.is_large_string(found))
+    if pa.types.is_list(wanted):
+        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
+        return is_list and pa.types.is_struct(found.value_type) and _has_fields(found.value_type, wanted.value_type)
+    return bool(pa.types.is_map(wanted) and pa.types.is_map(found))
+
+
+def _has_fields(found: pa.StructType, wanted: pa.StructType) -> bool:
+    names = {field.name for field in found}
+    return all(field.name in names and _is_like(found.field(field.name).type, field.type) for field in wanted)
 
 
 def read_part(path: Path) -> pa.Table:
@@ -157,7 +204,7 @@ def read_part(path: Path) -> pa.Table:
         return pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         text = " ".join(str(error).split())[:200]
-        message = f"{path} cannot be read ({text}): write it again"
+        message = f"{path} cannot be read ({text}): write it again, or remove it where it is a part of a run"
         raise StoreError(message) from error
 
 
@@ -170,8 +217,10 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
     Raises
     ------
     StoreError
-        If there are none, a file cannot be read, or the new one cannot be written.
+        If there are none, the folders are of different matchers, versions or settings, a file cannot be read, or the
+        new one cannot be written.
     """
+    _check_one_matcher(runs)
     if into.exists() and not _is_ours(into):
         message = f"{into} is no predictions file and would be lost: name another one"
         raise StoreError(message)
@@ -193,6 +242,26 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
     return len(rows)
 
 
+def _check_one_matcher(runs: Sequence[Path]) -> None:
+    """Refuse folders whose `run.json` say different things of who answered; files say nothing of it."""
+    said = [(path, read_run(path)) for path in runs]
+    known = [(path, about) for path, about in said if about is not None]
+    for path, about in known[1:]:
+        first, other = known[0]
+        if about.get("hash") != other.get("hash"):
+            message = (
+                f"{path} holds answers of {_who(about)}, {first} those of {_who(other)}: "
+                "two matchers, versions or settings are never mixed"
+            )
+            raise StoreError(message)
+
+
+def _who(about: Mapping[str, Any]) -> str:
+    card = about.get("matcher")
+    name, version = (card.get("name"), card.get("version")) if isinstance(card, dict) else (None, None)
+    return f"{name} {version} ({about.get('hash')})"
+
+
 def _is_ours(path: Path) -> bool:
     try:
         return path.is_file() and pq.read_schema(path).names == PREDICTION_SCHEMA.names
@@ -201,22 +270,42 @@ def _is_ours(path: Path) -> bool:
 
 
 def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
-    """Ids of the queries a run has answered; those with a status in `again` do not count."""
+    """Ids of the queries a run has answered; those with a status in `again` do not count.
+
+    Raises
+    ------
+    StoreError
+        If a part cannot be read, or is none.
+    """
     left_out = set(again)
     found: set[str] = set()
     for part in parts_of(folder):
-        table = read_part(part).select(["query_id", "status"])
+        table = read_part(part)
+        if differing_columns(table):
+            message = f"{part} holds no predictions: move it out of the run's folder"
+            raise StoreError(message)
         pairs = zip(table["query_id"].to_pylist(), table["status"].to_pylist(), strict=True)
         found |= {name for name, status in pairs if status not in left_out}
     return found
 
 
 def write_run(folder: Path, about: Mapping[str, Any]) -> None:
-    """Write `run.json`, in place of an older one."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write `run.json`, in place of an older one.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be written.
+    """
     scratch = folder / f".{RUN}.{os.getpid()}"
-    scratch.write_text(json.dumps(dict(about), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    scratch.rename(folder / RUN)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        scratch.write_text(json.dumps(dict(about), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        scratch.rename(folder / RUN)
+    except OSError as error:
+        _remove(scratch)
+        message = f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
+        raise StoreError(message) from error
 
 
 def read_run(folder: Path) -> dict[str, Any] | None:
@@ -230,8 +319,11 @@ def read_run(folder: Path) -> dict[str, Any] | None:
     path = folder / RUN
     if not path.is_file():
         return None
+    damaged = StoreError(f"{path} is damaged: remove it and run again, the parts beside it are kept")
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
-        message = f"{path} is damaged: remove it and run again, the parts beside it are kept"
-        raise StoreError(message) from error
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise damaged from error
+    if not isinstance(content, dict):
+        raise damaged
+    return content

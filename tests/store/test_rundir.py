@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on disk: rows that are read as they were written, whoever wrote them; what is wrong with a file, in a line."""
+
+import errno
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.store import rundir
+
+POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
+FULL = Prediction(
+    query_id="b", candidates=((POSE, 0.7), (POSE, 0.1)), confidence=0.5, diagnostics={"margin": 0.6}, latency_s=0.01
+)
+FAILED = Prediction(query_id="a", status="crash", message="died by SIGSEGV")
+
+
+@pytest.fixture
+def rows(tmp_path):
+    """The table of a sound file, to be changed and written by `write`."""
+    path = rundir.write_part(tmp_path / "sound", [FULL, FAILED])
+    return pq.read_table(path)
+
+
+@pytest.fixture
+def write(tmp_path):
+    def put(table, name="mine.parquet"):
+        pq.write_table(table, tmp_path / name)
+        return tmp_path / name
+
+    return put
+
+
+def refusal(read, *words):
+    with pytest.raises(StoreError) as refused:
+        read(*words)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def everything(path):
+    return list(rundir.read_predictions(path))
+
+
+def with_column(table, name, values):
+    return table.set_column(table.column_names.index(name), name, values)
+
+
+def test_rows_are_read_as_they_were_written(tmp_path):
+    folder = tmp_path / "run"
+    rundir.write_part(folder, [FULL])
+    rundir.write_part(folder, [FAILED])
+    assert sorted(everything(folder), key=lambda item: item.query_id) == [FAILED, FULL]
+    assert rundir.ids_done(folder) == {"a", "b"}
+    assert rundir.ids_done(folder, again=("crash",)) == {"b"}
+    assert {path.suffix for path in folder.iterdir()} == {".parquet"}
+
+
+def test_more_columns_other_orders_and_like_types_are_read_too(rows, write):
+    strings = with_column(rows, "status", rows["status"].cast(pa.large_string()))
+    single = with_column(rows, "confidence", rows["confidence"].cast(pa.float32()))
+    nothing = with_column(rows, "latency_s", pa.nulls(2))
+    for table in (rows.select(rows.column_names[::-1]), rows.append_column("rank", pa.array([1, 2])), strings, single):
+        assert everything(write(table))[::-1] == [FULL, FAILED]
+    assert {item.latency_s for item in everything(write(nothing))} == {None}
+
+
+@pytest.mark.parametrize("name", rundir.PREDICTION_SCHEMA.names)
+def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_are_read(tmp_path, rows, write, name):
+    for table in (rows.drop_columns([name]), with_column(rows, name, pa.array([[True], [False]]))):
+        (column, _, _) = rundir.differing_columns(table)[0]
+        assert column == name
+        path = write(table, "part-1.parquet")
+        assert "holds no predictions: 'validate' says what is missing" in refusal(everything, path)
+        assert "holds no predictions" in refusal(rundir.merge_runs, [path], tmp_path / "new.parquet")
+        assert "move it out of the run's folder" in refusal(rundir.ids_done, tmp_path)
+    assert not (tmp_path / "new.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("query_id", None, "(query_id is null)"),
+        ("status", None, "(status is null)"),
+        ("candidates", [{"easting_m": None}], "is no prediction ("),
+        ("candidates", [{"easting_m": float("nan")}], "(a pose has finite values, got Pose(easting_m=nan"),
+        ("candidates", [{"scale": 0.0}], "(scale must be positive, got 0.0)"),
+        ("candidates", [None], "is no prediction ("),
+    ],
+)
+def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words):
+    row = rows.to_pylist()[0]
+    if name == "candidates":
+        value = [item and row["candidates"][0] | item for item in value]
+    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=rundir.PREDICTION_SCHEMA)
+    pq.write_table(table, tmp_path / "mine.parquet")
+    told = refusal(everything, tmp_path / "mine.parquet")
+    assert "mine.parquet, row 1, is no prediction (" in told
+    assert words in told
+    assert told.endswith("'validate' says all that is wrong")
+
+
+def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows, write):
+    folders = [tmp_path / name for name in ("one", "two", "three")]
+    for folder, found in zip(folders, ("aa", "aa", "bb"), strict=True):
+        rundir.write_part(folder, [FULL])
+        rundir.write_run(folder, {"hash": found, "matcher": {"name": "mine", "version": found[0]}})
+    into = tmp_path / "all.parquet"
+    assert rundir.merge_runs(folders[:2], into) == 1
+    assert rundir.merge_runs([folders[2], write(rows)], into) == 2  # a file does not say whose it is
+    whole = into.read_bytes()
+    assert "never mixed" in refusal(rundir.merge_runs, folders[1:], into)
+    told = refusal(rundir.merge_runs, folders, into)
+    assert f"{folders[2]} holds answers of mine b (bb), {folders[0]} those of mine a (aa)" in told
+    (folders[2] / rundir.RUN).write_text('{"hash": 1, "matcher": 2}')
+    assert "None None (1)" in refusal(rundir.merge_runs, folders, into)
+    assert into.read_bytes() == whole
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", "[" * 100_000, "\x00"])
+def test_a_damaged_run_json_is_told_in_one_line(tmp_path, text):
+    (tmp_path / rundir.RUN).write_text(text)
+    assert "run.json is damaged: remove it and run again" in refusal(rundir.read_run, tmp_path)
+
+
+def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):
+    assert rundir.read_run(tmp_path) is None
+    for about in ({"hash": "aa"}, {"hash": "bb", "title": "Köln"}):
+        rundir.write_run(tmp_path / "run", about)
+        assert rundir.read_run(tmp_path / "run") == about
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [rundir.RUN]
+
+
+def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for folder in (tmp_path / "file", tmp_path / "file" / "deep"):
+        assert f"{folder} cannot be written (" in refusal(rundir.write_run, folder, {})
+        assert f"{folder} cannot be written (" in refusal(rundir.write_part, folder, [FULL])
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_full_disk_leaves_the_run_json_that_was_there(tmp_path, monkeypatch):
+    rundir.write_run(tmp_path, {"hash": "aa"})
+
+    def full(self, text, **_):
+        self.write_bytes(text[:4].encode())
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    assert "No space left on device" in refusal(rundir.write_run, tmp_path, {"hash": "bb"})
+    assert rundir.read_run(tmp_path) == {"hash": "aa"}
+    assert [path.name for path in tmp_path.iterdir()] == [rundir.RUN]

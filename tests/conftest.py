@@ -12,6 +12,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from sasgeo_bench import cli
 from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
@@ -102,6 +103,40 @@ def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> TinyPlace:
     """The place of the conformance kit, made in a second by each process; read it, do not write to it."""
     return tiny_place(tmp_path_factory.mktemp("tiny") / "place")
+
+
+@pytest.fixture
+def program(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., tuple[int, str, str]]:
+    """Run the program in an empty folder, without extracts; exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)
+    monkeypatch.delenv("SASGEO_OUT", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["sasgeo-bench", *map(str, words)])
+        with pytest.raises(SystemExit) as leaving:
+            cli.main()
+        told = capsys.readouterr()
+        return int(leaving.value.code or 0), told.out, told.err
+
+    return run
+
+
+@pytest.fixture
+def mistake(program: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """The one line that a user's mistake gets."""
+
+    def run(*words: object) -> str:
+        code, out, err = program(*words)
+        assert code == 2, err
+        assert out == ""
+        assert len(err.strip().splitlines()) == 1, err
+        return err.strip()
+
+    return run
 
 
 @pytest.fixture(autouse=True, scope="session")

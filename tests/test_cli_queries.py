@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import pytest
 
-from sasgeo_bench import cli
 from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.store.catalog import read_region_file, shipped_dir
 from sasgeo_bench.store.taskdir import QUERIES, TASK, TRUTH, TRUTH_OF, read_queries
@@ -17,38 +16,6 @@ from sasgeo_bench.suites.all_suites import SUITES
 
 RIVERSIDE = "town-riverside"
 CLEAN = f"clean/{RIVERSIDE}"
-
-
-@pytest.fixture
-def program(monkeypatch, capsys, tmp_path):
-    """Run the program in an empty folder, without extracts; exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)
-    monkeypatch.delenv("SASGEO_OUT", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
-
-    def run(*words):
-        monkeypatch.setattr("sys.argv", ["sasgeo-bench", *map(str, words)])
-        with pytest.raises(SystemExit) as leaving:
-            cli.main()
-        told = capsys.readouterr()
-        return leaving.value.code or 0, told.out, told.err
-
-    return run
-
-
-@pytest.fixture
-def mistake(program):
-    """The one line that a user's mistake gets."""
-
-    def run(*words):
-        code, out, err = program(*words)
-        assert code == 2, err
-        assert out == ""
-        assert len(err.strip().splitlines()) == 1, err
-        return err.strip()
-
-    return run
 
 
 @pytest.fixture

@@ -15,12 +15,12 @@ SOURCES := sasgeo_bench baselines benchmarks tests
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region queries test check bench ageing docs lock clean
+.PHONY: help install demo list-regions build-region queries leaderboard test check bench ageing docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@printf '\nVariables: REGION=<id> DATE=<yyyy-mm-dd> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
+	@printf '\nVariables: REGION=<id> PIPELINE=<id> DATE=<yyyy-mm-dd> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
 
 # Rebuilt when the lock or the packages' own metadata change; otherwise nothing runs, so a second call is quick.
 $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
@@ -35,9 +35,10 @@ $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
 
 install: $(STAMP) ## set up .venv from requirements.lock (the other targets do it too)
 
-demo: $(STAMP) ## build the region of an embedded town, offline, and show what is in it
+demo: $(STAMP) ## build an embedded town and show what is in it; then a small leaderboard, all offline
 	$(SASGEO) build-region town-riverside --out $(OUT) $(ARGS)
 	$(SASGEO) inspect town-riverside --out $(OUT)
+	$(SASGEO) leaderboard demo --jobs 2 --out $(OUT)
 
 list-regions: $(STAMP) ## list the regions that come with the package
 	$(SASGEO) list-regions $(ARGS)
@@ -49,6 +50,10 @@ build-region: $(STAMP) ## build one region: REGION=vaduz, and DATE=2021-10-28 fo
 queries: $(STAMP) ## draw every suite on the towns, and on each real region whose extract is here: N=8 sites each, SEED=0
 	$(SASGEO) make-queries --up-to --skip $(if $(N),--n $(N)) $(if $(SEED),--seed $(SEED)) \
 	  $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
+
+leaderboard: $(STAMP) ## carry out an experiment of pipelines/: PIPELINE=demo, or a file; goes on where it was cut off
+	@test -n "$(PIPELINE)" || { echo "name the pipeline: make leaderboard PIPELINE=demo (pipelines/ holds all)" >&2; exit 2; }
+	$(SASGEO) leaderboard $(PIPELINE) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(ARGS)

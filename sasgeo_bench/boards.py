@@ -15,6 +15,7 @@ from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
 from sasgeo_bench.query import TASK_VERSION
 from sasgeo_bench.region import DATA_VERSION
+from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import judge
@@ -48,6 +49,8 @@ class ScoreRequest:
         Where tasks/ and truth/ are.
     split : Split, optional
         Says which blocks are one place, and which calibrate; needed for rejectors.
+    contrasts : sequence of Contrast
+        Those that were registered.
     rejectors : sequence of str
         Names, or module:Class.
     board : Path
@@ -61,6 +64,7 @@ class ScoreRequest:
     board: Path
     tasks: Sequence[Path] = ()
     split: Split | None = None
+    contrasts: Sequence[Contrast] = ()
     rejectors: Sequence[str] = ()
     draws: int = DRAWS
 
@@ -88,6 +92,7 @@ class Board:
     scores: dict[str, pd.DataFrame]
     predictions: dict[str, dict[str, Prediction]]
     table: pd.DataFrame
+    findings: tuple[Finding, ...] = ()
     tasks: tuple[dict[str, Any], ...] = field(default=())
 
 
@@ -179,16 +184,21 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     abouts = [_check_task(folder, request.root) for folder in folders]
     scores = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
     rows = [leaderboard(scores, draws=request.draws)]
+    all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     for entry in entries:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs))))
         for name, judged_by in judges.items():
             judged = judged_by(frame, predictions[entry.name])
+            all_judged[entry.name, name] = judged
             if len(judged):
                 rows.append(to_frame(list(integrity_rows(entry.name, name, judged))))
         tell(f"{entry.name}: {int(frame['is_answered'].sum())} of {len(frame)} queries answered")
     table = pd.concat([item for item in rows if len(item)], ignore_index=True)
-    board = Board(entries=entries, scores=scores, predictions=predictions, table=table, tasks=tuple(abouts))
+    findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
+    board = Board(
+        entries=entries, scores=scores, predictions=predictions, table=table, findings=findings, tasks=tuple(abouts)
+    )
     _write(request, board)
     return board
 
@@ -300,9 +310,9 @@ def _write(request: ScoreRequest, board: Board) -> None:
     scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
     write_board(
         request.board,
-        tables={"leaderboard": board.table, "scores": scores},
+        tables={"leaderboard": board.table, "scores": scores, "contrasts": contrast_frame(board.findings)},
         texts={
-            "leaderboard.md": board_markdown(board.table, about),
+            "leaderboard.md": board_markdown(board.table, about, board.findings),
             "leaderboard.tex": board_latex(board.table, about),
         },
         about=about,

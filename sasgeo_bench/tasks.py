@@ -3,6 +3,7 @@
 
 import datetime as dt
 import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -21,7 +22,7 @@ from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query, Truth
+from sasgeo_bench.query import TASK_VERSION, Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
@@ -76,6 +77,45 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
         return _make_tasks(request, suite, tell)
 
 
+def made_tasks(request: Request) -> tuple[Path, ...] | None:
+    """Task folders that this very request has made, or None if it has to be carried out.
+
+    They are as they were written, nothing of the request or of this version of the program has changed since, and the
+    map they search is the one that a build would give.
+    """
+    said = taskdir.read_made(request.out / "truth" / request.suite / request.region.id)
+    if said is None or said[0] != _request_sha256(request):
+        return None
+    folders = []
+    for region, sha256 in sorted(said[1].items()):
+        folder = request.out / "tasks" / request.suite / region
+        try:
+            about = taskdir.read_task(folder)
+            if about["files"][taskdir.QUERIES]["sha256"] != sha256 or check_task(folder, out=request.out):
+                return None
+        except StoreError:
+            return None
+        folders.append(folder)
+    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
+    return tuple(folders) if plan.is_current else None
+
+
+def _request_sha256(request: Request) -> str:
+    """Hash of all that decides which queries come of a request."""
+    elsewhere = None if request.elsewhere is None else request.elsewhere.model_dump(mode="json")
+    said = {
+        "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
+        "region": request.region.model_dump(mode="json"),
+        "elsewhere": elsewhere,
+        "split": request.split.spec.model_dump(mode="json"),
+        "count": [request.count, request.may_be_fewer],
+        "seed": request.seed,
+        "group": None if request.group is None else request.group.name,
+        "made_by": version("sasgeo-bench"),
+    }
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
 def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
     if request.group is not None and suite.card.has_own_priors:
         message = f"suite {suite.card.name!r} is about what is known before: leave --prior out"
@@ -93,7 +133,13 @@ def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     scene, sites = _edited(request, suite, scene, base, sites, seeds)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split)
-    return tuple(_write(request, drawer, sites, tell))
+    made = tuple(_write(request, drawer, sites, tell))
+    hashes = {
+        item.folder.name: str(taskdir.read_task(item.folder)["files"][taskdir.QUERIES]["sha256"]) for item in made
+    }
+    truth_folder = request.out / "truth" / suite.card.name / request.region.id
+    taskdir.write_made(truth_folder, _request_sha256(request), hashes)
+    return made
 
 
 def _view_reach_m(request: Request, suite: Suite) -> float:

@@ -54,6 +54,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "split": None,
     "trajectory": None,
     "duplicates": None,
+    "pipelinefile": None,
     "twin": None,
     "suites": (
         *("base", "sites", "mining", "vectors", "twins"),
@@ -82,7 +83,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "score": None,
     "report": (
-        *("measures", "rows", "strata", "tables", "rejection", "integrity", "costs", "text"),
+        *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "costs", "text"),
         *("plots", "site"),
     ),
     "boards": None,
@@ -90,7 +91,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "validate": None,
     "scaffold": None,
     "testing": None,
-    "cli": ("console", "regions", "ageing", "queries", "looking", "matchers", "runs", "program"),
+    "cli": ("console", "regions", "ageing", "queries", "looking", "matchers", "runs", "boards", "program"),
 }
 
 # The rooms that touch the disk, and the few calls others may make, each with its reason.

@@ -247,6 +247,7 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
     assert "fewer than 36 in 12" in told.err
     assert sorted(path.name for path in Path(told.out.splitlines()[-1]).iterdir()) == [
         "board.json",
+        "contrasts.parquet",
         "leaderboard.csv",
         "leaderboard.md",
         "leaderboard.parquet",

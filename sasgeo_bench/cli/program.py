@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.ageing import compare_ageing_command, measure_ageing_command
+from sasgeo_bench.cli.boards import leaderboard_command, score_command
 from sasgeo_bench.cli.console import EXIT_USER, ExtractFolders, Out, errors, print_table
 from sasgeo_bench.cli.looking import inspect_command, verify_command
 from sasgeo_bench.cli.matchers import (
@@ -20,7 +21,7 @@ from sasgeo_bench.cli.matchers import (
 )
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
-from sasgeo_bench.cli.runs import merge_command, run_command, score_command, validate_command
+from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import SasgeoError
 
@@ -54,6 +55,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "merge": merge_command,
     "validate": validate_command,
     "score": score_command,
+    "leaderboard": leaderboard_command,
 }
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)

@@ -1,29 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that run matchers, check their predictions and score them."""
+"""Commands that run matchers and check their predictions."""
 
-import re
 import sys
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
-import pandas as pd
 import typer
-from rich.table import Table
 
-from sasgeo_bench.boards import ScoreRequest, make_board
-from sasgeo_bench.cli.console import EXIT_USER, Bars, Out, RegionFolders, print_table, tell
+from sasgeo_bench.cli.console import EXIT_USER, Bars, Out, tell
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.metrics.intervals import DRAWS
-from sasgeo_bench.report.text import summary, warnings_of
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
-from sasgeo_bench.split import Split, make_split
-from sasgeo_bench.store.catalog import find_split_file, list_region_files, read_region_file, read_split_file
 from sasgeo_bench.store.rundir import merge_runs
 from sasgeo_bench.validate import validate
-
-BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 def run_command(  # noqa: PLR0913 - a command has as many flags as its users need
@@ -107,58 +97,3 @@ def validate_command(
         tell(f"{predictions}: {count} violations")
         raise typer.Exit(EXIT_USER)
     typer.echo(f"{predictions}: answers every query of {len(tasks)} tasks, and nothing else")
-
-
-def score_command(  # noqa: PLR0913 - a command has as many flags as its users need
-    *,
-    predictions: Annotated[
-        list[Path], typer.Option(help="folder with runs in it, or file of predictions; may be repeated")
-    ],
-    tasks: Annotated[
-        list[Path] | None, typer.Option(help="task folder; may be repeated; default: all that are answered")
-    ] = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="folder of the truths, beside the tasks; default: OUT/truth")
-    ] = None,
-    name: Annotated[str, typer.Option(help="of the board: OUT/boards/NAME")] = "board",
-    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
-    rejector: Annotated[
-        list[str] | None, typer.Option(help="name from list-rejectors, or module:Class; may be repeated")
-    ] = None,
-    region_folders: RegionFolders = None,
-    draws: Annotated[int, typer.Option(min=100, help="of the bootstrap")] = DRAWS,
-    out: Out = Path("out"),
-) -> None:
-    """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
-    if not BOARD_NAME.fullmatch(name):
-        message = f"--name must hold letters, digits, hyphens and underscores, got {name!r}"
-        raise ConfigError(message)
-    request = ScoreRequest(
-        predictions=predictions,
-        tasks=tasks or (),
-        root=out if truth is None else truth.resolve().parent,
-        split=_split(split, region_folders or []),
-        rejectors=rejector or (),
-        board=out / "boards" / name,
-        draws=draws,
-    )
-    board = make_board(request, tell=tell)
-    show_board(board.table)
-    typer.echo(str(request.board))
-
-
-def _split(name: str, folders: list[Path]) -> Split:
-    grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
-    return make_split(read_split_file(find_split_file(name)), grids)
-
-
-def show_board(table: pd.DataFrame) -> None:
-    """Print what a board says in short, one table for each track and prior group."""
-    for title, short in summary(table):
-        typer.echo(title)
-        shown = Table(*map(str, short.columns), box=None, pad_edge=False)
-        for row in short.itertuples(index=False):
-            shown.add_row(*map(str, row))
-        print_table(shown)
-    for line in warnings_of(table):
-        tell(line)

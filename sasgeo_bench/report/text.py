@@ -8,6 +8,7 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES
@@ -100,8 +101,11 @@ def _cost_table(part: pd.DataFrame) -> pd.DataFrame:
 
 def _figure(row: pd.Series) -> str:
     """A figure with its interval, as in "0.63 [0.55, 0.70]"."""
-    text = _number(row["value"])
-    return text if math.isnan(row["lo"]) else f"{text} [{_number(row['lo'])}, {_number(row['hi'])}]"
+    return _with_interval(row["value"], row["lo"], row["hi"])
+
+
+def _with_interval(value: float, lo: float, hi: float) -> str:
+    return _number(value) if math.isnan(lo) else f"{_number(value)} [{_number(lo)}, {_number(hi)}]"
 
 
 def _number(value: float) -> str:
@@ -146,7 +150,7 @@ _NOTE: Final = (
 )
 
 
-def board_markdown(board: pd.DataFrame, about: Mapping[str, Any]) -> str:
+def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], findings: Sequence[Finding] = ()) -> str:
     """The board as a document."""
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
@@ -158,9 +162,30 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any]) -> str:
         *(f"- {line}" for line in warnings_of(board)),
         "",
     ]
+    if findings:
+        lines += ["## Registered contrasts", "", *_markdown(finding_table(findings)), ""]
     for title, table in tables_of(board):
         lines += [f"## {title}", "", *_markdown(table), ""]
     return "\n".join(lines)
+
+
+def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
+    """Registered contrasts in words."""
+    rows = [
+        {
+            "contrast": item.name,
+            "first": f"{item.first}: {_number(item.first_value)}",
+            "second": f"{item.second}: {_number(item.second_value)}",
+            "difference": _with_interval(item.difference, item.lo, item.hi),
+            "p (Holm)": _number(item.p_holm),
+            "discordant": f"{item.first_only} and {item.second_only}",
+            "detectable": _number(item.detectable),
+            "n": f"{item.n} in {item.blocks} blocks",
+            "verdict": item.verdict,
+        }
+        for item in findings
+    ]
+    return pd.DataFrame(rows)
 
 
 def _markdown(table: pd.DataFrame) -> Iterator[str]:

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.split import SplitFile
 from sasgeo_bench.tomlfile import Document, parse_toml
 
 Kind = Literal["regions", "splits", "pipelines"]
 Model = TypeVar("Model", bound=Document)
+Identified = RegionFile | SplitFile | PipelineFile
 
 
 def shipped_dir(kind: Kind) -> Path:
@@ -42,6 +44,11 @@ def read_region_file(path: Path) -> RegionFile:
 def read_split_file(path: Path) -> SplitFile:
     """Read one split file; raises as `read_region_file` does."""
     return _read(path, SplitFile, "splits")
+
+
+def read_pipeline_file(path: Path) -> PipelineFile:
+    """Read one pipeline file; raises as `read_region_file` does."""
+    return _read(path, PipelineFile, "pipelines")
 
 
 def list_region_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
@@ -94,6 +101,22 @@ def find_split_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     return _find(id_or_path, "split", "or name a .toml file", lambda: list_split_files(folders=folders))
 
 
+def list_pipeline_files() -> dict[str, Path]:
+    """Pipeline id -> file, of those shipped; raises as `list_region_files` does.
+
+    Examples
+    --------
+    >>> "demo" in list_pipeline_files()
+    True
+    """
+    return _list("pipelines", read_pipeline_file, ())
+
+
+def find_pipeline_file(id_or_path: str) -> Path:
+    """Find a pipeline file by its id, or take the path of one; raises as `find_region_file` does."""
+    return _find(id_or_path, "pipeline", "or name a .toml file", list_pipeline_files)
+
+
 def _read(path: Path, model: type[Model], kind: Kind) -> Model:
     try:
         text = path.read_text(encoding="utf-8")
@@ -104,7 +127,9 @@ def _read(path: Path, model: type[Model], kind: Kind) -> Model:
     return parse_toml(text, model, source=str(path))
 
 
-def _list(kind: Kind, read: Callable[[Path], RegionFile | SplitFile], folders: Sequence[Path]) -> dict[str, Path]:
+def _list(
+    kind: Kind, read: Callable[[Path], RegionFile | SplitFile | PipelineFile], folders: Sequence[Path]
+) -> dict[str, Path]:
     noun = kind.removesuffix("s")
     found: dict[str, Path] = {}
     for folder in (*folders, shipped_dir(kind)):

@@ -4,7 +4,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -415,6 +415,34 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
     if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
         message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
         raise StoreError(message)
+
+
+def write_made(truth_folder: Path, request_sha256: str, tasks: Mapping[str, str]) -> None:
+    """Note beside the truths which request they and which queries come from; `tasks` is region -> SHA-256 of queries.
+
+    Parameters
+    ----------
+    truth_folder : Path
+        out/truth/<suite>.
+    request_sha256 : str
+        Hash of all that the request says.
+    tasks : mapping of str to str
+        What came of it.
+    """
+    folder = truth_folder.parent
+    scratch = folder / f".{truth_folder.name}.made.partial"
+    _write_json(scratch, {"request_sha256": request_sha256, "tasks": dict(tasks)})
+    scratch.rename(folder / f".{truth_folder.name}.made.json")
+
+
+def read_made(truth_folder: Path) -> tuple[str, dict[str, str]] | None:
+    """What `write_made` noted, or None where it noted nothing that can be read."""
+    path = truth_folder.parent / f".{truth_folder.name}.made.json"
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+        return str(said["request_sha256"]), {str(name): str(value) for name, value in said["tasks"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
 
 
 def query_bytes(query: Query) -> bytes:

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that score predictions and publish what came of them."""
+
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final
+
+import pandas as pd
+import typer
+from rich.table import Table
+
+from sasgeo_bench.boards import ScoreRequest, make_board
+from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.metrics.intervals import DRAWS
+from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.report.contrasts import Finding
+from sasgeo_bench.report.text import finding_table, summary, warnings_of
+from sasgeo_bench.split import Split, make_split
+from sasgeo_bench.store.catalog import (
+    find_pipeline_file,
+    find_split_file,
+    list_region_files,
+    read_pipeline_file,
+    read_region_file,
+    read_split_file,
+)
+
+BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+def score_command(  # noqa: PLR0913 - a command has as many flags as its users need
+    *,
+    predictions: Annotated[
+        list[Path], typer.Option(help="folder with runs in it, or file of predictions; may be repeated")
+    ],
+    tasks: Annotated[
+        list[Path] | None, typer.Option(help="task folder; may be repeated; default: all that are answered")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="folder of the truths, beside the tasks; default: OUT/truth")
+    ] = None,
+    name: Annotated[str, typer.Option(help="of the board: OUT/boards/NAME")] = "board",
+    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
+    rejector: Annotated[
+        list[str] | None, typer.Option(help="name from list-rejectors, or module:Class; may be repeated")
+    ] = None,
+    region_folders: RegionFolders = None,
+    draws: Annotated[int, typer.Option(min=100, help="of the bootstrap")] = DRAWS,
+    out: Out = Path("out"),
+) -> None:
+    """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
+    if not BOARD_NAME.fullmatch(name):
+        message = f"--name must hold letters, digits, hyphens and underscores, got {name!r}"
+        raise ConfigError(message)
+    request = ScoreRequest(
+        predictions=predictions,
+        tasks=tasks or (),
+        root=out if truth is None else truth.resolve().parent,
+        split=_split(split, region_folders or []),
+        rejectors=rejector or (),
+        board=out / "boards" / name,
+        draws=draws,
+    )
+    board = make_board(request, tell=tell)
+    show_board(board.table, board.findings)
+    typer.echo(str(request.board))
+
+
+def leaderboard_command(
+    pipeline: Annotated[str, typer.Argument(help="id of a shipped pipeline, or a file of your own (*.toml)")],
+    *,
+    extracts: ExtractFolders = None,
+    region_folders: Annotated[
+        list[Path] | None, typer.Option("--region-files", help="folder with region files of your own")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
+    dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
+    ] = False,
+    out: Out = Path("out"),
+) -> None:
+    """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
+    plan = plan_pipeline(
+        read_pipeline_file(find_pipeline_file(pipeline)),
+        out=out,
+        tell=tell,
+        extract_folders=tuple(extracts or ()),
+        region_folders=tuple(region_folders or ()),
+        jobs=jobs,
+        dask=dask,
+    )
+    if dry_run:
+        typer.echo(plan.to_text())
+        return
+    if sys.stderr.isatty():
+        with Bars() as bars:
+            board = run_pipeline(plan, tell=tell, progress=bars)
+    else:
+        board = run_pipeline(plan, tell=tell)
+    show_board(board.table, board.findings)
+    typer.echo(str(board_folder(plan)))
+
+
+def _split(name: str, folders: list[Path]) -> Split:
+    grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
+    return make_split(read_split_file(find_split_file(name)), grids)
+
+
+def show_board(table: pd.DataFrame, findings: Sequence[Finding]) -> None:
+    """Print what a board says in short, one table for each track and prior group."""
+    tables = [*summary(table), *([("Registered contrasts", finding_table(findings))] if findings else [])]
+    for title, short in tables:
+        typer.echo(title)
+        shown = Table(*map(str, short.columns), box=None, pad_edge=False)
+        for row in short.itertuples(index=False):
+            shown.add_row(*map(str, row))
+        print_table(shown)
+    for line in warnings_of(table):
+        tell(line)

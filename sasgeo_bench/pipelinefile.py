@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a file in `pipelines/` says: an experiment as data, read before anything is run."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sasgeo_bench.query import PriorGroup
+from sasgeo_bench.tomlfile import Document
+
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+
+
+class ContrastSpec(Document):
+    """One registered contrast; `first` and `second` are matchers, or "matcher x rejector" for the metric "aurc"."""
+
+    name: Name
+    first: str
+    second: str
+    suites: Annotated[list[str], Field(min_length=1)]
+    kinds: list[str] = []
+    metric: Literal["primary", "aurc"] = "primary"
+    track: Literal["localization", "retrieval"] = "localization"
+    min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
+    why: str = ""
+
+
+class TaskSpec(Document):
+    """Suites that are drawn alike; several of these make up a pipeline. `prior` is that of each suite unless given."""
+
+    suites: Annotated[list[str], Field(min_length=1)]
+    sites: Annotated[int, Field(ge=1, le=10_000)]
+    prior: str | None = None
+
+
+class PipelineFile(Document):
+    """What a pipeline file says.
+
+    Examples
+    --------
+    >>> spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random"]}
+    >>> PipelineFile.model_validate(spec | {"task": [{"suites": ["clean"], "sites": 2}]}).top_k
+    25
+    """
+
+    id: Name
+    title: str
+    split: str
+    regions: list[str] = []
+    seed: int = 0
+    task: Annotated[list[TaskSpec], Field(min_length=1)]
+    matchers: Annotated[list[str], Field(min_length=1)]
+    rejectors: list[str] = []
+    contrast: list[ContrastSpec] = []
+    top_k: Annotated[int, Field(ge=1, le=1000)] = 25
+    match_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    draws: Annotated[int, Field(ge=100, le=100_000)] = 10_000
+
+    @model_validator(mode="after")
+    def _names_once(self) -> Self:
+        suites = [name for task in self.task for name in task.suites]
+        for what, listed in (
+            ("suite", suites),
+            ("matcher", self.matchers),
+            ("rejector", self.rejectors),
+            ("contrast", [item.name for item in self.contrast]),
+        ):
+            twice = sorted({name for name in listed if listed.count(name) > 1})
+            if twice:
+                message = f"{what} {twice[0]!r} is listed twice"
+                raise ValueError(message)
+        for item in self.contrast:
+            lost = next((name for name in item.suites if name not in suites), None)
+            if lost is not None:
+                message = f"contrast {item.name!r} names the suite {lost!r}, which is not drawn"
+                raise ValueError(message)
+            _check_methods(item, self.matchers, self.rejectors)
+        for task in self.task:
+            if task.prior is not None:
+                PriorGroup.parse(task.prior)
+        return self
+
+
+def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:
+    """Refuse a contrast of methods that are not run."""
+    known = set(matchers) if item.metric == "primary" else {f"{one} x {two}" for one in matchers for two in rejectors}
+    lost = next((name for name in (item.first, item.second) if name not in known), None)
+    if lost is not None:
+        kind = "matcher" if item.metric == "primary" else "matcher x rejector"
+        message = f"contrast {item.name!r} names the unknown {kind} {lost!r}"
+        raise ValueError(message)

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registered contrasts: two methods on the same queries, tested as was written down before anything was run."""
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.metrics.base import Floats
+from sasgeo_bench.metrics.compare import holm, mcnemar_clustered, mcnemar_exact
+from sasgeo_bench.metrics.decisions import Answers
+from sasgeo_bench.metrics.integrity import aurc
+from sasgeo_bench.metrics.intervals import DRAWS, ClusterDraws, mean_difference, statistic_interval
+from sasgeo_bench.metrics.power import sensitivity
+from sasgeo_bench.report.integrity import SLOW_DRAWS
+from sasgeo_bench.report.measures import primary_of
+from sasgeo_bench.report.rejection import answers_of
+
+ALPHA: Final = 0.05
+LEAST_BLOCKS: Final = 6  # with fewer no test over blocks can reach 5 %, however large the difference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contrast:
+    """Two methods and the queries they are compared on, as a pipeline file registers it.
+
+    Parameters
+    ----------
+    name : str
+        As in "graph".
+    first, second : str
+        Matchers; the difference is first less second. For "aurc" each is "matcher x rejector".
+    suites : tuple of str
+        Whose queries count, all of them together.
+    kinds : tuple of str
+        Only kinds that begin with one of these, as in "U2"; empty for all stresses.
+    metric : {"primary", "aurc"}
+        Success or recall at 1 on present places; or the area under risk against coverage on all of them.
+    track : str
+        Of the queries.
+    min_effect : float
+        Least difference that would matter: of shares, or of "aurc" relative to the second.
+    """
+
+    name: str
+    first: str
+    second: str
+    suites: tuple[str, ...]
+    kinds: tuple[str, ...] = ()
+    metric: str = "primary"
+    track: str = "localization"
+    min_effect: float = 0.03
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What came of a contrast.
+
+    Parameters
+    ----------
+    first_value, second_value, difference, lo, hi : float
+        Figures of both, first less second, and the paired 95 % interval; NaN where nothing could be drawn.
+    n, blocks : int
+        Queries and blocks they are from.
+    first_only, second_only : int
+        Discordant queries; 0 for "aurc".
+    p_exact, p_clustered, p_holm : float
+        McNemar's exact test (queries taken for independent), Obuchowski's for blocks, and that one adjusted by Holm
+        over all registered contrasts; of "aurc" the share of draws on the other side of zero, twice.
+    detectable : float
+        Least difference these queries would show; NaN for "aurc".
+    verdict : str
+        In words.
+    """
+
+    name: str
+    first: str
+    second: str
+    metric: str
+    n: int
+    blocks: int
+    first_value: float
+    second_value: float
+    difference: float
+    lo: float
+    hi: float
+    first_only: int
+    second_only: int
+    p_exact: float
+    p_clustered: float
+    p_holm: float
+    detectable: float
+    min_effect: float
+    verdict: str
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Finding))
+
+
+def hold_contrasts(
+    contrasts: Sequence[Contrast],
+    scores: Mapping[str, pd.DataFrame],
+    judged: Mapping[tuple[str, str], pd.DataFrame],
+    *,
+    draws: int = DRAWS,
+) -> tuple[Finding, ...]:
+    """Test every registered contrast.
+
+    Parameters
+    ----------
+    contrasts : sequence of Contrast
+        All that were registered, and no others: Holm's adjustment is over them.
+    scores : mapping of str to pandas.DataFrame
+        Scored rows by matcher.
+    judged : mapping of (matcher, rejector) to pandas.DataFrame
+        From `rejection.judge`.
+    draws : int
+        Of the bootstrap.
+
+    Returns
+    -------
+    tuple of Finding
+        In the same order. A contrast without a query has p = 1 and says so.
+
+    Raises
+    ------
+    ConfigError
+        If a contrast names a method that is not on the board.
+    """
+    found = [_tested(contrast, scores, judged, draws) for contrast in contrasts]
+    adjusted = holm({item.name: 1.0 if math.isnan(item.p_clustered) else item.p_clustered for item in found})
+    return tuple(_with_verdict(replace(item, p_holm=adjusted[item.name])) for item in found)
+
+
+def _tested(
+    contrast: Contrast,
+    scores: Mapping[str, pd.DataFrame],
+    judged: Mapping[tuple[str, str], pd.DataFrame],
+    draws: int,
+) -> Finding:
+    is_mean = contrast.metric == "primary"
+    known: Mapping[str, pd.DataFrame] = scores if is_mean else {" x ".join(key): item for key, item in judged.items()}
+    frames = []
+    for name in (contrast.first, contrast.second):
+        if name not in known:
+            there = ", ".join(sorted(known)) or "nothing of the kind"
+            message = f"contrast {contrast.name!r} names {name!r}, which is not on the board: there is {there}"
+            raise ConfigError(message)
+        frames.append(_chosen(contrast, known[name]))
+    shared = sorted(set(frames[0]["query_id"]) & set(frames[1]["query_id"]))
+    first, second = (frame.set_index("query_id", drop=False).loc[shared] for frame in frames)
+    if first.empty:
+        return _nothing(contrast)
+    return _means(contrast, first, second, draws) if is_mean else _areas(contrast, first, second)
+
+
+def _chosen(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
+    """The queries of a contrast: stresses of its suites and kinds on its track."""
+    rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
+    if contrast.metric == "primary":
+        rows = rows[rows["is_present"].to_numpy(bool) & (rows["role"] == "stress").to_numpy(bool)]
+    else:
+        rows = rows[(rows["role"] != "falsifier").to_numpy(bool)]
+    if contrast.kinds:
+        is_kind = rows["kind"].str.startswith(contrast.kinds) | (rows["role"] == "control").to_numpy(bool)
+        rows = rows[is_kind.to_numpy(bool)]
+    return rows
+
+
+def _nothing(contrast: Contrast) -> Finding:
+    return Finding(
+        name=contrast.name,
+        first=contrast.first,
+        second=contrast.second,
+        metric=contrast.metric,
+        min_effect=contrast.min_effect,
+        n=0,
+        blocks=0,
+        first_only=0,
+        second_only=0,
+        verdict="",
+        **dict.fromkeys(_NUMBERS, math.nan),
+    )
+
+
+_NUMBERS: Final = (
+    *("first_value", "second_value", "difference", "lo", "hi"),
+    *("p_exact", "p_clustered", "p_holm", "detectable"),
+)
+
+
+def _seed(contrast: Contrast) -> int:
+    return int.from_bytes(hashlib.sha256(contrast.name.encode()).digest()[:8], "big")
+
+
+def _means(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
+    measure = primary_of(contrast.track)
+    ours, theirs = measure.values(first), measure.values(second)
+    blocks = first["block"].tolist()
+    interval = mean_difference(ours, theirs, ClusterDraws(blocks=blocks, seed=_seed(contrast), draws=draws))
+    won = [(values == 1).astype(float) for values in (ours, theirs)]  # a tie that is shared is no win
+    exact, clustered = mcnemar_exact(won[0], won[1]), mcnemar_clustered(won[0], won[1], blocks)
+    return replace(
+        _nothing(contrast),
+        n=len(ours),
+        blocks=len(set(blocks)),
+        first_value=float(ours.mean()),
+        second_value=float(theirs.mean()),
+        difference=interval.value,
+        lo=interval.lo,
+        hi=interval.hi,
+        first_only=exact.first_only,
+        second_only=exact.second_only,
+        p_exact=exact.p_value,
+        p_clustered=clustered.p_value,
+        detectable=sensitivity(ours, theirs, blocks).detectable,
+    )
+
+
+def _areas(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
+    ours, theirs = (answers_of(frame, frame["p_false"].to_numpy(float)) for frame in (first, second))
+    blocks = first["block"].tolist()
+    drawn = ClusterDraws(blocks=blocks, seed=_seed(contrast), draws=SLOW_DRAWS)
+    apart = partial(_apart, ours, theirs)
+    interval = statistic_interval(apart, drawn)
+    everyone = np.ones(len(first))
+    return replace(
+        _nothing(contrast),
+        n=len(first),
+        blocks=len(set(blocks)),
+        first_value=aurc(ours, everyone),
+        second_value=aurc(theirs, everyone),
+        difference=interval.value,
+        lo=interval.lo,
+        hi=interval.hi,
+        p_clustered=_p_of_draws(apart, drawn),
+    )
+
+
+def _apart(ours: Answers, theirs: Answers, mass: Floats) -> float:
+    """The difference of both areas under the same weights."""
+    return aurc(ours, mass) - aurc(theirs, mass)
+
+
+def _p_of_draws(apart: Callable[[Floats], float], drawn: ClusterDraws) -> float:
+    """Twice the share of draws on the rarer side of zero, one draw added; NaN for fewer than two blocks."""
+    if drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
+        return math.nan
+    values = np.array([apart(row) for some in drawn.weights() for row in some])
+    rarer = min(int((values <= 0).sum()), int((values >= 0).sum()))
+    return min(1.0, 2 * (rarer + 1) / (len(values) + 1))
+
+
+def _with_verdict(found: Finding) -> Finding:
+    """Say in words what came of it; a null is a result."""
+    if not found.n:
+        return replace(found, verdict="not tested: no query")
+    if found.blocks < LEAST_BLOCKS:
+        return replace(found, verdict=f"not decided: {found.blocks} blocks, at least {LEAST_BLOCKS} are needed")
+    least = found.min_effect * (1.0 if found.metric == "primary" else abs(found.second_value))
+    is_better = found.difference > 0 if found.metric == "primary" else found.difference < 0
+    if found.p_holm <= ALPHA and (found.lo > 0 or found.hi < 0):
+        size = "" if abs(found.difference) >= least else ", by less than would matter"
+        return replace(found, verdict=f"{found.first if is_better else found.second} is better{size}")
+    if -least < found.lo and found.hi < least:
+        return replace(found, verdict="null: any difference is smaller than would matter")
+    return replace(found, verdict="null: no difference shown, and one that matters is not ruled out")
+
+
+def contrast_frame(findings: Sequence[Finding]) -> pd.DataFrame:
+    """Findings as a table.
+
+    Examples
+    --------
+    >>> contrast_frame([]).columns[0]
+    'name'
+    """
+    return pd.DataFrame([{name: getattr(item, name) for name in COLUMNS} for item in findings], columns=list(COLUMNS))

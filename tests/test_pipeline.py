@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pipeline draws, runs and scores; a second time it does only what is not up to date."""
+
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.store import taskdir
+from sasgeo_bench.store.catalog import find_pipeline_file, list_pipeline_files, read_pipeline_file
+from sasgeo_bench.tasks import made_tasks
+from sasgeo_bench.tomlfile import parse_toml
+
+TEXT = """
+id = "small"
+title = "Small"
+split = "crossfit"
+regions = ["town-suburb"]
+matchers = ["random", "prior_centre"]
+
+[[task]]
+suites = ["clean"]
+sites = 1
+
+[[contrast]]
+name = "nothing"
+first = "random"
+second = "prior_centre"
+suites = ["clean"]
+"""
+
+
+def small(**changes):
+    text = TEXT
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    return parse_toml(text, PipelineFile, source="small.toml")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    out = tmp_path_factory.mktemp("pipeline") / "out"
+    plan = plan_pipeline(small(), out=out, tell=lambda _: None)
+    assert "to be drawn" in plan.to_text()
+    lines = []
+    return plan, run_pipeline(plan, tell=lines.append), lines
+
+
+def test_a_pipeline_ends_with_a_board(made):
+    plan, board, lines = made
+    count = len(taskdir.read_ids(plan.out / "tasks" / "clean" / "town-suburb"))
+    assert f"random: {count} queries to ask, 0 answered before" in lines
+    assert {entry.name for entry in board.entries} == {"random", "prior_centre"}
+    assert [item.name for item in board.findings] == ["nothing"]
+    assert (plan.out / "boards" / "small" / "leaderboard.parquet").is_file()
+    assert "Registered contrasts" in (plan.out / "boards" / "small" / "leaderboard.md").read_text(encoding="utf-8")
+
+
+def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
+    plan, board, _ = made
+    queries = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"
+    before = queries.stat().st_mtime_ns
+    lines = []
+    again = run_pipeline(plan, tell=lines.append)
+    assert queries.stat().st_mtime_ns == before
+    assert [line.split(",")[0] for line in lines if "to ask" in line] == [
+        f"{name}: 0 queries to ask" for name in plan.spec.matchers
+    ]
+    assert again.table.equals(board.table)
+    assert "up to date" in plan.to_text()
+    assert "to be drawn" not in plan.to_text()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"sites = 1": "sites = 2"}, {"crossfit": "holdout"}, {"title": "seed = 1\ntitle"}],
+)
+def test_what_changes_queries_has_them_drawn_anew(made, changes):
+    plan, _, _ = made
+    assert made_tasks(plan.requests[0]) is not None
+    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    assert made_tasks(other.requests[0]) is None
+
+
+def test_a_task_that_was_touched_is_not_up_to_date(made):
+    plan, _, _ = made
+    path = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"
+    data = path.read_bytes()
+    try:
+        path.write_bytes(data + b"x")
+        assert made_tasks(plan.requests[0]) is None
+    finally:
+        path.write_bytes(data)
+    assert made_tasks(plan.requests[0]) is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"title": "titel"}, "unknown key 'titel', did you mean 'title'"),
+        ({'second = "prior_centre"': 'second = "nobody"'}, "contrast 'nothing' names the unknown matcher 'nobody'"),
+        (
+            {'matchers = ["random", "prior_centre"]': 'matchers = ["random", "random"]'},
+            "matcher 'random' is listed twice",
+        ),
+        ({"sites = 1": "sites = 0"}, "greater than or equal to 1"),
+        ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
+        ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
+        (
+            {'second = "prior_centre"': 'second = "prior_centre"\nmetric = "aurc"'},
+            "unknown matcher x rejector 'random'",
+        ),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(changes, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        small(**changes)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp_path):
+    for old, new in (("claen", "clean"), ("town-suburbia", "town-suburb"), ("crosfit", "crossfit")):
+        spec = parse_toml(TEXT.replace(f'"{new}"', f'"{old}"'), PipelineFile, source="small.toml")
+        with pytest.raises(ConfigError, match=f"did you mean '{new}'"):
+            plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", sorted(list_pipeline_files()))
+def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
+    spec = read_pipeline_file(find_pipeline_file(name))
+    assert spec.id == name
+    plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
+    assert plan.requests
+    assert list(tmp_path.iterdir()) == []

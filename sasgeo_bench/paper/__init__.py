@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The SASGeo paper's own experiment, Section VI: 30 procedural regions and 220 retrieval trials."""

@@ -283,17 +283,68 @@ def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, s
         notes=record.notes,
         warnings=(*record.warnings, note),
     )
+    _write_unless_current(edited, record.extract, reading, tell=lambda _: None)
+    return edited.folder
+
+
+def build_made(spec: RegionFile, reading: Reading, *, out: Path, tell: Tell) -> Path:
+    """Write a region whose features come from no extract, because they were generated.
+
+    Parameters
+    ----------
+    spec : RegionFile
+        Where it lies, its id and title; the file its one extract names is read by nobody.
+    reading : Reading
+        What was generated, in the place of what is read from an extract.
+    out : Path
+        Root of what is built; the region goes to `out/regions/<id>`.
+    tell : callable
+        Gets a line where another run has to be waited for.
+
+    Returns
+    -------
+    Path
+        Its folder.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be written.
+    """
+    extract = spec.pick(None)
+    content = _content_sha256(reading.features)
+    plan = BuildPlan(
+        spec=spec,
+        extract=extract,
+        source=None,
+        grid=spec.grid(),
+        folder=out / "regions" / spec.id,
+        inputs_sha256=_inputs_sha256(spec, extract, f"{content}/{reading.coverage.wkt}"),
+        is_current=False,
+    )
+    record = ExtractRecord(file=extract.file, sha256=content, bytes=0, date=extract.date, osm_timestamp=None)
+    _write_unless_current(plan, record, reading, tell=tell)
+    return plan.folder
+
+
+def _content_sha256(features: gpd.GeoDataFrame) -> str:
+    """Hash every shape and what it is; a fingerprint has centroids alone."""
+    shapes = b"".join(shapely.to_wkb(features.geometry.to_numpy()))
+    return hashlib.sha256(fingerprint(features).encode() + shapes).hexdigest()
+
+
+def _write_unless_current(plan: BuildPlan, extract: ExtractRecord, reading: Reading, *, tell: Tell) -> None:
+    """Write a region that is read from no file, unless it is there already."""
     try:
-        with regiondir.locked(edited.folder, tell=lambda _: None):
-            if not _is_current(edited.folder, inputs):
-                with regiondir.fresh_folder(edited.folder) as scratch:
-                    _write_into(scratch, edited, record.extract, reading, with_preview=True)
+        with regiondir.locked(plan.folder, tell=tell):
+            if not _is_current(plan.folder, plan.inputs_sha256):
+                with regiondir.fresh_folder(plan.folder) as scratch:
+                    _write_into(scratch, plan, extract, reading, with_preview=True)
     except SasgeoError:
         raise
     except OSError as error:
-        message = f"{edited.folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        message = f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         raise StoreError(message) from error
-    return edited.folder
 
 
 @contextmanager

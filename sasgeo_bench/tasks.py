@@ -4,7 +4,7 @@
 import datetime as dt
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -273,33 +273,58 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     for job in left:
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name
+    # With the seed anyone could draw the truths again, so it is kept with them.
+    hidden = {"seed": request.seed}
     for region, own in sorted(by_map.items()):
-        task_folder = request.out / "tasks" / name / region
-        truth_folder = request.out / "truth" / name / region
         about = _about(request, drawer, region, sites, own)
-        check_apart(request.out / "tasks", truth_folder)
-        check_apart(task_folder, request.out / "truth")
-        taskdir.check_ours(task_folder, (taskdir.QUERIES, taskdir.TASK))
-        taskdir.check_ours(truth_folder, (taskdir.TRUTH, taskdir.TRUTH_OF))
-        try:
-            with (
-                regiondir.locked(task_folder, tell=tell),
-                regiondir.locked(truth_folder, tell=tell),
-                regiondir.fresh_folder(task_folder) as task_scratch,
-                regiondir.fresh_folder(truth_folder) as truth_scratch,
-            ):
-                # With the seed anyone could draw the truths again, so it is kept with them.
-                hidden = {"seed": request.seed}
-                total = taskdir.write_task(task_scratch, truth_scratch, map(drawer.draw, own), about, hidden)
-        except SasgeoError:
-            raise
-        except OSError as error:
-            message = (
-                f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-            )
-            raise StoreError(message) from error
-        tell(f"{name} on {region}: {total} queries at {len(sites)} sites in {task_folder}")
-        yield Made(folder=task_folder, queries=total, sites=len(sites))
+        made = put_task(map(drawer.draw, own), about, hidden, out=request.out, tell=tell)
+        tell(f"{name} on {region}: {made.queries} queries at {len(sites)} sites in {made.folder}")
+        yield made
+
+
+def put_task(
+    pairs: Iterable[tuple[Query, Truth]], about: dict[str, Any], hidden: dict[str, Any], *, out: Path, tell: Tell
+) -> Made:
+    """Write queries below `out/tasks` and their truths below `out/truth`, each folder whole or not at all.
+
+    Parameters
+    ----------
+    pairs : iterable of (Query, Truth)
+        In the order of the query ids.
+    about : dict
+        What `task.json` says; `suite` and `region` name the folders, `sites` counts the sites.
+    hidden : dict
+        What `truth.json` says.
+    out : Path
+        Root.
+    tell : callable
+        Gets a line where another run has to be waited for.
+
+    Raises
+    ------
+    StoreError
+        If a folder holds something that is not ours, or cannot be written.
+    """
+    task_folder = out / "tasks" / about["suite"] / about["region"]
+    truth_folder = out / "truth" / about["suite"] / about["region"]
+    check_apart(out / "tasks", truth_folder)
+    check_apart(task_folder, out / "truth")
+    taskdir.check_ours(task_folder, (taskdir.QUERIES, taskdir.TASK))
+    taskdir.check_ours(truth_folder, (taskdir.TRUTH, taskdir.TRUTH_OF))
+    try:
+        with (
+            regiondir.locked(task_folder, tell=tell),
+            regiondir.locked(truth_folder, tell=tell),
+            regiondir.fresh_folder(task_folder) as task_scratch,
+            regiondir.fresh_folder(truth_folder) as truth_scratch,
+        ):
+            total = taskdir.write_task(task_scratch, truth_scratch, pairs, about, hidden)
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        raise StoreError(message) from error
+    return Made(folder=task_folder, queries=total, sites=about["sites"])
 
 
 def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]) -> dict[str, Any]:
@@ -432,23 +457,29 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
     if truth.pose is None:
         return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
     size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
-    at_truth = state.view(truth.pose, size_cells=size, cell_size_m=cell_m)
+
+    def view(pose: Pose) -> Evidence:
+        """What the map shows there, of the classes that were looked for."""
+        return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
+
+    at_truth = view(truth.pose)
     near = _others(query, truth) or rivals.get(truth.pose, ())
     places = [(pose.easting_m, pose.northing_m) for pose in near]
     if not places:
         center_m, side_m = (truth.pose.easting_m, truth.pose.northing_m), size * cell_m
         mined = mine(describe(state, side_m=side_m, clear_m=side_m * float(np.sqrt(0.5))), center_m, count=1).points_m
         places = [(float(x), float(y)) for x, y in mined]
-    views = [
-        state.view(replace(truth.pose, easting_m=x, northing_m=y), size_cells=size, cell_size_m=cell_m)
-        for x, y in places
-    ]
-    hardest = min(views, key=lambda view: changed_share(_drawn(at_truth), _drawn(view)), default=None)
+    views = [view(replace(truth.pose, easting_m=x, northing_m=y)) for x, y in places]
+    hardest = min(views, key=lambda other: changed_share(_drawn(at_truth), _drawn(other)), default=None)
     return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=hardest)
 
 
 def _drawn(evidence: Evidence) -> Evidence:
     """What a person looks at: roads, buildings and water, not the ground cover that fills most of a view."""
-    chosen = [index for index, name in enumerate(evidence.classes) if name in (*DRAWN_CLASSES, "water", "bridge")]
-    names = tuple(evidence.classes[index] for index in chosen)
-    return Evidence(classes=names, cells=evidence.cells[chosen], cell_size_m=evidence.cell_size_m)
+    return _only(evidence, [name for name in evidence.classes if name in (*DRAWN_CLASSES, "water", "bridge")])
+
+
+def _only(evidence: Evidence, classes: Sequence[str]) -> Evidence:
+    """Some of the classes of a view, in the order given."""
+    cells = evidence.cells[[evidence.classes.index(name) for name in classes]]
+    return Evidence(classes=tuple(classes), cells=cells, cell_size_m=evidence.cell_size_m)

@@ -73,6 +73,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "request": None,
     "draw": None,
     "tasks": None,
+    "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
     "sasgeo": ("weights", "raster", "graph", "temporal", "joint", "integrity"),
     "plugins": None,

@@ -13,11 +13,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+import shapely
+from shapely import affinity
 
 from sasgeo_bench import build
-from sasgeo_bench.build import build_region, plan_build
+from sasgeo_bench.build import build_made, build_region, plan_build
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError, StoreError
-from sasgeo_bench.features import fingerprint
+from sasgeo_bench.extract.read import Reading
+from sasgeo_bench.features import DTYPES, fingerprint, make_features
 from sasgeo_bench.layers import OUTSIDE
 from sasgeo_bench.store.catalog import list_region_files, read_region_file
 from sasgeo_bench.store.regiondir import differing_files, read_manifest, read_region
@@ -226,6 +229,38 @@ def test_two_builds_of_one_region_at_once_both_end_well(tmp_path):
         process.join()
     assert [process.exitcode for process in pair] == [0, 0]
     assert differing_files(tmp_path / "regions" / "town-suburb") == []
+
+
+def generated(*houses: shapely.Polygon) -> Reading:
+    """Houses that come from no extract, in the place of what is read from one."""
+    row = {name: [0] * len(houses) for name in DTYPES} | {"osm_type": "way", "class": "building", "is_visible": True}
+    row |= {"osm_id": range(len(houses)), "timestamp": [None] * len(houses), "width_m": np.nan, "geometry": houses}
+    return Reading(
+        features=make_features(row, epsg=small().grid().epsg),
+        coverage=shapely.box(*small().grid().bounds_m),
+        coverage_source="region file",
+        osm_timestamp=None,
+        drops={},
+        hidden={},
+        notes={},
+        warnings=("made up",),
+    )
+
+
+def test_what_was_generated_becomes_a_region_that_says_so_and_is_built_once(tmp_path):
+    west_m, south_m, *_ = small().grid().bounds_m
+    flat, tall = shapely.box(0, 4, 20, 6), shapely.box(9, 0, 11, 10)  # of one centroid, and so of one fingerprint
+    flat, tall = (affinity.translate(house, west_m + 10, south_m + 10) for house in (flat, tall))
+    folder = build_made(small(), generated(flat), out=tmp_path, tell=lambda _: None)
+    assert differing_files(folder) == []
+    manifest = read_manifest(folder)
+    assert (manifest.extract.bytes, manifest.warnings, manifest.counts["building"]) == (0, ("made up",), 1)
+    assert (read_region(folder).layer("building") == 1).sum() == 40
+    stamp = (folder / "region.json").stat().st_mtime_ns
+    build_made(small(), generated(flat), out=tmp_path, tell=lambda _: None)
+    assert (folder / "region.json").stat().st_mtime_ns == stamp
+    build_made(small(), generated(tall), out=tmp_path, tell=lambda _: None)
+    assert (read_region(folder).layer("building") == 1).sum() == 20
 
 
 @pytest.mark.real

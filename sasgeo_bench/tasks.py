@@ -83,21 +83,20 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
     They are as they were written, nothing of the request or of this version of the program has changed since, and the
     map they search is the one that a build would give.
     """
-    said = taskdir.read_made(request.out / "truth" / request.suite / request.region.id)
-    if said is None or said[0] != _request_sha256(request):
+    sha256 = _request_sha256(request)
+    suite_folder = request.out / "truth" / request.suite
+    hidden = {path.name: taskdir.read_hidden(path) for path in sorted(suite_folder.glob(f"{request.region.id}*"))}
+    mine = {name: said for name, said in hidden.items() if said.get("request_sha256") == sha256}
+    if not mine or any(said.get("maps") != len(mine) for said in mine.values()):
         return None
-    folders = []
-    for region, sha256 in sorted(said[1].items()):
-        folder = request.out / "tasks" / request.suite / region
-        try:
-            about = taskdir.read_task(folder)
-            if about["files"][taskdir.QUERIES]["sha256"] != sha256 or check_task(folder, out=request.out):
-                return None
-        except StoreError:
+    folders = tuple(request.out / "tasks" / request.suite / name for name in mine)
+    try:
+        if any(check_task(folder, out=request.out) for folder in folders):
             return None
-        folders.append(folder)
+    except StoreError:
+        return None
     plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    return tuple(folders) if plan.is_current else None
+    return folders if plan.is_current else None
 
 
 def _request_sha256(request: Request) -> str:
@@ -133,13 +132,7 @@ def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     scene, sites = _edited(request, suite, scene, base, sites, seeds)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split)
-    made = tuple(_write(request, drawer, sites, tell))
-    hashes = {
-        item.folder.name: str(taskdir.read_task(item.folder)["files"][taskdir.QUERIES]["sha256"]) for item in made
-    }
-    truth_folder = request.out / "truth" / suite.card.name / request.region.id
-    taskdir.write_made(truth_folder, _request_sha256(request), hashes)
-    return made
+    return tuple(_write(request, drawer, sites, tell))
 
 
 def _view_reach_m(request: Request, suite: Suite) -> float:
@@ -274,7 +267,7 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name
     # With the seed anyone could draw the truths again, so it is kept with them.
-    hidden = {"seed": request.seed}
+    hidden = {"seed": request.seed, "request_sha256": _request_sha256(request), "maps": len(by_map)}
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
         made = put_task(map(drawer.draw, own), about, hidden, out=request.out, tell=tell)

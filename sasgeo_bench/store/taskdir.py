@@ -4,7 +4,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -395,10 +395,7 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
 
 def _belongs_to(truth_folder: Path) -> str:
     """SHA-256 of the queries that the truths of a folder are of; "unknown" where it does not say."""
-    try:
-        return str(json.loads((truth_folder / TRUTH_OF).read_text(encoding="utf-8"))["queries_sha256"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "unknown"
+    return str(read_hidden(truth_folder).get("queries_sha256", "unknown"))
 
 
 def check_truths(task_folder: Path, truth_folder: Path) -> None:
@@ -417,32 +414,12 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
         raise StoreError(message)
 
 
-def write_made(truth_folder: Path, request_sha256: str, tasks: Mapping[str, str]) -> None:
-    """Note beside the truths which request they and which queries come from; `tasks` is region -> SHA-256 of queries.
-
-    Parameters
-    ----------
-    truth_folder : Path
-        out/truth/<suite>.
-    request_sha256 : str
-        Hash of all that the request says.
-    tasks : mapping of str to str
-        What came of it.
-    """
-    folder = truth_folder.parent
-    scratch = folder / f".{truth_folder.name}.made.partial"
-    _write_json(scratch, {"request_sha256": request_sha256, "tasks": dict(tasks)})
-    scratch.rename(folder / f".{truth_folder.name}.made.json")
-
-
-def read_made(truth_folder: Path) -> tuple[str, dict[str, str]] | None:
-    """What `write_made` noted, or None where it noted nothing that can be read."""
-    path = truth_folder.parent / f".{truth_folder.name}.made.json"
+def read_hidden(truth_folder: Path) -> dict[str, Any]:
+    """What `truth.json` says; nothing where it cannot be read."""
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
-        return str(said["request_sha256"]), {str(name): str(value) for name, value in said["tasks"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
+        return dict(json.loads((truth_folder / TRUTH_OF).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return {}
 
 
 def query_bytes(query: Query) -> bytes:

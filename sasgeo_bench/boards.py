@@ -239,12 +239,8 @@ def _answered(
 
 
 def _check_task(folder: Path, root: Path) -> dict[str, Any]:
-    """What `task.json` says, after it was held against the version of the scorer and the truths."""
+    """What `task.json` says, after it was held against the truths."""
     about = taskdir.read_task(folder)
-    if about.get("task_version") != TASK_VERSION:
-        found = about.get("task_version")
-        message = f"{folder} is of task version {found}, this scorer reads {TASK_VERSION}: make the queries again"
-        raise StoreError(message)
     taskdir.check_truths(folder, _truth_folder(about, root))
     return about
 

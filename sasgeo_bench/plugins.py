@@ -26,9 +26,20 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     -----
     UserWarning
         Where a name stands twice, or is that of the runner's own control.
+
+    Raises
+    ------
+    MatchError
+        If an installed package has entry points that cannot be read.
     """
     found: dict[str, EntryPoint] = {}
-    points = sorted(entry_points(group=group), key=lambda point: (_home(point) != BUILT_IN, _home(point), point.value))
+    try:
+        installed = entry_points(group=group)
+    except Exception as error:
+        said = one_line(f"{type(error).__name__}: {error}")
+        message = f"an installed package has entry points that cannot be read ({said}): reinstall or remove it"
+        raise MatchError(message) from error
+    points = sorted(installed, key=lambda point: (_home(point) != BUILT_IN, _home(point), point.value))
     for point in points:
         if group == MATCHERS and point.name == ORACLE:
             message = f"{_home(point)} ({point.value}) is not used: {ORACLE!r} is the name of a control of the runner"
@@ -122,7 +133,7 @@ def _from_module(spec: str) -> Callable[[], Any]:
     try:
         return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
     except Exception as error:
-        message = f"{spec}: cannot be imported ({one_line(f'{type(error).__name__}: {error}')})"
+        message = f"{one_line(spec)}: cannot be imported ({one_line(f'{type(error).__name__}: {error}')})"
         raise MatchError(message) from error
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import MatchError, PoseError, StoreError
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
-from sasgeo_bench.query import TASK_VERSION, Query
+from sasgeo_bench.query import Query
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
 
@@ -83,11 +83,8 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def _queries(task: Path) -> Iterator[Query]:
-    """Queries of a task, of the version that this program asks."""
-    version = taskdir.read_task(task).get("task_version")
-    if version != TASK_VERSION:
-        message = f"{task} has task version {version!r}, this version asks {TASK_VERSION}: make the queries again"
-        raise StoreError(message)
+    """Queries of a task that this program can read."""
+    taskdir.read_task(task)
     yield from taskdir.read_queries(task)
 
 

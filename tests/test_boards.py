@@ -185,7 +185,7 @@ def cut_part(out):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (break_task, "of task version 0, this scorer reads 1"),
+        (break_task, "has task version 0, this version reads 1"),
         (break_truth, "holds the truths of other queries"),
         (lose_truth, "holds no truths of"),
         (break_run, "answered other queries than"),

@@ -270,7 +270,7 @@ def test_a_task_that_cannot_be_asked_gets_one_line(mistake, out, changes, words)
 def test_a_truncated_task_gets_one_line(mistake, out) -> None:
     queries = TASK / taskdir.QUERIES
     queries.write_bytes(queries.read_bytes()[:-100])
-    assert "queries.parquet cannot be read (" in mistake(*ORACLE)
+    assert "queries.parquet is not what task.json says" in mistake(*ORACLE)
     (TASK / taskdir.TASK).write_text("{")
     assert "task.json is damaged (" in mistake(*ORACLE)
     assert not (out / "runs").exists()
@@ -375,7 +375,7 @@ def test_a_column_that_is_missing_is_told_once_and_not_for_every_query(program, 
 
 
 @pytest.mark.parametrize(
-    ("version", "words"), [(0, "has task version 0, this version asks"), (None, "has task version None")]
+    ("version", "words"), [(0, "has task version 0, this version reads"), (None, "has task version None")]
 )
 def test_predictions_for_a_task_of_another_version_are_not_validated(mistake, mine, version, words) -> None:
     path = mine()

@@ -5,9 +5,9 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_baselines.answers import ranked_candidates
+from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
-from sasgeo_bench.matcher import Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 
@@ -21,13 +21,16 @@ class MapDensityPrior:
 
     card = MatcherCard(
         name="map_density_prior",
-        version="1",
+        version="2",
         title="Control: where the map is fullest",
         source="original",
         ours="All of it: cells of drawn classes in upright squares of the view's side, on a lattice of 16 m",
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
-        limits="A control: does not look at the view, but for its side; heading is the prior's; never withholds",
+        limits=(
+            "A control: does not look at the view, but for its side; heading is the prior's; withholds only where "
+            "nothing was seen"
+        ),
     )
 
     def __init__(self) -> None:
@@ -44,6 +47,8 @@ class MapDensityPrior:
         if self._sums is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
+        if is_blind(query):
+            return WITHHELD
         side_m = max(query.evidence.size_m)
         if query.track == "retrieval":
             drawn = self._sums.squares(points_of(query.candidates), side_m)[:-1].sum(axis=0)

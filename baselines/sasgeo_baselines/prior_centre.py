@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`prior_centre`: the control that answers with what was known before."""
 
-from sasgeo_baselines.answers import offsets_m, ranked_candidates
+from sasgeo_baselines.answers import is_blind, offsets_m, ranked_candidates
 from sasgeo_baselines.places import at_place, middle_m, points_of
-from sasgeo_bench.matcher import Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 
@@ -13,13 +13,13 @@ class PriorCentre:
 
     card = MatcherCard(
         name="prior_centre",
-        version="1",
+        version="2",
         title="Control: the middle of the prior",
         source="original",
         ours="All of it",
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
-        limits="A control: looks at neither the view nor the map; never withholds",
+        limits="A control: looks at neither the view nor the map; withholds only where nothing was seen",
     )
 
     def __init__(self) -> None:
@@ -35,6 +35,8 @@ class PriorCentre:
         if self._region is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
+        if is_blind(query):
+            return WITHHELD
         if query.track == "retrieval":
             points_m = points_of(query.candidates)
             center = points_m.mean(axis=0) if len(points_m) else points_m.sum(axis=0)

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from sasgeo_baselines.answers import ranked_candidates
+from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import middle_m
 from sasgeo_bench.grid import Grid
-from sasgeo_bench.matcher import MOST_CANDIDATES, Match, MatcherCard, Training
+from sasgeo_bench.matcher import MOST_CANDIDATES, WITHHELD, Match, MatcherCard, Training
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
@@ -20,13 +20,13 @@ class RandomPlaces:
 
     card = MatcherCard(
         name="random",
-        version="1",
+        version="2",
         title="Control: chance",
         source="original",
         ours="All of it; chance comes from the SHA-256 of the query's id",
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
-        limits="A control: looks at neither the view nor the map; never withholds",
+        limits="A control: looks at neither the view nor the map; withholds only where nothing was seen",
     )
 
     def __init__(self) -> None:
@@ -42,9 +42,14 @@ class RandomPlaces:
         if self._grid is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
+        if is_blind(query):
+            return WITHHELD
         rng = generator(query.query_id)
         if query.track == "retrieval":
-            return ranked_candidates(query, rng.random(len(query.candidates)).tolist(), top_k=top_k)
+            drawn: dict[tuple[float, float], float] = {}  # one number for each place: equal candidates tie
+            places = ((pose.easting_m, pose.northing_m) for pose in query.candidates)
+            scores = [drawn.setdefault(place, float(rng.random())) for place in places]
+            return ranked_candidates(query, scores, top_k=top_k)
         count = min(top_k, MOST_CANDIDATES)
         poses = [self._guess(query, self._grid, rng) for _ in range(count)]
         return Match(poses=poses, scores=sorted(rng.random(count).tolist(), reverse=True))

@@ -50,11 +50,13 @@ def new_matcher_command(
 
 def check_matcher_command(
     matcher: Annotated[str, typer.Argument(help="name from list-matchers, or module:Class")],
+    *,
+    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in")] = False,
 ) -> None:
     """Try a matcher on a tiny town and say, row by row, whether it keeps to what all of them keep to."""
     table = Table("check", "outcome", "found", box=None, pad_edge=False)
     failed = 0
-    for check in check_matcher(matcher):
+    for check in check_matcher(matcher, is_shut_in=not trusted):
         failed += check.outcome == "fail"
         table.add_row(check.name, check.outcome, check.found)
     print_table(table)

@@ -2,9 +2,10 @@
 """The program `sasgeo-bench`: parses, calls, prints. Results go to stdout, everything else to stderr."""
 
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 import typer
 from rich.table import Table
@@ -63,8 +64,22 @@ for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
 
 
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print a warning as one line, without where it came from."""
+    del category, filename, lineno, file, line
+    errors.print(f"sasgeo-bench: warning: {message}", markup=False)
+
+
 def main() -> None:
     """Run the program: 0 done, 2 the user's mistake on one line, 1 our bug with a traceback."""
+    warnings.showwarning = _warn
     try:
         app()
     except SasgeoError as error:

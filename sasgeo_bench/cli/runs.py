@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that run matchers and check their predictions."""
 
+import re
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -14,6 +15,8 @@ from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store.rundir import merge_runs
 from sasgeo_bench.validate import validate
+
+SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 
 def run_command(  # noqa: PLR0913 - a command has as many flags as its users need
@@ -67,7 +70,7 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
 
 def _shard(text: str) -> tuple[int, int]:
     index, _, count = text.partition("/")
-    if not (index.isdecimal() and count.isdecimal() and text.isascii()):
+    if not SHARD.fullmatch(text):
         message = f"--shard must be i/n, as in 1/2, got {text!r}"
         raise ConfigError(message)
     return int(index), int(count)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.plugins import ORACLE
+from sasgeo_bench.plugins import ORACLE, list_entry_points
 from sasgeo_bench.results import STATUSES, matcher_hash
 from sasgeo_bench.run.oracle import CARD
 from sasgeo_bench.run.worker import Limits, Reach, Worker
@@ -104,6 +104,21 @@ def plan_run(request: RunRequest) -> RunPlan:
     StoreError
         If a task is missing, of another version, or its map is.
     """
+    _check(request)
+    if request.dask is not None:  # other processes work in other folders
+        request = replace(request, out=request.out.resolve(), tasks=[task.resolve() for task in request.tasks])
+    if ":" not in request.spec:
+        list_entry_points()  # a clash of names is told here: what the plugin's own process prints is not shown
+    tasks = [(folder, taskdir.read_task(folder)) for folder in dict.fromkeys(request.tasks)]
+    card, code = _card(request)
+    settings = json.dumps({"top_k": request.top_k, "limits": asdict(request.limits)}, sort_keys=True)
+    found = matcher_hash(request.spec, card.version, code.encode(), settings)
+    parts = tuple(_part(request, card, found, *task) for task in tasks)
+    return RunPlan(request=request, card=card, hash=found, parts=parts)
+
+
+def _check(request: RunRequest) -> None:
+    """Refuse numbers that make no sense."""
     index, count = request.shard
     if not 1 <= index <= count:
         message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
@@ -129,14 +144,6 @@ def plan_run(request: RunRequest) -> RunPlan:
     if request.dask is not None and request.jobs != 1:
         message = "--jobs and --dask both say how many processes there are: leave one of them out"
         raise ConfigError(message)
-    if request.dask is not None:  # other processes work in other folders
-        request = replace(request, out=request.out.resolve(), tasks=[task.resolve() for task in request.tasks])
-    tasks = [(folder, taskdir.read_task(folder)) for folder in request.tasks]
-    card, code = _card(request)
-    settings = json.dumps({"top_k": request.top_k, "limits": asdict(limits)}, sort_keys=True)
-    found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    parts = tuple(_part(request, card, found, *task) for task in tasks)
-    return RunPlan(request=request, card=card, hash=found, parts=parts)
 
 
 def _card(request: RunRequest) -> tuple[MatcherCard, str]:
@@ -167,6 +174,10 @@ def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about:
             f"{folder} holds answers to other queries than {task} does now: move it away, or make the old queries again"
         )
         raise StoreError(message)
+    if before is not None and before.get("hash") != found:
+        message = f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away"
+        raise StoreError(message)
+    taskdir.check_queries(task)
     root = task.resolve().parent.parent.parent
     region = root / "regions" / about["region"]
     if read_manifest(region).fingerprint != about["map_fingerprint"]:

@@ -20,7 +20,7 @@ from sasgeo_bench.evidence import Evidence, pack, unpack
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.store.regiondir import file_record
+from sasgeo_bench.store.regiondir import file_record, sha256_of
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
@@ -329,10 +329,33 @@ def read_task(folder: Path) -> dict[str, Any]:
     if found != SCHEMA_VERSION:
         message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: make the queries again"
         raise StoreError(message)
+    version = content.get("task_version")
+    if not missing and version != TASK_VERSION:
+        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
+        raise StoreError(message)
     if missing:
         message = f"{path} is damaged (it does not say {', '.join(missing)}): make the queries again"
         raise StoreError(message)
+    version = content.get("task_version")
+    if version != TASK_VERSION:
+        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
+        raise StoreError(message)
     return dict(content)
+
+
+def check_queries(folder: Path) -> None:
+    """Refuse queries that are not those `task.json` speaks of.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or has another hash.
+    """
+    said = read_task(folder)["files"][QUERIES]["sha256"]
+    path = folder / QUERIES
+    if not path.is_file() or sha256_of(path) != said:
+        message = f"{path} is not what {TASK} says: make the queries again"
+        raise StoreError(message)
 
 
 def check_ours(folder: Path, names: Sequence[str]) -> None:

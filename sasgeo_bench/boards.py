@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,6 +32,7 @@ from sasgeo_bench.store.boardfile import write_board
 Tell = Callable[[str], None]
 Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
 
+FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 
@@ -120,6 +122,9 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
     files: list[Entry] = []
     for path in paths:
         if path.is_file():
+            if not FILE_NAME.fullmatch(path.stem):
+                message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
+                raise ConfigError(message)
             files.append(Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,)))
             continue
         found = sorted(path.rglob(rundir.RUN))

@@ -15,6 +15,7 @@ Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_CANDIDATES: Final = 1000  # of one answer
 MOST_DIAGNOSTICS: Final = 64
+MOST_SAID: Final = 1000  # characters of a field of a card
 SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
 
 
@@ -88,6 +89,9 @@ def check_said(card: object) -> None:
         value = getattr(card, name)
         if not isinstance(value, str) or not value.strip():
             message = f"card: {name} is empty, say it in one line"
+            raise MatchError(message)
+        if not value.isprintable() or len(value) > MOST_SAID:
+            message = f"card: {name} must be one line of at most {MOST_SAID} printable characters"
             raise MatchError(message)
 
 

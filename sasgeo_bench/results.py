@@ -46,14 +46,14 @@ class Prediction:
 
 
 def one_line(text: str) -> str:
-    """Any text in one line of at most `MOST_MESSAGE` characters.
+    """Any text in one line of at most `MOST_MESSAGE` printable characters.
 
     Examples
     --------
     >>> one_line(chr(10).join(("first", "  second")))
     'first second'
     """
-    line = " ".join(text.split())
+    line = "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 

@@ -231,6 +231,8 @@ def test_two_files_of_one_name_are_refused(out, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         submission(out, tmp_path / name / "mine.parquet")
+    with pytest.raises(ConfigError, match="name the file by letters"):
+        find_entries([shutil.copy(tmp_path / "a" / "mine.parquet", tmp_path / "a|b.parquet")])
     with pytest.raises(ConfigError, match="two contestants are named 'mine'"):
         find_entries([tmp_path / "a" / "mine.parquet", tmp_path / "b" / "mine.parquet"])
 

@@ -7,7 +7,7 @@ import pytest
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.plugins import load_rejector
 from sasgeo_bench.rejector import Rejector, RejectorCard, check_p_false
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.results import Prediction, one_line
 
 SAID = {"name": "half", "version": "1", "title": "Half", "source": "original", "ours": "all", "licence": "MIT"}
 
@@ -89,3 +89,13 @@ def test_a_card_that_does_not_say_enough_is_refused(field, value):
 def test_what_is_no_probability_is_refused_with_found_and_expected(found, words):
     with pytest.raises(MatchError, match=words):
         check_p_false(found, 2)
+
+
+@pytest.mark.parametrize("said", ["two\nlines", "\x1b[31mred", "x" * 1001])
+def test_a_card_is_one_printable_line(said):
+    with pytest.raises(MatchError, match="card: title must be one line of at most 1000 printable characters"):
+        RejectorCard(**(SAID | {"title": said}))
+
+
+def test_a_message_cannot_steer_a_terminal():
+    assert one_line("\x1b[2Jgone\a\nnext") == "?[2Jgone? next"

@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import ABSENT, PRESENT
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.grid import Grid
+from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import Region
 
 FULL: Final = 255  # present without doubt; degrees are kept in steps of 1/255
+_DECIMALS: Final = 6  # of a place within its cell: the same on every copy of a piece of map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +48,8 @@ class Chart:
         for name, layer, kept in zip(region.classes, region.layers, degree, strict=True):
             present = (layer == PRESENT) & known
             if name in thin and reach_m > 0:
-                faded = fade(present, reach_cells=reach_m / region.grid.cell_size_m)
-                kept[:] = np.rint(FULL * faded) * known
+                faded = np.rint(FULL * fade(present, reach_cells=reach_m / region.grid.cell_size_m))
+                kept[:] = np.where(present, FULL, np.minimum(faded, FULL - 1)) * known
             else:
                 np.multiply(present, np.uint8(FULL), out=kept)
         return cls(
@@ -71,6 +73,42 @@ class Chart:
             return self.square(row, col, size, bands)
         cuts = (self._cut(layer, row, col, size * factor) for layer in self._layers(bands))
         return np.stack([cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) for cut in cuts])
+
+    def under(
+        self, pose: Pose, shape: tuple[int, int], bands: NDArray[np.int64], *, cell_size_m: float
+    ) -> NDArray[np.uint8]:
+        """Show some classes as a perfect view from a pose would: the cells of `evidence.observe`, read from here.
+
+        Parameters
+        ----------
+        pose : Pose
+            Of the view.
+        shape : tuple of int
+            Its rows and columns.
+        bands : ndarray of int64, shape (B,)
+            Which classes.
+        cell_size_m : float
+            Metres a side of a view cell for scale 1.
+
+        Returns
+        -------
+        ndarray of uint8, shape (B, rows, cols)
+            ABSENT, PRESENT or UNKNOWN; beyond the map everything is UNKNOWN.
+        """
+        place = self.grid.to_uv(np.array([(pose.easting_m, pose.northing_m)]))[0]
+        whole = np.floor(place)
+        turn = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=pose.yaw_deg, scale=pose.scale)
+        right, up = turn.to_map(np.eye(2) * cell_size_m) / (self.grid.cell_size_m, -self.grid.cell_size_m)
+        across, along = (np.arange(count) + 0.5 - count / 2 for count in (shape[1], shape[0]))
+        uv = (place - whole).round(_DECIMALS)[:, None, None] + np.multiply.outer(right, across)[:, None, :]
+        moved = np.floor(uv - np.multiply.outer(up, along)[:, :, None]).astype(np.int64)
+        cols, rows = moved + whole.astype(np.int64)[:, None, None]
+        inside = (rows >= 0) & (rows < self.grid.rows) & (cols >= 0) & (cols < self.grid.cols)
+        at = np.where(inside, rows * self.grid.cols + cols, 0)
+        unknown = ~(inside & (self.known.ravel().take(at) == FULL))
+        shown = np.stack([self.degree[band].ravel().take(at) == FULL for band in bands]).astype(np.uint8)
+        shown[:, unknown] = UNKNOWN
+        return shown
 
     def _layers(self, bands: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
         return [*(self.degree[band] for band in bands), self.known]

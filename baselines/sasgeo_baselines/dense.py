@@ -155,8 +155,8 @@ class Search:
         plan, factor = self.plan, self._factor()
         coarse = self._peaks(self._tiles_of_prior(factor), factor, most=max(plan.modes, 2 * count))
         limit = self._limit(factor)
-        rough = _ranked(self._rough(mode, limit) for mode in coarse)
-        fine = _ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
+        rough = ranked(self._rough(mode, limit) for mode in coarse)
+        fine = ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
         return _thinned(fine, plan.apart_m)
 
     def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
@@ -378,7 +378,7 @@ def _transform_size(side: int) -> tuple[int, int]:
     return size, size
 
 
-def _ranked(modes: Iterable[Mode]) -> list[Mode]:
+def ranked(modes: Iterable[Mode]) -> list[Mode]:
     """Best first; equals keep their order."""
     return sorted((mode for mode in modes if mode.score > NOWHERE), key=lambda mode: -mode.score)
 

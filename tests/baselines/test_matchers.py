@@ -18,7 +18,8 @@ from sasgeo_bench.store.taskdir import read_queries, read_truths
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.matchers"]
-DENSE = ("fft_vote", "raster_uniform")
+VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
+DENSE = ("fft_vote", "raster_uniform", *VARIANTS)
 CONTROLS = ("random", "prior_centre", "map_density_prior")
 
 
@@ -60,7 +61,7 @@ def test_every_matcher_is_registered() -> None:
 
 @pytest.mark.parametrize("name", REGISTERED)
 def test_answers_are_valid_and_the_same_in_any_order(name, region, queries) -> None:
-    some = queries[:: 6 if name in DENSE else 1]
+    some = queries[:: 12 if name in VARIANTS else 6 if name in DENSE else 1]
     first, second = make(name), make(name)
     for matcher in (first, second):
         matcher.prepare(region, None)

@@ -106,7 +106,9 @@ class Chart:
         inside = (rows >= 0) & (rows < self.grid.rows) & (cols >= 0) & (cols < self.grid.cols)
         at = np.where(inside, rows * self.grid.cols + cols, 0)
         unknown = ~(inside & (self.known.ravel().take(at) == FULL))
-        shown = np.stack([self.degree[band].ravel().take(at) == FULL for band in bands]).astype(np.uint8)
+        shown = np.empty((len(bands), *shape), dtype=np.uint8)
+        for band, layer in zip(bands, shown, strict=True):
+            np.equal(self.degree[band].ravel().take(at), FULL, out=layer)
         shown[:, unknown] = UNKNOWN
         return shown
 

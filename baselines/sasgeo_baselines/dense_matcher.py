@@ -52,6 +52,10 @@ class DenseMatcher(ABC):
         del verifier
         return modes
 
+    def told(self, best: Mode, verifier: Verifier) -> dict[str, float]:
+        """Diagnostics of the best mode."""
+        return {"class_agreement": verifier.agreement(best.pose)}
+
     def match(self, query: Query, *, top_k: int) -> Match:
         """Find the best modes, or rank the candidates by the best pose near each."""
         if self._chart is None:
@@ -62,21 +66,21 @@ class DenseMatcher(ABC):
         chart, view = self._chart, self._read(query.evidence, self._chart)
         search = Search(chart=chart, view=self._view(view, chart), prior=query.prior, plan=self.plan)
         verifier = self._verifier(view, chart)
-        said = {"known_share": 1.0 - query.evidence.unknown_share}
-        if query.track == "retrieval":
-            found = search.candidates(query.candidates)
-            modes = self.rescored([mode for mode in found if mode is not None], verifier)
-            said |= _diagnostics(ranked(modes))
-            left = iter(modes)
-            given = [None if mode is None else next(left) for mode in found]
-            poses = [pose if mode is None else mode.pose for pose, mode in zip(query.candidates, given, strict=True)]
-            scores = [None if mode is None else mode.score for mode in given]
-            return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=said)
         count = min(top_k, MOST_PLACES)
-        modes = ranked(self.rescored(search.places(count), verifier))
-        said |= _diagnostics(modes)
-        best = modes[:count]
-        return Match(poses=[mode.pose for mode in best], scores=[mode.score for mode in best], diagnostics=said)
+        is_retrieval = query.track == "retrieval"
+        found = search.candidates(query.candidates) if is_retrieval else search.places(count)
+        modes = self.rescored([mode for mode in found.modes if mode is not None], verifier)
+        best = ranked(modes)
+        said = {"known_share": 1.0 - query.evidence.unknown_share, "null_score": found.null_score}
+        said |= _margin(best) | (self.told(best[0], verifier) if best else {})
+        if not is_retrieval:
+            given = best[:count]
+            return Match(poses=[mode.pose for mode in given], scores=[mode.score for mode in given], diagnostics=said)
+        left = iter(modes)
+        by_candidate = [None if mode is None else next(left) for mode in found.modes]
+        poses = [mode.pose if mode else pose for pose, mode in zip(query.candidates, by_candidate, strict=True)]
+        scores = [mode.score if mode else None for mode in by_candidate]
+        return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=said)
 
     def _read(self, evidence: Evidence, chart: Chart) -> Evidence:
         """Take the classes the map speaks of, as this matcher reads them."""
@@ -102,7 +106,7 @@ def _bands(evidence: Evidence, chart: Chart) -> NDArray[np.int64]:
     return np.array([chart.classes.index(name) for name in evidence.classes], dtype=np.int64)
 
 
-def _diagnostics(modes: list[Mode]) -> dict[str, float]:
+def _margin(modes: list[Mode]) -> dict[str, float]:
     """Margin of the best mode over the next, and how many there are."""
     if not modes:
         return {"margin": 0.0, "modes": 0.0}

@@ -113,6 +113,11 @@ class RasterMatcher(DenseMatcher):
         scores = blended(np.array([mode.score for mode in modes]), distances)
         return [replace(mode, score=float(score)) for mode, score in zip(modes, scores, strict=True)]
 
+    def told(self, best: Mode, verifier: Verifier) -> dict[str, float]:
+        """Diagnostics of the best mode; that of the graph only where the graph is looked at."""
+        said = super().told(best, verifier)
+        return said | {"graph_distance": verifier.distance(best.pose)} if self.switches.has_graph else said
+
 
 def stability(classes: tuple[str, ...]) -> NDArray[np.float64]:
     """Prior p_c of each class, shape (C,): Eq. (5) of the SASGeo paper with all its other factors 1.

@@ -71,6 +71,17 @@ class Verifier:
         seen = self._described if known.all() else self._describe((self.seen == PRESENT) & known)
         return seen.distance(self._describe((mapped == PRESENT) & (self.seen != UNKNOWN)))
 
+    def agreement(self, pose: Pose) -> float:
+        """Mean over classes of what view and map both hold over what either holds, where both know, 0..1."""
+        mapped = self._under(pose)
+        known = (mapped != UNKNOWN) & (self.seen != UNKNOWN)
+        both, either = (
+            (how(self.seen == PRESENT, mapped == PRESENT) & known).sum(axis=(1, 2))
+            for how in (np.logical_and, np.logical_or)
+        )
+        there = either > 0
+        return float((both[there] / either[there]).mean()) if there.any() else 0.0
+
     def _under(self, pose: Pose) -> NDArray[np.uint8]:
         return self.chart.under(pose, self.seen.shape[1:], self.bands, cell_size_m=self.cell_size_m)
 

@@ -205,3 +205,43 @@ def test_of_a_field_and_a_house_of_one_shape_the_house_weighs_more_by_stability_
     graph, stable = (ranks(made, variant, region, places, view) for variant in VARIANTS[1:3])
     assert graph[1100.0] == pytest.approx(graph[1200.0], abs=1e-9)
     assert stable[1100.0] < stable[1200.0]
+
+
+# What is told besides
+
+
+@pytest.mark.parametrize("variant", [FftVote, *VARIANTS])
+def test_a_perfect_view_agrees_in_all_classes_and_stands_out(made, variant) -> None:
+    region = made.region_of(made.textured(1))
+    view = made.view_of(region, HERE, size_cells=96)
+    matcher = variant()
+    matcher.prepare(region, None)
+    for candidates in ((), PLACES):
+        prior = KNOWN_YAW if candidates else NEAR_HERE
+        said = matcher.match(made.query_of(view, prior, candidates=candidates), top_k=3).diagnostics
+        assert said["class_agreement"] > 0.8
+        assert said["null_score"] > 3
+        assert said["margin"] > 0
+        assert ("graph_distance" in said) == ("graph" in variant.card.name or variant is FullUnknown)
+        assert 0 <= said.get("graph_distance", 0) < 0.1
+
+
+def test_agreement_is_the_mean_over_classes_of_both_over_either(made) -> None:
+    # Houses: two of three cells in common; roads: seen in vain; water: one cell, where nothing was seen.
+    layers = np.zeros((3, 1, 5), dtype=np.uint8)
+    layers[0, 0, :3] = layers[2, 0, 4] = PRESENT
+    seen = np.zeros((3, 1, 5), dtype=np.uint8)
+    seen[0, 0, 1:3] = seen[1, 0, 0] = PRESENT
+    seen[2, 0, 4] = UNKNOWN
+    chart = FftVote().read(made.region_of(layers))
+    verifier = Verifier(chart=chart, bands=np.arange(3), seen=seen, cell_size_m=1.0)
+    assert verifier.agreement(Pose(easting_m=1002.5, northing_m=8999.5, yaw_deg=0.0)) == pytest.approx((2 / 3 + 0) / 2)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_an_empty_view_of_an_empty_map_is_answered(made, variant) -> None:
+    empty = np.zeros((3, 200, 200), dtype=np.uint8)
+    matcher = variant()
+    matcher.prepare(made.region_of(empty), None)
+    query = made.query_of(Evidence(classes=made.classes, cells=empty[:, :32, :32], cell_size_m=1.0), KNOWN_YAW)
+    assert check_match(matcher.match(query, top_k=3), query, top_k=3).diagnostics["class_agreement"] == 0.0

@@ -117,15 +117,43 @@ class Chart:
     def _layers(self, bands: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
         return [*(self.degree[band] for band in bands), self.known]
 
+    def blocks(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Some classes, then knowing, in a square of blocks of `factor` cells a side: 1 where any cell of one has it.
+
+        The result has shape (bands + 1, size, size); its first block begins at (row, col) of the map. Lines stay whole
+        that way, and houses closer than a block grow together.
+        """
+        windows = (_window(layer, row, col, size * factor) for layer in self._layers(bands))
+        return np.stack([np.minimum(largest(window, factor), 1) for window in windows])
+
     def _cut(self, layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.float32]:
         """Square of one layer, 0..1."""
-        found = np.zeros((size, size), dtype=np.float32)
-        rows, cols = layer.shape
-        top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
-        if top < bottom and left < right:
-            inside = found[top - row : bottom - row, left - col : right - col]
-            np.divide(layer[top:bottom, left:right], np.float32(FULL), out=inside)
-        return found
+        return np.asarray(np.divide(_window(layer, row, col, size), np.float32(FULL)), dtype=np.float32)
+
+
+def _window(layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.uint8]:
+    """Square of one layer; 0 beyond it."""
+    found = np.zeros((size, size), dtype=np.uint8)
+    rows, cols = layer.shape
+    top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
+    if top < bottom and left < right:
+        found[top - row : bottom - row, left - col : right - col] = layer[top:bottom, left:right]
+    return found
+
+
+def largest(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Largest value of each block of `factor` cells a side; cells left over at the right and below are left out.
+
+    Examples
+    --------
+    >>> largest(np.array([[0, 1, 0, 0, 1], [0, 0, 0, 0, 1]], dtype=np.uint8), 2).tolist()
+    [[1, 0]]
+    """
+    rows, cols = (count // factor * factor for count in layer.shape)
+    found = np.zeros((rows // factor, cols // factor), dtype=np.uint8)
+    for down, right in np.ndindex(factor, factor):
+        np.maximum(found, layer[down:rows:factor, right:cols:factor], out=found)
+    return found
 
 
 def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ from sasgeo_bench.pose import Pose
 # stands out in the raster and all others are alike, it stands N / sqrt(N - 1) > sqrt(N) standard deviations above
 # them, and no two graph terms are further apart than sqrt(2 N): below 1 / sqrt(2) = 0.71 the graph never overturns it.
 BETA: Final = 0.5
+_EQUAL: Final = 1e-9  # distances that differ by less are equal: to standardise would make much of rounding
 
 
 def blended(scores: NDArray[np.float64], distances: NDArray[np.float64], *, beta: float = BETA) -> NDArray[np.float64]:
@@ -33,7 +34,7 @@ def blended(scores: NDArray[np.float64], distances: NDArray[np.float64], *, beta
     >>> blended(np.array([1.0, 3.0]), np.array([0.5, 0.5])).tolist()
     [1.0, 3.0]
     """
-    if len(scores) == 0 or not np.ptp(distances) > 0:
+    if len(scores) == 0 or not np.ptp(distances) > _EQUAL:
         return scores
     unit = scores.std() if np.ptp(scores) > 0 else 1.0
     return np.asarray(scores - beta * unit * (distances - distances.mean()) / distances.std())

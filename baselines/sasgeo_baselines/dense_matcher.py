@@ -107,8 +107,6 @@ def _bands(evidence: Evidence, chart: Chart) -> NDArray[np.int64]:
 
 
 def _margin(modes: list[Mode]) -> dict[str, float]:
-    """Margin of the best mode over the next, and how many there are."""
-    if not modes:
-        return {"margin": 0.0, "modes": 0.0}
-    second = modes[1].score if len(modes) > 1 else 0.0
-    return {"margin": modes[0].score - second, "modes": float(len(modes))}
+    """Margin of the best mode over the next, 0 where there is none, and how many there are."""
+    margin = modes[0].score - modes[1].score if len(modes) > 1 else 0.0
+    return {"margin": margin, "modes": float(len(modes))}

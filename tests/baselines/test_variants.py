@@ -210,6 +210,15 @@ def test_of_a_field_and_a_house_of_one_shape_the_house_weighs_more_by_stability_
 # What is told besides
 
 
+def test_a_mode_that_is_alone_has_no_margin(made, view) -> None:
+    matcher = RasterUniform()
+    matcher.prepare(made.region_of(made.textured(1)), None)
+    alone = matcher.match(made.query_of(view, KNOWN_YAW, candidates=PLACES[:1]), top_k=3)
+    assert alone.diagnostics["margin"] == 0.0
+    several = matcher.match(made.query_of(view, KNOWN_YAW, candidates=PLACES), top_k=3)
+    assert several.diagnostics["margin"] == several.scores[0] - several.scores[1] > 0
+
+
 @pytest.mark.parametrize("variant", [FftVote, *VARIANTS])
 def test_a_perfect_view_agrees_in_all_classes_and_stands_out(made, variant) -> None:
     region = made.region_of(made.textured(1))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chart: a region's layers as degrees of presence, made ready for reading squares of them at any coarseness."""
 
+import math
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -8,11 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import ABSENT, PRESENT
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.grid import Grid
+from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import Region
 
 FULL: Final = 255  # present without doubt; degrees are kept in steps of 1/255
+_NOTHING: Final = 6.5  # times the reach: less than 1e-9 is left
+_DECIMALS: Final = 6  # of a place within its cell: the same on every copy of a piece of map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +50,8 @@ class Chart:
         for name, layer, kept in zip(region.classes, region.layers, degree, strict=True):
             present = (layer == PRESENT) & known
             if name in thin and reach_m > 0:
-                faded = fade(present, reach_cells=reach_m / region.grid.cell_size_m)
-                kept[:] = np.rint(FULL * faded) * known
+                faded = np.rint(FULL * fade(present, reach_cells=reach_m / region.grid.cell_size_m))
+                kept[:] = np.where(present, FULL, np.minimum(faded, FULL - 1)) * known
             else:
                 np.multiply(present, np.uint8(FULL), out=kept)
         return cls(
@@ -72,18 +76,84 @@ class Chart:
         cuts = (self._cut(layer, row, col, size * factor) for layer in self._layers(bands))
         return np.stack([cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) for cut in cuts])
 
+    def under(
+        self, pose: Pose, shape: tuple[int, int], bands: NDArray[np.int64], *, cell_size_m: float
+    ) -> NDArray[np.uint8]:
+        """Show some classes as a perfect view from a pose would: the cells of `evidence.observe`, read from here.
+
+        Parameters
+        ----------
+        pose : Pose
+            Of the view.
+        shape : tuple of int
+            Its rows and columns.
+        bands : ndarray of int64, shape (B,)
+            Which classes.
+        cell_size_m : float
+            Metres a side of a view cell for scale 1.
+
+        Returns
+        -------
+        ndarray of uint8, shape (B, rows, cols)
+            ABSENT, PRESENT or UNKNOWN; beyond the map everything is UNKNOWN.
+        """
+        place = self.grid.to_uv(np.array([(pose.easting_m, pose.northing_m)]))[0]
+        whole = np.floor(place)
+        turn = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=pose.yaw_deg, scale=pose.scale)
+        right, up = turn.to_map(np.eye(2) * cell_size_m) / (self.grid.cell_size_m, -self.grid.cell_size_m)
+        across, along = (np.arange(count) + 0.5 - count / 2 for count in (shape[1], shape[0]))
+        uv = (place - whole).round(_DECIMALS)[:, None, None] + np.multiply.outer(right, across)[:, None, :]
+        moved = np.floor(uv - np.multiply.outer(up, along)[:, :, None]).astype(np.int64)
+        cols, rows = moved + whole.astype(np.int64)[:, None, None]
+        inside = (rows >= 0) & (rows < self.grid.rows) & (cols >= 0) & (cols < self.grid.cols)
+        at = np.where(inside, rows * self.grid.cols + cols, 0)
+        unknown = ~(inside & (self.known.ravel().take(at) == FULL))
+        shown = np.empty((len(bands), *shape), dtype=np.uint8)
+        for band, layer in zip(bands, shown, strict=True):
+            np.equal(self.degree[band].ravel().take(at), FULL, out=layer)
+        shown[:, unknown] = UNKNOWN
+        return shown
+
     def _layers(self, bands: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
         return [*(self.degree[band] for band in bands), self.known]
 
+    def blocks(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Some classes, then knowing, in a square of blocks of `factor` cells a side: 1 where any cell of one has it.
+
+        The result has shape (bands + 1, size, size); its first block begins at (row, col) of the map. Lines stay whole
+        that way, and houses closer than a block grow together.
+        """
+        windows = (_window(layer, row, col, size * factor) for layer in self._layers(bands))
+        return np.stack([np.minimum(largest(window, factor), 1) for window in windows])
+
     def _cut(self, layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.float32]:
         """Square of one layer, 0..1."""
-        found = np.zeros((size, size), dtype=np.float32)
-        rows, cols = layer.shape
-        top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
-        if top < bottom and left < right:
-            inside = found[top - row : bottom - row, left - col : right - col]
-            np.divide(layer[top:bottom, left:right], np.float32(FULL), out=inside)
-        return found
+        return np.asarray(np.divide(_window(layer, row, col, size), np.float32(FULL)), dtype=np.float32)
+
+
+def _window(layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.uint8]:
+    """Square of one layer; 0 beyond it."""
+    found = np.zeros((size, size), dtype=np.uint8)
+    rows, cols = layer.shape
+    top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
+    if top < bottom and left < right:
+        found[top - row : bottom - row, left - col : right - col] = layer[top:bottom, left:right]
+    return found
+
+
+def largest(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Largest value of each block of `factor` cells a side; cells left over at the right and below are left out.
+
+    Examples
+    --------
+    >>> largest(np.array([[0, 1, 0, 0, 1], [0, 0, 0, 0, 1]], dtype=np.uint8), 2).tolist()
+    [[1, 0]]
+    """
+    rows, cols = (count // factor * factor for count in layer.shape)
+    found = np.zeros((rows // factor, cols // factor), dtype=np.uint8)
+    for down, right in np.ndindex(factor, factor):
+        np.maximum(found, layer[down:rows:factor, right:cols:factor], out=found)
+    return found
 
 
 def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float32]:
@@ -111,4 +181,7 @@ def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float3
     distance = cv2.distanceTransform(
         np.where(present, ABSENT, PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
     )
-    return np.asarray(np.exp(-(distance**2) / np.float32(2 * reach_cells**2)), dtype=np.float32)
+    # D^2 is whole, so a table holds all there is; NumPy's exp rounds by where in memory an array happens to lie.
+    squared = np.rint(np.minimum(distance, _NOTHING * reach_cells) ** 2).astype(np.int64)
+    table = [math.exp(-k / (2 * reach_cells**2)) for k in range(int(squared.max()) + 1)]
+    return np.asarray(np.array(table, dtype=np.float32)[squared], dtype=np.float32)

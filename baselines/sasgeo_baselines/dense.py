@@ -65,6 +65,23 @@ class Mode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """What a search comes back with.
+
+    Parameters
+    ----------
+    modes : list of Mode or None
+        The best of the places, best first; or one for each candidate, None where the map shows too little.
+    null_score : float
+        By how many standard deviations the best coarse score exceeds those of the places apart from it, which are
+        wrong if it is right; 0 where there are none.
+    """
+
+    modes: list[Mode | None]
+    null_score: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Disc:
     """Where a view may lie; anywhere, if there is no centre."""
 
@@ -150,23 +167,27 @@ class Search:
     prior: Prior
     plan: Plan
 
-    def places(self, count: int) -> list[Mode]:
-        """Find the best modes within the prior, best first; none where no pose shows enough of the map."""
+    def places(self, count: int) -> Found:
+        """Find the best modes within the prior; none where no pose shows enough of the map."""
         plan, factor = self.plan, self._factor()
-        coarse = self._peaks(self._tiles_of_prior(factor), factor, most=max(plan.modes, 2 * count))
+        tiles = self._tiles_of_prior(factor)
+        votes, points_m = _joined(tiles, self._vote(tiles, factor))
+        coarse = self._peaks(votes, points_m, most=max(plan.modes, 2 * count))
         limit = self._limit(factor)
-        rough = _ranked(self._rough(mode, limit) for mode in coarse)
-        fine = _ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
-        return _thinned(fine, plan.apart_m)
+        rough = ranked(self._rough(mode, limit) for mode in coarse)
+        fine = ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
+        null_score = above_others(votes.score, points_m, apart_m=plan.apart_m)
+        return Found(modes=[*_thinned(fine, plan.apart_m)], null_score=null_score)
 
-    def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
-        """Score every candidate by the best pose near it, in their order; None where the map shows too little.
+    def candidates(self, poses: Sequence[Pose]) -> Found:
+        """Score every candidate by the best pose near it.
 
         Those that the coarse search puts behind `plan.modes` others keep its score, below all that were refined.
         """
         factor = self._cells(self.plan.coarse_m)
         tiles = [self._tile_around(pose, factor) for pose in poses]
-        rough = [self._best(tile, votes) for tile, votes in zip(tiles, self._vote(tiles, factor), strict=True)]
+        votes = self._vote(tiles, factor)
+        rough = [self._best(tile, part) for tile, part in zip(tiles, votes, strict=True)]
         order = sorted((mode.score for mode in rough if mode), reverse=True)
         cut = order[min(self.plan.modes, len(order)) - 1] if order else NOWHERE
         fine: dict[int, Mode] = {}
@@ -175,9 +196,11 @@ class Search:
                 disc = Disc(center_m=(poses[at].easting_m, poses[at].northing_m), radius_m=self.plan.around_m)
                 fine[at] = self._fine(self._rough(mode, disc), disc)
         lowest = min((mode.score for mode in fine.values()), default=0.0)
-        return [
+        modes = [
             fine.get(at, mode and replace(mode, score=lowest - (cut - mode.score))) for at, mode in enumerate(rough)
         ]
+        joined, points_m = _joined(tiles, votes)
+        return Found(modes=modes, null_score=above_others(joined.score, points_m, apart_m=self.plan.apart_m))
 
     # Where
 
@@ -283,18 +306,11 @@ class Search:
         pose = replace(turn, easting_m=float(point_m[0]), northing_m=float(point_m[1]))
         return Mode(pose=pose, score=float(votes.score[at]))
 
-    def _peaks(self, tiles: Sequence[_Tile], factor: int, *, most: int) -> list[Mode]:
-        """Best modes of all tiles, none nearer to a better one than `apart_m`."""
-        if not tiles:
-            return []
-        parts = self._vote(tiles, factor)
-        points_m = np.concatenate([tile.points_m for tile in tiles])
-        votes = _Votes(
-            score=np.concatenate([part.score for part in parts]), turn=np.concatenate([part.turn for part in parts])
-        )
+    def _peaks(self, votes: _Votes, points_m: NDArray[np.float64], *, most: int) -> list[Mode]:
+        """Best modes, none nearer to a better one than `apart_m`."""
         left = votes.score.copy()
         found: list[Mode] = []
-        while len(found) < most:
+        while len(found) < min(most, len(left)):
             at = int(np.argmax(left))
             if not left[at] > NOWHERE:
                 break
@@ -356,6 +372,30 @@ class Search:
         return best
 
 
+def _joined(tiles: Sequence[_Tile], parts: Sequence[_Votes]) -> tuple[_Votes, NDArray[np.float64]]:
+    """Votes and places of all tiles in one."""
+    score = np.concatenate([np.zeros(0), *(part.score for part in parts)])
+    turn = np.concatenate([np.zeros(0, dtype=np.int64), *(part.turn for part in parts)])
+    points_m = np.concatenate([np.zeros((0, 2)), *(tile.points_m for tile in tiles)])
+    return _Votes(score=score, turn=turn), points_m
+
+
+def above_others(score: NDArray[np.float64], points_m: NDArray[np.float64], *, apart_m: float) -> float:
+    """By how many standard deviations the best score exceeds those at least `apart_m` away from it; else 0.
+
+    Examples
+    --------
+    >>> above_others(np.array([5.0, 4.0, 1.0, -1.0]), np.array([(0.0, 0), (1, 0), (9, 0), (-9, 0)]), apart_m=2.0)
+    5.0
+    """
+    if not len(score):
+        return 0.0
+    at = int(np.argmax(score))
+    others = score[(score > NOWHERE) & (np.hypot(*(points_m - points_m[at]).T) >= apart_m)]
+    spread = float(others.std()) if len(others) > 1 else 0.0
+    return float(score[at] - others.mean()) / spread if spread > 0 else 0.0
+
+
 def _climb(best: Mode, score_of: Callable[[Pose], float], steps: Sequence[float]) -> Mode:
     """Step along place, heading and scale, one at a time, as long as that is better."""
     metres, degrees, scale = steps
@@ -378,7 +418,7 @@ def _transform_size(side: int) -> tuple[int, int]:
     return size, size
 
 
-def _ranked(modes: Iterable[Mode]) -> list[Mode]:
+def ranked(modes: Iterable[Mode]) -> list[Mode]:
     """Best first; equals keep their order."""
     return sorted((mode for mode in modes if mode.score > NOWHERE), key=lambda mode: -mode.score)
 

@@ -17,7 +17,7 @@ class FftVote(DenseMatcher):
 
     card = MatcherCard(
         name="fft_vote",
-        version="1",
+        version="2",
         title="Exhaustive three-state voting by FFT",
         source="Template voting of OrienterNet (Sarlin et al., CVPR 2023), on the scores of the SASGeo paper, Eqs. 7-8",
         ours=(

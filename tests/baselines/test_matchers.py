@@ -18,7 +18,9 @@ from sasgeo_bench.store.taskdir import read_queries, read_truths
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.matchers"]
-DENSE = ("fft_vote", "raster_uniform")
+VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
+DENSE = ("fft_vote", "raster_uniform", *VARIANTS)
+STRIDES = dict.fromkeys(VARIANTS, 12) | {"fft_vote": 6, "raster_uniform": 6, "graph_only": 6}
 CONTROLS = ("random", "prior_centre", "map_density_prior")
 
 
@@ -55,12 +57,12 @@ def test_a_matcher_is_registered_under_the_name_of_its_card(name) -> None:
 
 
 def test_every_matcher_is_registered() -> None:
-    assert set(REGISTERED) == {"global_descriptor", *DENSE, *CONTROLS}
+    assert set(REGISTERED) == {"global_descriptor", "graph_only", *DENSE, *CONTROLS}
 
 
 @pytest.mark.parametrize("name", REGISTERED)
 def test_answers_are_valid_and_the_same_in_any_order(name, region, queries) -> None:
-    some = queries[:: 6 if name in DENSE else 1]
+    some = queries[:: STRIDES.get(name, 1)]
     first, second = make(name), make(name)
     for matcher in (first, second):
         matcher.prepare(region, None)

@@ -9,6 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sasgeo_baselines.dense import Disc, Plan, turns
 from sasgeo_baselines.fft_vote import FftVote
+from sasgeo_baselines.full_unknown import FullUnknown
+from sasgeo_baselines.raster_graph import RasterGraph
 from sasgeo_baselines.raster_uniform import RasterUniform
 from sasgeo_baselines.view import Patch, View
 
@@ -129,7 +131,7 @@ def test_a_view_that_reaches_beyond_the_map_is_found(made) -> None:
     assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 0.5
 
 
-@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform()])
+@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform(), RasterGraph(), FullUnknown()])
 def test_the_same_place_twice_scores_the_same_and_keeps_its_order(made, matcher) -> None:
     one = made.textured(4, side=200)
     region = made.region_of(np.concatenate((one, one, one), axis=2))  # three copies, 200 m apart
@@ -161,7 +163,7 @@ def test_a_candidate_given_twice_ties_with_itself(made) -> None:
     assert match.scores[0] == match.scores[1] > match.scores[2]
 
 
-@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform()])
+@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform(), RasterGraph(), FullUnknown()])
 def test_an_answer_is_withheld_where_nothing_was_seen_or_no_map_is_near(made, matcher) -> None:
     region = made.region_of(made.textured(1))
     matcher.prepare(region, None)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.chart import Chart
+from sasgeo_baselines.chart import Chart, fade
 from sasgeo_baselines.view import Patch, View
 from sasgeo_baselines.voting import Gains, make_template, score_cells, vote, vote_directly
 
@@ -69,3 +69,21 @@ def test_a_pose_scores_as_what_is_seen_from_it(made, east_m, north_m, yaw_deg, s
         assert found == -np.inf
     else:
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+def test_what_fades_does_not_depend_on_where_in_memory_it_lies(made) -> None:
+    present = made.textured(1, side=96)[1] == 1
+    rng = np.random.default_rng(0)
+    kept, found = [], set()
+    for size in rng.integers(1, 200_000, 300):
+        kept = [*kept[-5:], np.ones(size, dtype=np.uint8)]
+        found.add(fade(present, reach_cells=4.0).tobytes())
+    assert len(found) == 1
+
+
+def test_what_fades_is_the_formula() -> None:
+    present = np.zeros((30, 40), dtype=bool)
+    present[3, 4] = True
+    rows, cols = np.indices(present.shape)
+    expected = np.exp(-((rows - 3) ** 2 + (cols - 4) ** 2) / (2 * 2.5**2))
+    np.testing.assert_allclose(fade(present, reach_cells=2.5), expected, atol=1e-9, rtol=1e-6)

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`graph_only`: how many things there are and how far from each other, and no overlap of rasters."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_baselines.answers import is_blind, ranked_candidates
+from sasgeo_baselines.chart import Chart, largest
+from sasgeo_baselines.dense import Disc
+from sasgeo_baselines.descriptor import Descriptor, components
+from sasgeo_baselines.nodes import Nodes
+from sasgeo_baselines.places import at_place, first_apart, lattice_m, points_of
+from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.pose import Prior
+from sasgeo_bench.query import Query
+from sasgeo_bench.region import Region
+
+CELL_M: Final = 2.0  # finer patches cost more and tell no more
+STEP_M: Final = 32.0
+NEAR_M: Final = 16.0  # how far a candidate may be moved, east and north
+APART_M: Final = 25.0
+MOST_TRIED: Final = 1000  # places of a lattice; a larger prior has a wider one
+REFINED: Final = 24
+_AROUND: Final = np.array([(east, north) for north in (1, 0, -1) for east in (-1, 0, 1)], dtype=np.float64)
+
+
+class GraphOnly:
+    """Rank places by the graph descriptor alone, and by the nodes of the map graph where vectors were seen."""
+
+    card = MatcherCard(
+        name="graph_only",
+        version="1",
+        title="Graph descriptor alone",
+        source="SASGeo paper (Trukhina and Vashkelis), the graph descriptor of its Section VI; Eq. 9 is its proposal",
+        ours=(
+            "For every class the number of connected patches of at least 9 m2 and a histogram of the distances of "
+            "their centroids, in the largest disc within the view, on cells of 2 m; what is unknown is allowed for by "
+            "the share of the disc that is known. With perceived vectors the same of junctions of three and of more "
+            "roads, crossings with and without connection, and buildings, of a graph derived from the vectors as the "
+            "map's is, and the mean of both. A candidate is the best of nine places 16 m apart; localization tries a "
+            "lattice of 32 m, wider where that were more than 1000 places, then the places around the best 24"
+        ),
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits=(
+            "No overlap, no correspondences: heading is the prior's (north if unknown), scale 1, places are no finer "
+            "than 16 m; a patch that the disc cuts counts as one; no confidence"
+        ),
+    )
+
+    def __init__(self) -> None:
+        self._chart: Chart | None = None
+
+    def prepare(self, region: Region, training: Training | None) -> None:
+        """Read the layers and the nodes of the map."""
+        del training
+        self._chart = Chart.of(region)
+        self._used = self._chart.used()
+        self._nodes = Nodes.of(region.graph)
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Rank candidates, or places of a lattice, by how alike their descriptors are."""
+        if self._chart is None:
+            message = f"{self.card.name}: call prepare() with a region before match()"
+            raise RuntimeError(message)
+        if is_blind(query) and (query.vectors is None or query.vectors.empty):
+            return WITHHELD
+        glance = _Glance.of(query, self._chart, self._nodes, used=self._used)
+        said = {"known_share": 1.0 - query.evidence.unknown_share}
+        if query.track == "retrieval":
+            best = [glance.scores(place_m + NEAR_M * _AROUND).max() for place_m in points_of(query.candidates)]
+            kept = [float(score) if math.isfinite(score) else None for score in best]
+            return ranked_candidates(query, kept, top_k=top_k, diagnostics=said)
+        points_m, scores = _searched(glance, query.prior)
+        chosen = first_apart(points_m, scores, apart_m=APART_M, most=top_k)
+        poses = [at_place(points_m[at], query.prior) for at in chosen]
+        return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=said)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Glance:
+    """What a view holds within the largest disc in it, and the map to hold it against.
+
+    `things` is the descriptor of its layers, for the classes in `bands`, of which some is known, `shares` how much of
+    each; `seen_nodes` that of its vectors, None without.
+    """
+
+    chart: Chart
+    nodes: Nodes
+    radius_m: float
+    bands: NDArray[np.int64]
+    shares: NDArray[np.float64]
+    things: Descriptor
+    seen_nodes: Descriptor | None
+
+    @classmethod
+    def of(cls, query: Query, chart: Chart, nodes: Nodes, *, used: NDArray[np.bool_]) -> Self:
+        """Look at a view once; classes that the map holds nowhere, by `used`, say the same of every place."""
+        view, radius_m = query.evidence, min(query.evidence.size_m) / 2
+        inside = _disc(view.shape)
+        known = np.array([(layer != UNKNOWN)[inside].mean() for layer in view.cells])
+        mapped = {name for name, is_used in zip(chart.classes, used, strict=True) if is_used}
+        chosen = [at for at, name in enumerate(view.classes) if name in mapped and known[at] > 0]
+        seen = None
+        if query.vectors is not None:
+            seen = Nodes.seen(query.vectors, epsg=chart.grid.epsg).around((0.0, 0.0), radius_m)
+        return cls(
+            chart=chart,
+            nodes=nodes,
+            radius_m=radius_m,
+            bands=np.array([chart.classes.index(view.classes[at]) for at in chosen], dtype=np.int64),
+            shares=known[chosen],
+            things=_things_of(view, chosen, radius_m),
+            seen_nodes=seen,
+        )
+
+    def scores(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minus the unlikeness of each place, shape (N,); minus infinity where the map knows nothing."""
+        return np.array([self._score(place_m) for place_m in points_m])
+
+    def _score(self, place_m: NDArray[np.float64]) -> float:
+        factor = _factor(self.chart.grid.cell_size_m)
+        size = max(1, round(2 * self.radius_m / (self.chart.grid.cell_size_m * factor)))
+        corner = self.chart.grid.to_uv(place_m[None])[0] - size * factor / 2
+        col, row = np.rint(corner.round(6)).astype(np.int64).tolist()
+        *layers, known = self.chart.blocks(row, col, size, factor, self.bands)
+        inside = _disc((size, size))
+        share = float(known[inside].mean())
+        if share == 0:
+            return -math.inf
+        found = []
+        if len(self.bands):
+            mapped = _described(
+                [layer * inside for layer in layers], self.chart.grid.cell_size_m * factor, self.radius_m
+            )
+            found.append(self.things.scaled(np.full(len(layers), share)).distance(mapped.scaled(self.shares)))
+        if self.seen_nodes is not None:
+            east_m, north_m = place_m.tolist()
+            found.append(self.seen_nodes.distance(self.nodes.around((east_m, north_m), self.radius_m)))
+        return -sum(found) / len(found) if found else 0.0
+
+
+def _searched(glance: _Glance, prior: Prior) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places within the prior, shape (N, 2), and their scores: a lattice, then around the best of it."""
+    grid, step_m = glance.chart.grid, STEP_M
+    points_m = lattice_m(prior, grid, step_m=step_m)
+    if len(points_m) > MOST_TRIED:
+        step_m *= math.ceil(math.sqrt(len(points_m) / MOST_TRIED))
+        points_m = lattice_m(prior, grid, step_m=step_m)
+    scores = glance.scores(points_m)
+    west_m, south_m, east_m, north_m = grid.bounds_m
+    disc = Disc(center_m=prior.center_m, radius_m=prior.radius_m or 0.0)
+    while step_m > NEAR_M:
+        step_m /= 2
+        best = points_m[first_apart(points_m, scores, apart_m=APART_M, most=REFINED)]
+        near = (best[:, None] + step_m * _AROUND[_AROUND.any(axis=1)]).reshape(-1, 2)
+        on_map = ((near >= (west_m, south_m)) & (near <= (east_m, north_m))).all(axis=1)
+        near = near[on_map & disc.holds(near)]
+        points_m, scores = np.concatenate((points_m, near)), np.concatenate((scores, glance.scores(near)))
+    return points_m, scores
+
+
+def _things_of(view: Evidence, chosen: list[int], radius_m: float) -> Descriptor:
+    """Describe some classes of a view, on coarse cells."""
+    factor = _factor(view.cell_size_m)
+    layers = [largest((view.cells[at] == PRESENT).astype(np.uint8), factor) for at in chosen]
+    return _described([layer * _disc(layer.shape) for layer in layers], view.cell_size_m * factor, radius_m)
+
+
+def _described(layers: list[NDArray[np.uint8]], cell_size_m: float, radius_m: float) -> Descriptor:
+    return Descriptor.of([components(layer, cell_size_m=cell_size_m) for layer in layers], reach_m=2 * radius_m)
+
+
+def _factor(cell_size_m: float) -> int:
+    """Cells a side of a coarse one."""
+    return max(1, round(CELL_M / cell_size_m))
+
+
+@lru_cache(maxsize=16)
+def _disc(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Cells whose middles lie in the largest disc around the middle of a raster."""
+    rows, cols = (np.arange(count) + 0.5 - count / 2 for count in shape)
+    found = np.asarray(np.hypot(*np.meshgrid(rows, cols, indexing="ij")) <= min(shape) / 2)
+    found.flags.writeable = False
+    return found

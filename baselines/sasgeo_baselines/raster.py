@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's variants 2 to 5 as one matcher with switches; a file beside it for each card."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_baselines.chart import Chart, fade
+from sasgeo_baselines.dense import Mode, Plan
+from sasgeo_baselines.dense_matcher import DenseMatcher
+from sasgeo_baselines.verification import Verifier, blended
+from sasgeo_baselines.voting import Gains, make_template
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.region import Region
+from sasgeo_bench.taxonomy import load_taxonomy
+
+THIN: Final = (
+    *("road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"),
+)
+REACH_M: Final = 4.0
+
+# What the cards share.
+SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), Eqs. 7-8 and variant {variant} of its Section VI"
+OURS: Final = (
+    "Distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for the classes drawn as lines, on the map, and in the "
+    "view as an excuse for what seems missed; all gains 1; division by the cells that count; the search over place, "
+    "heading and scale (the paper ranks ten windows)"
+)
+GRAPH: Final = (
+    "graph descriptor: for every class the number of connected patches of at least 9 m2 (8 neighbours) and a histogram "
+    "of the distances of their centroids (16 bins to the view's diagonal), of the view and of the map under each pose "
+    "that the raster found; counts differ by |n - m| / (n + m + 1), histograms by half their L1 distance; the mean "
+    "over classes; it changes the order of the raster's modes and finds none; raster and graph are standardised over "
+    "the modes or candidates of the query and the graph weighs 0.5, set by hand: below 0.71 it cannot overturn a mode "
+    "that stands alone in the raster"
+)
+STABLE: Final = (
+    "every class weighs its prior p_c of Eq. 5, set by hand in the taxonomy (0.70 for fields to 0.98 for coastlines); "
+    "ages, seasons, visibility and distinctiveness are 1, and the graph is not weighted"
+)
+UNKNOWN_IS_ABSENT: Final = (
+    "what is unknown in the view counts as absent, so that what is mapped there contradicts, as in the paper's trials, "
+    "whose last variant alone ignores it"
+)
+LIMITS: Final = (
+    "headings and scales beyond two standard deviations are not searched; candidates that share a place within 24 m "
+    "cannot be told apart; no confidence; withholds only where everything is unknown"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Switches:
+    """What the variants differ in; with all off it is the second.
+
+    Parameters
+    ----------
+    has_graph : bool
+        The graph descriptor has a say in the score of each mode: see `verification.blended`.
+    is_stable : bool
+        Each class weighs as much as `stability` says, else 1.
+    is_unknown_silent : bool
+        What is unknown in the view says nothing; else it is taken for absent.
+    """
+
+    has_graph: bool = False
+    is_stable: bool = False
+    is_unknown_silent: bool = False
+
+
+class RasterMatcher(DenseMatcher):
+    """Eqs. (7)-(8) with gains of 1; lines agree by nearness.
+
+    Parameters
+    ----------
+    reach_m : float
+        The tau of exp(-D^2 / 2 tau^2) for lines, metres.
+    plan : Plan, optional
+        How the search is done.
+    """
+
+    switches: ClassVar[Switches] = Switches()
+
+    def __init__(self, *, reach_m: float = REACH_M, plan: Plan | None = None) -> None:
+        super().__init__(plan)
+        self.reach_m = reach_m
+
+    def read(self, region: Region) -> Chart:
+        """Let the lines of the map fade."""
+        return Chart.of(region, thin=THIN, reach_m=self.reach_m)
+
+    def seen(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Take what is unknown for absent, unless this variant handles it."""
+        if self.switches.is_unknown_silent:
+            return cells
+        return np.where(cells == UNKNOWN, ABSENT, cells).astype(np.uint8)
+
+    def template(self, evidence: Evidence) -> NDArray[np.float64]:
+        """One vote each; a line that is mapped beside one that was seen is not missed."""
+        near = np.zeros(evidence.cells.shape, dtype=np.float32)
+        for name, layer, into in zip(evidence.classes, evidence.cells, near, strict=True):
+            if name in THIN:
+                into[:] = fade(layer == PRESENT, reach_cells=self.reach_m / evidence.cell_size_m)
+        weights = stability(evidence.classes) if self.switches.is_stable else np.ones(len(evidence.classes))
+        return make_template(evidence.cells, Gains(agree=weights, extra=weights, missed=weights), near=near)
+
+    def rescored(self, modes: list[Mode], verifier: Verifier) -> list[Mode]:
+        """Let the graph descriptor have its say."""
+        if not self.switches.has_graph:
+            return modes
+        distances = np.array([verifier.distance(mode.pose) for mode in modes])
+        scores = blended(np.array([mode.score for mode in modes]), distances)
+        return [replace(mode, score=float(score)) for mode, score in zip(modes, scores, strict=True)]
+
+    def told(self, best: Mode, verifier: Verifier) -> dict[str, float]:
+        """Diagnostics of the best mode; that of the graph only where the graph is looked at."""
+        said = super().told(best, verifier)
+        return said | {"graph_distance": verifier.distance(best.pose)} if self.switches.has_graph else said
+
+
+def stability(classes: tuple[str, ...]) -> NDArray[np.float64]:
+    """Prior p_c of each class, shape (C,): Eq. (5) of the SASGeo paper with all its other factors 1.
+
+    Examples
+    --------
+    >>> stability(("railway", "farmland")).tolist()
+    [0.97, 0.7]
+    """
+    taxonomy = load_taxonomy()
+    return np.array([taxonomy[name].persistence.prior for name in classes], dtype=np.float64)

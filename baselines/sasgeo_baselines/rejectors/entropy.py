@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`entropy`: over how many places the scores are spread."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_baselines.rejectors.leads import entropy, with_withheld
+from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.results import Prediction
+
+
+class Entropy:
+    """One less the inverse of the effective number of candidates."""
+
+    card = RejectorCard(
+        name="entropy",
+        version="1",
+        title="Entropy over candidates",
+        source="SASGeo paper (Trukhina and Vashkelis), Section V: posterior entropy",
+        ours=(
+            "Softmax of the scores over their standard deviation, entropy H; 1 - exp(-H), which is 1 - 1/n for n "
+            "equals; one candidate alone is taken for two that tie; withheld answers say 1"
+        ),
+        licence="Apache-2.0",
+        limits=(
+            "Uncalibrated: the softmax has no fitted temperature; blind to the scale of the scores; the number of "
+            "candidates that a matcher gives moves it"
+        ),
+    )
+
+    def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
+        """Learn nothing."""
+
+    def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
+        """The more candidates share the scores, the nearer to 1, shape (N,)."""
+        return with_withheld(predictions, lambda answers: np.array([-math.expm1(-entropy(item)) for item in answers]))

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the rules read of the scores of an answer: by how much the first place leads, and over how many it is spread."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.results import Prediction
+
+# The widest tolerance of the benchmark: what lies nearer is the same answer. (A footprint would do, but no rule sees
+# the view.)
+APART_M: Final = 25.0
+MOST: Final = 1e100  # larger numbers are taken for this one, so that squares and differences stay finite
+
+Values = NDArray[np.float64]
+
+
+def with_withheld(predictions: Sequence[Prediction], rule: Callable[[Sequence[Prediction]], Values]) -> Values:
+    """What a rule says of answers with candidates, and 1 of those without, shape (N,).
+
+    Examples
+    --------
+    >>> with_withheld([Prediction(query_id="a")], lambda answers: np.zeros(len(answers))).tolist()
+    [1.0]
+    """
+    found = np.ones(len(predictions))
+    at = answered(predictions)
+    if len(at):
+        found[at] = rule([predictions[index] for index in at])
+    return found
+
+
+def answered(predictions: Sequence[Prediction]) -> NDArray[np.int64]:
+    """Which of some answers hold any candidate."""
+    return np.array([at for at, item in enumerate(predictions) if item.candidates], dtype=np.int64)
+
+
+def margin(prediction: Prediction) -> float:
+    """Score of the first candidate less that of the second; 0 where there is none to compare with."""
+    scores = scores_of(prediction)
+    return float(min(scores[0] - scores[1], MOST)) if len(scores) > 1 else 0.0
+
+
+def margin_nms(prediction: Prediction) -> float:
+    """Score of the first candidate less that of the best at least `APART_M` away from it.
+
+    Where all lie near, a rival is none of those given, and so no better than the last of them.
+    """
+    scores = scores_of(prediction)
+    (first, _), *others = prediction.candidates
+    away_m = np.array([math.dist(_place(first), _place(pose)) for pose, _ in others])
+    rivals = scores[1:][away_m >= APART_M]
+    return float(min(scores[0] - (rivals.max() if len(rivals) else scores[-1]), MOST))
+
+
+def entropy(prediction: Prediction) -> float:
+    """Entropy, in nats, of a softmax over the scores, standardised by their spread.
+
+    As for two candidates that tie where there is only one: nothing says that it is better than others.
+    """
+    scores = scores_of(prediction)
+    if len(scores) == 1:
+        return math.log(2)
+    scaled = scores / max(float(np.abs(scores).max()), 1e-300)
+    spread = float(scaled.std())
+    if not np.ptp(scaled) > 0 or not spread > 0:
+        return math.log(len(scores))
+    weights = np.exp((scaled - scaled.max()) / spread)
+    shares = weights / weights.sum()
+    return float(-(shares * np.log(np.maximum(shares, 1e-300))).sum())
+
+
+def scores_of(prediction: Prediction) -> Values:
+    """Scores of the candidates, best first, shape (N,)."""
+    return np.clip(np.array([score for _, score in prediction.candidates], dtype=np.float64), -MOST, MOST)
+
+
+def _place(pose: Pose) -> tuple[float, float]:
+    return (pose.easting_m, pose.northing_m)
+
+
+def base_rate(is_false: NDArray[np.bool_]) -> float:
+    """Share of false fixes with one more of each kind (Laplace): never 0 or 1.
+
+    Examples
+    --------
+    >>> base_rate(np.array([True, True]))
+    0.75
+    """
+    return float((is_false.sum() + 1) / (len(is_false) + 2))

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`logistic_all`: logistic regression on everything that an answer tells."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
+
+from sasgeo_baselines.rejectors.leads import (
+    MOST,
+    answered,
+    base_rate,
+    entropy,
+    margin,
+    margin_nms,
+    scores_of,
+    with_withheld,
+)
+from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.results import Prediction
+
+_NEAR: Final = 1e-150  # a smaller spread is none: quotients stay finite
+_FAR: Final = 10.0  # standard deviations: beyond what calibration has seen, farther is no more
+
+_DECIMALS: Final = 12  # of a probability: the last digits of a fit hang on where in memory arrays lie
+
+
+class LogisticAll:
+    """Margins, entropy, number of candidates, best score and the shared diagnostics, weighed by calibration."""
+
+    card = RejectorCard(
+        name="logistic_all",
+        version="1",
+        title="Logistic regression on all an answer tells",
+        source="SASGeo paper (Trukhina and Vashkelis), Section V: what a probability may be calibrated from",
+        ours=(
+            "scikit-learn's LogisticRegression with its own penalty (C = 1) on standardised features: the margins with "
+            "and without suppression, entropy, number of candidates, best score, and every diagnostic that all "
+            "answers of calibration give; what an answer lacks is the median of calibration; beyond 10 standard "
+            "deviations all is 10; the share of false fixes with one more of each kind where calibration knows one "
+            "kind only; withheld answers say 1 and are not learnt from"
+        ),
+        licence="Apache-2.0",
+        limits="Linear in its features; fitted for one matcher; as good as calibration is like the test",
+    )
+
+    def __init__(self) -> None:
+        self._model: _Model | float | None = None
+
+    def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
+        """Learn the weights."""
+        at = answered(predictions)
+        truth = np.asarray(is_false, dtype=bool)[at]
+        if truth.all() or not truth.any():
+            self._model = base_rate(truth)
+        else:
+            self._model = _Model.of([predictions[index] for index in at], truth)
+
+    def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
+        """Calibrated probability of a false fix, shape (N,)."""
+        model = self._model
+        if model is None:
+            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
+            raise RuntimeError(message)
+        if isinstance(model, float):
+            return with_withheld(predictions, lambda answers: np.full(len(answers), model))
+        return with_withheld(predictions, model.p_false)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Model:
+    """What was learnt: names of diagnostics, and median, mean and spread of each feature."""
+
+    names: tuple[str, ...]
+    medians: NDArray[np.float64]
+    means: NDArray[np.float64]
+    spreads: NDArray[np.float64]
+    weights: LogisticRegression
+
+    @classmethod
+    def of(cls, answers: Sequence[Prediction], is_false: NDArray[np.bool_]) -> Self:
+        """Fit."""
+        shared = set.intersection(*(set(item.diagnostics) for item in answers))
+        names = tuple(sorted(name for name in shared if any(math.isfinite(item.diagnostics[name]) for item in answers)))
+        raw = features(answers, names)
+        medians = np.nanmedian(raw, axis=0)
+        filled = np.where(np.isnan(raw), medians, raw)
+        means, spreads = filled.mean(axis=0), filled.std(axis=0)
+        varies = (np.ptp(filled, axis=0) > 0) & (spreads > _NEAR)
+        spreads = np.where(varies, spreads, 1.0)
+        weights = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000)
+        weights.fit(_standardised(filled, means, spreads), is_false)
+        return cls(names=names, medians=medians, means=means, spreads=spreads, weights=weights)
+
+    def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
+        """Probability of a false fix, shape (N,)."""
+        raw = features(answers, self.names)
+        filled = np.where(np.isnan(raw), self.medians, raw)
+        chances = self.weights.predict_proba(_standardised(filled, self.means, self.spreads))
+        return np.asarray(chances[:, 1], dtype=np.float64).round(_DECIMALS)
+
+
+def features(answers: Sequence[Prediction], names: Sequence[str]) -> NDArray[np.float64]:
+    """Margins, entropy, number of candidates, best score, and some diagnostics, shape (N, 5 + names).
+
+    A diagnostic that an answer lacks, or that is not finite, is nan.
+    """
+    rows = [
+        [
+            margin(item), margin_nms(item), entropy(item), len(item.candidates), scores_of(item)[0],
+            *(_finite(item.diagnostics.get(name, math.nan)) for name in names),
+        ]
+        for item in answers
+    ]  # fmt: skip
+    return np.array(rows, dtype=np.float64)
+
+
+def _finite(value: float) -> float:
+    return min(max(value, -MOST), MOST) if math.isfinite(value) else math.nan
+
+
+def _standardised(
+    filled: NDArray[np.float64], means: NDArray[np.float64], spreads: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.asarray(np.clip((filled - means) / spreads, -_FAR, _FAR))

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rejectors: what they read of an answer, worked by hand; what they learn; and that nothing upsets them."""
+
+import math
+import tomllib
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sasgeo_baselines.rejectors import leads
+from sasgeo_baselines.rejectors.entropy import Entropy
+from sasgeo_baselines.rejectors.isotonic_margin import IsotonicMargin
+from sasgeo_baselines.rejectors.logistic_all import LogisticAll
+from sasgeo_baselines.rejectors.margin import Margin
+from sasgeo_baselines.rejectors.margin_nms import MarginNms
+from sklearn.isotonic import IsotonicRegression
+
+from sasgeo_bench.plugins import load_rejector
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.rejector import check_p_false
+from sasgeo_bench.results import Prediction
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
+REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.rejectors"]
+RULES = (Margin, MarginNms, Entropy)
+LEARNERS = (IsotonicMargin, LogisticAll)
+WITHHELD = Prediction(query_id="withheld")
+SCORES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=6)
+DIAGNOSTICS = st.dictionaries(st.sampled_from("abc"), st.floats(), max_size=3)
+
+
+def answer(*scores: float, step_m: float = 30.0, **diagnostics: float) -> Prediction:
+    """Candidates in a row, so far apart."""
+    poses = [Pose(easting_m=at * step_m, northing_m=0.0, yaw_deg=0.0) for at in range(len(scores))]
+    return Prediction(query_id="q", candidates=tuple(zip(poses, scores, strict=True)), diagnostics=diagnostics)
+
+
+ANSWERS = st.builds(
+    lambda scores, step_m, diagnostics: replace(
+        answer(*sorted(scores, reverse=True), step_m=step_m), diagnostics=diagnostics
+    ),
+    SCORES,
+    st.sampled_from((1.0, 10.0, 30.0)),
+    DIAGNOSTICS,
+)
+
+
+def toy(count: int = 60, seed: int = 0) -> tuple[list[Prediction], np.ndarray]:
+    """Answers of which the right ones lead by more, and see more."""
+    rng = np.random.default_rng(seed)
+    is_false = rng.random(count) < 0.4
+    made = [
+        answer(
+            2.0,
+            2.0 - abs(rng.normal(0.2 if wrong else 0.8, 0.2)),
+            0.5,
+            seen=rng.normal(0.3 if wrong else 0.7, 0.1),
+            noise=rng.normal(),
+        )
+        for wrong in is_false
+    ]
+    return made, is_false
+
+
+# Cards and doors
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_a_rejector_is_registered_under_the_name_of_its_card(name) -> None:
+    rejector = load_rejector(REGISTERED[name])
+    assert rejector.card.name == name
+    assert rejector.card.licence == "Apache-2.0"
+    assert rejector.card.limits
+
+
+def test_every_rejector_is_registered() -> None:
+    folder = Path(import_module("sasgeo_baselines.rejectors").__file__).parent
+    files = {path.stem for path in folder.glob("*.py")} - {"__init__", "leads"}
+    assert set(REGISTERED) == files == {rule.card.name for rule in (*RULES, *LEARNERS)}
+
+
+@pytest.mark.parametrize("rule", [*RULES, *LEARNERS])
+def test_withheld_answers_are_false_and_nobody_asked_is_nobody_answered(rule) -> None:
+    rejector = rule()
+    rejector.fit(*toy())
+    assert rejector.p_false([WITHHELD, replace(WITHHELD, status="timeout")]).tolist() == [1.0, 1.0]
+    assert rejector.p_false([WITHHELD, answer(1.0, 0.0)])[1] < 1.0
+    assert rejector.p_false([]).shape == (0,)
+
+
+@pytest.mark.parametrize("rule", [*RULES, *LEARNERS])
+@given(calibration=st.lists(st.tuples(ANSWERS, st.booleans()), max_size=8), asked=st.lists(ANSWERS, max_size=4))
+def test_whatever_is_told_makes_a_probability(rule, calibration, asked) -> None:
+    rejector = rule()
+    rejector.fit([item for item, _ in calibration], np.array([wrong for _, wrong in calibration], dtype=bool))
+    check_p_false(rejector.p_false([*asked, WITHHELD]), len(asked) + 1)
+
+
+@pytest.mark.parametrize("rule", [*RULES, *LEARNERS])
+def test_an_answer_is_judged_alone_and_a_second_fit_says_the_same(rule) -> None:
+    answers, is_false = toy()
+    first, second = rule(), rule()
+    first.fit(answers, is_false)
+    second.fit(*toy(seed=5))
+    second.fit(answers, is_false)
+    whole = first.p_false(answers)
+    assert second.p_false(answers).tolist() == whole.tolist()
+    np.testing.assert_allclose([first.p_false([item])[0] for item in answers], whole, atol=1e-9)
+
+
+# By hand
+
+
+def test_the_margin_is_the_lead_over_the_second() -> None:
+    assert leads.margin(answer(5.0, 3.0, 2.0)) == 2.0
+    assert leads.margin(answer(5.0)) == 0.0
+    assert Margin().p_false([answer(5.0, 3.0), answer(1.0, 1.0), answer(7.0)]).tolist() == [1 / 4, 1 / 2, 1 / 2]
+
+
+def test_a_rival_is_another_place() -> None:
+    assert leads.margin_nms(answer(5.0, 4.0, 3.0, 1.0, step_m=12.5)) == 2.0  # 12.5 m away is the same, 25 m is not
+    assert leads.margin_nms(answer(5.0, 4.0, 3.0, step_m=1.0)) == 2.0  # none given is one: no better than the last
+    assert leads.margin_nms(answer(5.0)) == 0.0
+    assert MarginNms().p_false([answer(5.0, 4.0, 3.0, step_m=12.5)]).tolist() == [1 / 4]
+
+
+def test_entropy_is_that_of_a_softmax_over_standardised_scores() -> None:
+    # Scores 4, 1, 1: mean 2, deviation sqrt(2); z = 1.414, -0.707, -0.707.
+    weights = np.exp([math.sqrt(2), -math.sqrt(0.5), -math.sqrt(0.5)])
+    shares = weights / weights.sum()
+    assert leads.entropy(answer(4.0, 1.0, 1.0)) == pytest.approx(-(shares * np.log(shares)).sum())
+    found = Entropy().p_false([answer(3.0, 3.0, 3.0, 3.0), answer(3.0), answer(4.0, 1.0, 1.0)])
+    np.testing.assert_allclose(found[:2], [3 / 4, 1 / 2])
+    assert found[2] < 2 / 3
+
+
+@given(scores=st.lists(st.integers(-50, 50), min_size=2, max_size=9), gain=st.floats(0.01, 100))
+def test_entropy_knows_no_scale_and_is_greatest_for_equals(scores, gain) -> None:
+    ranked = sorted(map(float, scores), reverse=True)
+    found = leads.entropy(answer(*ranked))
+    assert leads.entropy(answer(*(gain * score + 3 for score in ranked))) == pytest.approx(found, abs=1e-6)
+    assert 0 <= found <= math.log(len(scores)) + 1e-12
+
+
+@pytest.mark.parametrize("rule", [Margin, MarginNms])
+@given(one=st.floats(0, 1e6), more=st.floats(1e-6, 1e6))
+def test_a_larger_lead_is_a_smaller_number(rule, one, more) -> None:
+    less, larger = rule().p_false([answer(0.0, -one), answer(0.0, -one - more)])
+    assert 0 < larger < less <= 1 / 2
+
+
+# Learnt
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_learner_says_that_it_must_be_fitted(learner) -> None:
+    with pytest.raises(RuntimeError, match="fit"):
+        learner().p_false([WITHHELD])
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize(("wrong", "expected"), [(True, 4 / 5), (False, 1 / 5)])
+def test_calibration_of_one_kind_says_one_number_that_is_not_certain(learner, wrong, expected) -> None:
+    rejector = learner()
+    rejector.fit([answer(2.0, lead) for lead in (0.0, 1.0, 1.5)] + [WITHHELD], np.array([wrong] * 3 + [not wrong]))
+    assert rejector.p_false([answer(9.0, 0.0), answer(0.0, 0.0), WITHHELD]).tolist() == [expected, expected, 1.0]
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_calibration_of_nothing_says_one_half(learner) -> None:
+    rejector = learner()
+    rejector.fit([], np.zeros(0, dtype=bool))
+    assert rejector.p_false([answer(1.0, 0.0)]).tolist() == [0.5]
+
+
+def test_isotonic_agrees_with_scikit_learn_and_averages_ties() -> None:
+    answers, is_false = toy()
+    answers, is_false = [*answers, answer(1.0, 0.7), answer(1.0, 0.7)], np.array([*is_false, True, False])
+    rejector = IsotonicMargin()
+    rejector.fit(answers, is_false)
+    margins = np.array([leads.margin(item) for item in answers])
+    curve = IsotonicRegression(increasing=False, out_of_bounds="clip").fit(margins, is_false)
+    np.testing.assert_allclose(rejector.p_false(answers), curve.predict(margins))
+    beyond = rejector.p_false([answer(99.0, 0.0), answer(0.0, 0.0)])
+    np.testing.assert_allclose(beyond, curve.predict([margins.max(), margins.min()]))
+    order = np.argsort(margins)
+    assert (np.diff(rejector.p_false(answers)[order]) <= 0).all()
+
+
+def test_equal_margins_get_the_share_of_the_false_among_them() -> None:
+    rejector = IsotonicMargin()
+    rejector.fit(
+        [answer(1.0, 1.0), answer(1.0, 1.0), answer(1.0, 1.0), answer(5.0, 1.0)], np.array([True, False, True, False])
+    )
+    np.testing.assert_allclose(rejector.p_false([answer(1.0, 1.0), answer(9.0, 5.0)]), [2 / 3, 0.0])
+
+
+def test_logistic_gives_less_to_answers_like_the_right_ones() -> None:
+    rejector = LogisticAll()
+    rejector.fit(*toy())
+    answers, is_false = toy(seed=1)
+    found = rejector.p_false(answers)
+    assert found[~is_false].max() < 0.9
+    assert found[~is_false].mean() + 0.4 < found[is_false].mean()
+
+
+def test_logistic_learns_from_a_diagnostic_that_no_score_tells() -> None:
+    seen = np.linspace(0, 1, 40)
+    rejector = LogisticAll()
+    rejector.fit([answer(1.0, 0.5, seen=value) for value in seen], seen < 0.5)
+    low, lacking, high = rejector.p_false([answer(1.0, 0.5, seen=0.1), answer(1.0, 0.5), answer(1.0, 0.5, seen=0.9)])
+    assert low > 0.9
+    assert lacking == pytest.approx(0.5, abs=0.05)  # as the median of calibration
+    assert high < 0.1
+
+
+def test_logistic_takes_the_diagnostics_that_all_of_calibration_give() -> None:
+    answers = [answer(1.0, 0.5, both=float(at), one=1.0 if at else math.nan) for at in range(4)]
+    answers[3] = replace(answers[3], diagnostics={"both": 3.0})
+    rejector = LogisticAll()
+    rejector.fit([*answers, WITHHELD], np.array([True, False, True, False, True]))
+    assert rejector._model.names == ("both",)
+
+
+def test_a_feature_that_never_changed_in_calibration_says_nothing_later() -> None:
+    rejector = LogisticAll()
+    rejector.fit([answer(1.0, lead, still=0.1) for lead in (0.1, 0.2, 0.8, 0.9)], np.array([False, False, True, True]))
+    same, other = rejector.p_false([answer(1.0, 0.5, still=0.1), answer(1.0, 0.5, still=1e9)])
+    assert same == pytest.approx(other, abs=1e-6)

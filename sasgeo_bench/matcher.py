@@ -15,7 +15,7 @@ Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_CANDIDATES: Final = 1000  # of one answer
 MOST_DIAGNOSTICS: Final = 64
-MOST_SAID: Final = 1000  # characters of a field of a card
+MOST_SAID: Final = 4000  # characters of a field of a card
 SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
 
 

@@ -28,6 +28,7 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import write_board
+from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
 Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
@@ -109,7 +110,8 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
     Returns
     -------
     tuple of Entry
-        By name; two versions of one matcher are two entries, with the hash in their names.
+        By name; two versions of one matcher are two entries, with the version in their names, and with the hash where
+        that is the same.
 
     Raises
     ------
@@ -137,9 +139,17 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
                 card = about["matcher"]
                 by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
     names = [name for name, _, _ in by_run]
+    versions = [(name, number) for name, number, _ in by_run]
+
+    def shown(name: str, number: str, digest: str) -> str:
+        """As short as it can be and still be one contestant's alone."""
+        if names.count(name) == 1:
+            return name
+        return f"{name} {number}" if versions.count((name, number)) == 1 else f"{name} {number} ({digest[:6]})"
+
     entries = [
         Entry(
-            name=name if names.count(name) == 1 else f"{name} ({digest[:6]})",
+            name=shown(name, number, digest),
             version=number,
             hash=digest,
             how=REPRODUCED,
@@ -187,6 +197,9 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         message = "there is nothing to score: no task of this folder is answered by these predictions"
         raise ConfigError(message)
     abouts = [_check_task(folder, request.root) for folder in folders]
+    for entry in entries:
+        if entry.how == AS_SUBMITTED:
+            _check_file(entry.sources[0], folders)
     scores = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
     rows = [leaderboard(scores, draws=request.draws)]
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
@@ -196,6 +209,8 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         for name, judged_by in judges.items():
             judged = judged_by(frame, predictions[entry.name])
             all_judged[entry.name, name] = judged
+            if not len(judged):
+                tell(f"{name} on {entry.name}: not applied, no other place of the board calibrates")
             if len(judged):
                 rows.append(to_frame(list(integrity_rows(entry.name, name, judged))))
         tell(f"{entry.name}: {int(frame['is_answered'].sum())} of {len(frame)} queries answered")
@@ -241,6 +256,14 @@ def _answered(
         is_named = (folder.parent.name, folder.name) in named
         if is_named or (held and not held.isdisjoint(taskdir.read_ids(folder))):
             yield folder
+
+
+def _check_file(path: Path, folders: Sequence[Path]) -> None:
+    """Refuse a file of predictions that is not what the tasks ask for; queries without a row are misses, no faults."""
+    faults = [fault for fault in validate(path, folders) if not fault.is_missing_row]
+    if faults:
+        message = f"{path} holds {len(faults)} faults, the first: {faults[0].to_text()} ('validate' lists all)"
+        raise ConfigError(message)
 
 
 def _check_task(folder: Path, root: Path) -> dict[str, Any]:

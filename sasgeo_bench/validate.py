@@ -13,6 +13,7 @@ from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
 
 _ANSWERED: Final = "ok"
+_NO_ROW: Final = "no row for "
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +25,11 @@ class Violation:
     column: str
     found: str
     expected: str
+
+    @property
+    def is_missing_row(self) -> bool:
+        """Whether it says that a query has no row."""
+        return self.found.startswith(_NO_ROW)
 
     def to_text(self) -> str:
         """One line.
@@ -78,7 +84,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     missing = [] if unread else [name for name in queries if name not in seen]
     for name in missing:
         yield Violation(
-            file=path.name, row=-1, column="query_id", found=f"no row for {name}", expected="one for every query"
+            file=path.name, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
         )
 
 

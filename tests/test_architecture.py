@@ -82,6 +82,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
         *("sequence", "cost", "intervals", "compare", "power"),
     ),
+    "validate": None,
     "score": None,
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "costs", "text"),
@@ -89,7 +90,6 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "boards": None,
     "pipeline": None,
-    "validate": None,
     "scaffold": None,
     "testing": None,
     "cli": ("console", "regions", "ageing", "queries", "looking", "matchers", "runs", "boards", "program"),

@@ -218,6 +218,25 @@ def test_a_folder_with_other_things_is_not_replaced(out):
     assert (folder / "thesis.txt").read_text(encoding="utf-8") == "years of work"
 
 
+def test_a_file_that_validate_refuses_is_not_scored(out, tmp_path):
+    submission(out, tmp_path / "mine.parquet")
+    table = pq.read_table(tmp_path / "mine.parquet")
+    pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), tmp_path / "mine.parquet")
+    with pytest.raises(ConfigError, match=r"holds 1 faults, the first: .*each query once.*'validate' lists all"):
+        board_of(out, tmp_path / "mine.parquet")
+    assert not (out / "boards").exists()
+
+
+class Raises(Doubt):
+    def p_false(self, predictions):
+        raise RuntimeError(len(predictions))
+
+
+def test_a_rejector_that_fails_is_named(out, split):
+    with pytest.raises(MatchError, match=r"rejector 'doubt' failed \(RuntimeError: "):
+        board_of(out, rejectors=[f"{__name__}:Raises"], split=split)
+
+
 def test_nothing_to_score_is_told(out, tmp_path):
     rundir.write_part(tmp_path / "foreign", [Prediction(query_id="f" * 24)])
     (part,) = rundir.parts_of(tmp_path / "foreign")

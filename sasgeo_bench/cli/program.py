@@ -87,5 +87,5 @@ def main() -> None:
         sys.exit(EXIT_USER)
     except SystemExit as leaving:
         if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word
-            errors.print("sasgeo-bench: interrupted; what was there before is as it was")
+            errors.print("sasgeo-bench: interrupted; what was finished is kept, nothing is half-written: run it again")
         raise

@@ -64,6 +64,8 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
         report = run(plan, tell=tell)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
     tell(f"{plan.card.name} {plan.card.version}: {counts}")
+    for status, message in sorted(report.messages.items()):
+        tell(f"  {status}, the first of {report.counts[status]}: {message}")
     for folder in report.folders:
         typer.echo(str(folder))
 

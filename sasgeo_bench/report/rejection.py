@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from sasgeo_bench.errors import MatchError
 from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.metrics.decisions import Answers
 from sasgeo_bench.metrics.integrity import choose_threshold
 from sasgeo_bench.rejector import Rejector, check_p_false
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.score import NOT_APPLICABLE
 from sasgeo_bench.split import Split
 
@@ -126,12 +127,17 @@ def _fit_and_say(make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictio
     """Fit on the answers of some rows; say of others. NaN where there is no answer."""
     rejector = make()
     answered = known[known["is_answered"].to_numpy(bool)]
-    rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
     found = np.full(len(asked), np.nan)
     is_answered = asked["is_answered"].to_numpy(bool)
     some = _answers(asked[is_answered], predictions)
-    if some:
-        found[is_answered] = check_p_false(rejector.p_false(some), len(some))
+    try:
+        rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
+        if some:
+            found[is_answered] = check_p_false(rejector.p_false(some), len(some))
+    except Exception as error:
+        said = one_line(f"{type(error).__name__}: {error}")
+        message = f"rejector {rejector.card.name!r} failed ({said}): mend it, or leave it out"
+        raise MatchError(message) from error
     return found
 
 

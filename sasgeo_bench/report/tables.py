@@ -20,7 +20,6 @@ from sasgeo_bench.metrics.intervals import (
     bootstrap_means,
     percentile_interval,
     wilson,
-    wilson_mean,
 )
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
@@ -146,7 +145,7 @@ def _rows_of_cell(cell: _Cell) -> Iterator[Row]:
 def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
     """Means that share a denominator, by the same draws."""
     names = list(cell.frames)
-    blocks = cell.first["block"].tolist()
+    blocks, sites = cell.first["block"].tolist(), cell.first["pair_id"].tolist()
     table = np.column_stack([measure.values(frame) for measure in measures for frame in cell.frames.values()])
     drawn = ClusterDraws(blocks=blocks, seed=cell.seed, draws=cell.draws)
     below = _thresholds(cell, measures)
@@ -158,7 +157,7 @@ def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
         yield from _ranked(cell, measure, table[:, columns], means[:, columns])
     offset = len(measures) * len(names)
     for at, (name, quantile, value, column) in enumerate(below):
-        found, how = mean_with_interval(column, blocks, means[:, offset + at])
+        found, how = mean_with_interval(column, sites, means[:, offset + at])
         errors = cell.frames[name][quantile.column].to_numpy(float)
         lo, hi = (_inverse(errors, share) for share in (found.lo, found.hi))
         told = _told(name, cell.group, cell.stratum, cell.frames[name])
@@ -188,8 +187,8 @@ def _inverse(errors: Floats, share: float) -> float:
 
 def _ranked(cell: _Cell, measure: Measure, table: Floats, means: Floats) -> Iterator[Row]:
     """Rows of one measure; of the primary one with ranks."""
-    names, blocks = list(cell.frames), cell.first["block"].tolist()
-    found = [mean_with_interval(table[:, at], blocks, means[:, at]) for at in range(len(names))]
+    names, blocks, sites = list(cell.frames), cell.first["block"].tolist(), cell.first["pair_id"].tolist()
+    found = [mean_with_interval(table[:, at], sites, means[:, at]) for at in range(len(names))]
     ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if measure.is_primary else {}
     for at, name in enumerate(names):
         interval, how = found[at]
@@ -209,12 +208,12 @@ def _ranked(cell: _Cell, measure: Measure, table: Floats, means: Floats) -> Iter
 
 
 def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
-    """Rank intervals of all but the controls; where nothing could be drawn every rank is possible."""
+    """Rank intervals of all but the controls; none where there are not two blocks to draw from."""
     chosen = [at for at, name in enumerate(names) if name not in UNRANKED]
     if not chosen:
         return {}
     if not len(means):
-        return {names[at]: RankInterval(best=1, worst=len(chosen)) for at in chosen}
+        return {}
     better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
     return {names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
 
@@ -222,29 +221,29 @@ def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure
 def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Sequence[str]) -> float:
     """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
     others = [at for at, other in enumerate(names) if other != name and other not in UNRANKED]
-    if not others or name in UNRANKED:
+    if not others or name in UNRANKED or len(set(blocks)) < 2:  # noqa: PLR2004 - one block says nothing of others
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable
 
 
-def mean_with_interval(values: Floats, blocks: Sequence[str], draws: Floats) -> tuple[Interval, str]:
+def mean_with_interval(values: Floats, sites: Sequence[str], draws: Floats) -> tuple[Interval, str]:
     """A mean of values in [0, 1] with its interval, and how it was found.
 
     Parameters
     ----------
     values : ndarray of float, shape (N,)
         One for each query.
-    blocks : sequence of str, length N
-        Block of each.
+    sites : sequence of str, length N
+        Site of each: the queries of one site show one place.
     draws : ndarray of float, shape (D,)
         Means of the bootstrap; none where there are fewer than two blocks.
 
     Returns
     -------
     Interval, str
-        By the bootstrap where there are two blocks or more and something varies. Where all values are 0 or all are 1
-        the draws say nothing: then Wilson's interval, as if each block were one trial.
+        By the bootstrap where there are two blocks or more and something varies. Of one block, or where all values are
+        0 or all are 1, the draws say nothing: then Wilson's interval, as if each site were one trial.
 
     Examples
     --------
@@ -253,9 +252,7 @@ def mean_with_interval(values: Floats, blocks: Sequence[str], draws: Floats) -> 
     (0.34, 1.0, 'wilson')
     """
     value = float(values.mean())
-    if not len(draws):
-        return wilson_mean(values), "wilson"
-    if value in {0.0, 1.0}:
-        count = len(set(blocks))
+    if not len(draws) or value in {0.0, 1.0}:
+        count = len(set(sites))
         return wilson(value * count, count), "wilson"
     return percentile_interval(value, draws), "blocks"

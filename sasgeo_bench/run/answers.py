@@ -43,6 +43,8 @@ class Cost:
         Most memory that all processes of one matcher held at once.
     isolation : dict of str to str
         How the matcher was shut in.
+    messages : dict of str to str
+        By status, what the first row without an answer said.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
@@ -51,6 +53,7 @@ class Cost:
     cpu_s: float = 0.0
     peak_bytes: int = 0
     isolation: dict[str, str] = field(default_factory=dict)
+    messages: dict[str, str] = field(default_factory=dict)
 
 
 def pool_costs(costs: Sequence[Cost]) -> Cost:
@@ -63,7 +66,9 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
     """
     counts: dict[str, int] = {}
     words: dict[str, list[str]] = {}
+    messages: dict[str, str] = {}
     for cost in costs:
+        messages = cost.messages | messages
         for status, count in cost.counts.items():
             counts[status] = counts.get(status, 0) + count
         for name, said in cost.isolation.items():
@@ -75,6 +80,7 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
         cpu_s=sum(cost.cpu_s for cost in costs),
         peak_bytes=max((cost.peak_bytes for cost in costs), default=0),
         isolation={name: _AND.join(dict.fromkeys(said)) for name, said in words.items()},
+        messages=messages,
     )
 
 
@@ -109,11 +115,13 @@ def answer(plan: RunPlan, part: RunPart, ids: Sequence[str], *, jobs: int, watch
     workers = [_asked(plan, part) for _ in range(min(jobs, len(ids)))]
     try:
         with ThreadPoolExecutor(max_workers=max(1, len(workers))) as pool:
-            costs = list(pool.map(lambda worker: _ask_all(plan, part, worker, questions, writer), workers))
+            try:
+                costs = list(pool.map(lambda worker: _ask_all(plan, part, worker, questions, writer), workers))
+            finally:
+                questions.stop()  # before the pool waits for its threads: each ends with the query it is at
     finally:
-        questions.stop()
         writer.flush()
-    return pool_costs([*costs, Cost(counts=writer.counts)])
+    return pool_costs([*costs, Cost(counts=writer.counts, messages=writer.messages)])
 
 
 def _asked(plan: RunPlan, part: RunPart) -> Worker | Oracle:
@@ -146,7 +154,8 @@ def _ask_all(plan: RunPlan, part: RunPart, worker: Worker | Oracle, questions: "
             index_bytes=ready.grown_bytes,
             cpu_s=worker.cpu_s,
             peak_bytes=worker.peak_bytes,
-            isolation=dict(worker.isolation) or {"files": "trusted code, not shut in"},
+            isolation=dict(worker.isolation)
+            or dict.fromkeys(("files", "truth", "network", "processes"), "trusted code, not shut in"),
         )
 
 
@@ -198,6 +207,7 @@ class _Writer:
 
     def __init__(self, folder: Path, *, watch: Watch) -> None:
         self.counts: dict[str, int] = {}
+        self.messages: dict[str, str] = {}
         self._folder, self._watch = folder, watch
         self._lock = threading.Lock()
         self._rows: list[Prediction] = []
@@ -208,6 +218,8 @@ class _Writer:
         with self._lock:
             self._rows.append(prediction)
             self.counts[prediction.status] = self.counts.get(prediction.status, 0) + 1
+            if prediction.message:
+                self.messages.setdefault(prediction.status, prediction.message)
             if len(self._rows) >= PART_ROWS or time.monotonic() - self._written > PART_S:
                 self._write()
             self._watch(1)

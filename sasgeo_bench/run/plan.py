@@ -111,7 +111,8 @@ def plan_run(request: RunRequest) -> RunPlan:
         list_entry_points()  # a clash of names is told here: what the plugin's own process prints is not shown
     tasks = [(folder, taskdir.read_task(folder)) for folder in dict.fromkeys(request.tasks)]
     card, code = _card(request)
-    settings = json.dumps({"top_k": request.top_k, "limits": asdict(request.limits)}, sort_keys=True)
+    said = {"top_k": request.top_k, "limits": asdict(request.limits), "is_shut_in": request.is_shut_in}
+    settings = json.dumps(said, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
     parts = tuple(_part(request, card, found, *task) for task in tasks)
     return RunPlan(request=request, card=card, hash=found, parts=parts)

@@ -64,9 +64,10 @@ class Lines:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunReport:
-    """How many rows of which status a run has added."""
+    """How many rows of which status a run has added, and what the first of each without an answer said."""
 
     counts: dict[str, int]
+    messages: dict[str, str]
     folders: tuple[Path, ...]
 
 
@@ -104,7 +105,9 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
         costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
     else:
         costs += [_run_here(plan, part, tell, progress) for part in parts]
-    return RunReport(counts=pool_costs(costs).counts, folders=tuple(part.folder for part in plan.parts))
+    pooled = pool_costs(costs)
+    folders = tuple(part.folder for part in plan.parts)
+    return RunReport(counts=pooled.counts, messages=pooled.messages, folders=folders)
 
 
 def _run_here(plan: RunPlan, part: RunPart, tell: Tell, progress: Progress) -> Cost:
@@ -155,7 +158,7 @@ def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: what the run is, and what it and the runs before it have taken."""
     about = taskdir.read_task(part.task)
     told: dict[str, Any] = asdict(pool_costs([before, cost]))
-    del told["counts"]
+    del told["counts"], told["messages"]
     rundir.write_run(
         part.folder,
         {

@@ -111,8 +111,10 @@ def _flush(path: Path) -> None:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The files of a run's folder in the order they were written, or the file itself."""
-    return [path] if path.is_file() else sorted(path.glob("part-*.parquet"))
+    """The files of a run's folder in the order they were written, or of all runs in a folder, or the file itself."""
+    if path.is_file():
+        return [path]
+    return sorted(path.glob("part-*.parquet")) or sorted(path.rglob("part-*.parquet"), key=lambda part: part.name)
 
 
 def read_predictions(path: Path) -> Iterator[Prediction]:
@@ -244,7 +246,8 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
 
 def _check_one_matcher(runs: Sequence[Path]) -> None:
     """Refuse folders whose `run.json` say different things of who answered; files say nothing of it."""
-    said = [(path, read_run(path)) for path in runs]
+    folders = [run.parent for path in runs if path.is_dir() for run in sorted(path.rglob(RUN))]
+    said = [(path, read_run(path)) for path in folders]
     known = [(path, about) for path, about in said if about is not None]
     for path, about in known[1:]:
         first, other = known[0]

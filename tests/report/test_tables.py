@@ -102,19 +102,20 @@ def test_the_median_of_errors_has_an_interval_that_holds_it():
     assert row["lo"] < 20 * math.log(2) < row["hi"]
 
 
-def test_of_one_block_the_interval_is_wilsons_and_ranks_are_open():
-    both = {"a": scores([1.0] * 3 + [99.0], blocks=1), "b": scores([99.0] * 4, blocks=1)}
+def test_of_one_block_the_interval_is_wilsons_over_sites_and_nothing_is_ranked():
+    sites = ["one", "one", "other", "other"]
+    both = {"a": scores([1.0] * 3 + [99.0], blocks=1, pair_id=sites), "b": scores([99.0] * 4, blocks=1, pair_id=sites)}
     board = leaderboard(both, draws=200)
-    row, expected = pick(board, "a", "success_25m"), wilson(3, 4)
+    row, expected = pick(board, "a", "success_25m"), wilson(0.75 * 2, 2)
     assert (row["lo"], row["hi"], row["interval"]) == (expected.lo, expected.hi, "wilson")
-    assert {
-        (pick(board, name, "success_25m")["rank_best"], pick(board, name, "success_25m")["rank_worst"]) for name in both
-    } == {(1, 2)}
+    assert {tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in both} == {(0, 0)}
+    assert math.isnan(row["detectable"])
 
 
-def test_where_nothing_varies_the_interval_is_as_wide_as_few_blocks_make_it():
-    row = pick(leaderboard({"mine": scores([1.0] * 100, blocks=5)}, draws=200), "mine", "success_25m")
-    assert (row["value"], row["lo"]) == (1.0, wilson(5, 5).lo)
+def test_where_nothing_varies_the_interval_is_as_wide_as_few_sites_make_it():
+    sites = [f"s{at % 7}" for at in range(100)]
+    row = pick(leaderboard({"mine": scores([1.0] * 100, blocks=5, pair_id=sites)}, draws=200), "mine", "success_25m")
+    assert (row["value"], row["lo"]) == (1.0, wilson(7, 7).lo)
 
 
 def test_ranks_tell_apart_what_differs_and_nothing_else():

@@ -4,6 +4,7 @@
 import errno
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -128,6 +129,34 @@ def test_killed_at_random_moments_a_run_ends_with_the_same_rows(place, task, und
 
 def env_with(place):
     return os.environ | {"PYTHONPATH": f"{place}:{os.environ.get('PYTHONPATH', '')}"}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task, undisturbed, tmp_path, jobs):
+    folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
+    command = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()", "run", "--matcher", "hostile:Slow"]
+    command += ["--tasks", str(task), "--out", str(tmp_path), "--match-s", "5", "--jobs", str(jobs)]
+    process = subprocess.Popen(command, cwd=place, env=env_with(place), stderr=subprocess.PIPE, text=True)  # noqa: S603
+    while process.poll() is None and not rundir.parts_of(folder):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate()
+    assert process.returncode == 130
+    assert "interrupted; what was finished is kept" in told.splitlines()[-1]
+    assert 0 < len(rundir.ids_done(folder)) < len(taskdir.read_ids(task))
+    run_all(request_of(task, tmp_path, name="Slow"))
+    assert table(folder) == table(undisturbed[1])
+
+
+def test_a_run_without_isolation_is_another_run_and_says_what_it_lacked(task, tmp_path):
+    _, shut_in = run_all(request_of(task, tmp_path, limit=1))
+    report, trusted = run_all(request_of(task, tmp_path, name="Raises", limit=1, is_shut_in=False))
+    assert shut_in.parent != trusted.parent
+    assert set(rundir.read_run(trusted)["isolation"].values()) == {"trusted code, not shut in"}
+    assert set(rundir.read_run(trusted)["isolation"]) == {"files", "truth", "network", "processes"}
+    assert list(report.messages) == ["crash"]
+    same = plan_run(request_of(task, tmp_path, limit=1, is_shut_in=False)).parts[0].folder
+    assert same != shut_in
 
 
 def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits, Reach, Worker
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store import rundir, taskdir, taskrows
 from sasgeo_bench.tasks import make_tasks
 
 TOWN = "town-riverside"
@@ -48,7 +48,7 @@ def measure(spec: str, task: Path, out: Path, cells: int) -> Row:
     """Ask some queries of one size, one after the other; medians."""
     region = out / "regions" / TOWN
     chosen = [query for query in taskdir.read_queries(task) if query.evidence.shape[0] == cells]
-    blobs = [taskdir.query_bytes(query) for query in chosen if query.track == "localization"][:ASKED]
+    blobs = [taskrows.query_bytes(query) for query in chosen if query.track == "localization"][:ASKED]
     reach = Reach(readable=[region.resolve()], hidden=[(out / "truth").resolve()])
     with Worker(spec=spec, reach=reach, limits=Limits(match_s=120.0)) as worker:
         begun = time.perf_counter()

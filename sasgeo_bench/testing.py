@@ -19,7 +19,7 @@ from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.run.worker import Limits, Reach, Reply, Worker
-from sasgeo_bench.store import taskdir
+from sasgeo_bench.store import taskdir, taskrows
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.tasks import make_tasks
@@ -230,7 +230,7 @@ class _Kit:
         yield self._cost(sound)
 
     def _ask(self, query: Query, *, top_k: int = TOP_K) -> Reply:
-        reply = self.worker.match(taskdir.query_bytes(query), top_k=top_k)
+        reply = self.worker.match(taskrows.query_bytes(query), top_k=top_k)
         self.refused = self.refused or _refusal(reply)
         return reply
 

@@ -66,7 +66,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "results": None,
     "rejector": None,
     "store": (
-        *("layerfile", "regiondir", "taskdir", "rundir", "boardfile", "pluginfiles"),
+        *("layerfile", "regiondir", "taskrows", "taskdir", "rundir", "boardfile", "pluginfiles"),
         *("preview", "sheet", "splitmap", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,

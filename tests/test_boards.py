@@ -22,7 +22,7 @@ from sasgeo_bench.run.oracle import right_answer
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.split import SplitFile, make_split
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store import rundir, taskdir, taskrows
 from sasgeo_bench.store.boardfile import read_board
 from sasgeo_bench.store.catalog import find_region_file, find_split_file, read_region_file, read_split_file
 from sasgeo_bench.tasks import make_tasks
@@ -54,8 +54,8 @@ def built(tmp_path_factory):
     for town in TOWNS:
         folder = out / "truth" / "clean" / town
         truths = [replace(truth, is_present=at % 4 > 0) for at, truth in enumerate(taskdir.read_truths(folder))]
-        rows = [taskdir.truth_row(truth) for truth in truths]
-        pq.write_table(pa.Table.from_pylist(rows, schema=taskdir.TRUTH_SCHEMA), folder / taskdir.TRUTH)
+        rows = [taskrows.truth_row(truth) for truth in truths]
+        pq.write_table(pa.Table.from_pylist(rows, schema=taskrows.TRUTH_SCHEMA), folder / taskdir.TRUTH)
     run(plan_run(RunRequest(spec="oracle_pose", tasks=tasks, out=out)), tell=lambda _: None)
     return out
 

@@ -19,7 +19,7 @@ from sasgeo_bench.paper.tiles import CLASSES, GAP_M, TILE_M, TILES, draw_tile, m
 from sasgeo_bench.paper.trials import CHANGE_FACTORS, Transformation, draw_crops, draw_view, map_change, rectangle
 from sasgeo_bench.paper.windows import CANDIDATES, MARGIN_M, STEP_M, WINDOW_CELLS, WINDOW_M, Windows
 from sasgeo_bench.query import PriorGroup
-from sasgeo_bench.store import regiondir, taskdir
+from sasgeo_bench.store import regiondir, taskdir, taskrows
 from sasgeo_bench.suites.base import Seeds, State
 from sasgeo_bench.tasks import check_task, panels
 
@@ -306,7 +306,7 @@ def test_another_process_makes_the_same_bytes_and_fewer_trials_are_the_first_of_
     # The map knows nothing of the trials, and what changes in them is the world.
     assert content(tmp_path, "regions") == content(out, "regions")
     whole, few = (
-        {query.query_id: (taskdir.query_bytes(query), truth) for query, truth in pairs_of(root)}
+        {query.query_id: (taskrows.query_bytes(query), truth) for query, truth in pairs_of(root)}
         for root in (out, tmp_path)
     )
     assert len(few) == FEW

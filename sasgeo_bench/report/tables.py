@@ -92,6 +92,7 @@ class _Cell:
 
     @property
     def seed(self) -> int:
+        """Of these queries alone, so that all matchers are drawn alike."""
         text = "/".join((*self.group, self.stratum))
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
@@ -102,6 +103,7 @@ class _Cell:
 
     @property
     def first(self) -> pd.DataFrame:
+        """Rows of any matcher: what they say of the queries is the same in all."""
         return next(iter(self.frames.values()))
 
 

@@ -12,7 +12,7 @@ from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.plugins import ORACLE
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.run.worker import Reply
-from sasgeo_bench.store import taskdir
+from sasgeo_bench.store import taskdir, taskrows
 
 CARD: Final = MatcherCard(
     name=ORACLE,
@@ -72,7 +72,7 @@ class Oracle:
         """Answer one query."""
         del top_k
         start = time.perf_counter()
-        asked = taskdir.query_from(query)
+        asked = taskrows.query_from(query)
         truth = self._truths.get(asked.query_id)
         if truth is None:
             message = f"{self._folder} holds no truth of query {asked.query_id}: make the queries again"

@@ -18,7 +18,7 @@ from sasgeo_bench.plugins import load_matcher
 from sasgeo_bench.results import one_line
 from sasgeo_bench.run import wire
 from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.store.taskdir import query_from
+from sasgeo_bench.store.taskrows import query_from
 
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 

@@ -9,18 +9,25 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-import geopandas as gpd
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import shapely
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.evidence import Evidence, pack, unpack
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.regiondir import file_record, sha256_of
+from sasgeo_bench.store.taskrows import (
+    HEAD_SCHEMA,
+    QUERY_SCHEMA,
+    TRUTH_SCHEMA,
+    query_of,
+    query_row,
+    stream_of,
+    truth_of,
+    truth_row,
+)
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
@@ -30,187 +37,6 @@ SCHEMA_VERSION: Final = 1
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of a suite or a region: one folder, never a way out
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
-
-_POSE: Final = pa.struct(
-    [("easting_m", pa.float64()), ("northing_m", pa.float64()), ("yaw_deg", pa.float64()), ("scale", pa.float64())]
-)
-_VECTOR: Final = pa.struct(
-    [("class", pa.string()), ("level", pa.int16()), ("is_bridge", pa.bool_()), ("wkb", pa.binary())]
-)
-_META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
-
-# The last five columns are for sequences and images, which no suite draws yet.
-QUERY_SCHEMA: Final = pa.schema(
-    [
-        ("query_id", pa.string()),
-        ("track", pa.string()),
-        ("suite", pa.string()),
-        ("suite_version", pa.int16()),
-        ("part", pa.string()),
-        ("region", pa.string()),
-        ("cell_size_m", pa.float64()),
-        ("rows", pa.int32()),
-        ("cols", pa.int32()),
-        ("classes", pa.list_(pa.string())),
-        ("evidence", pa.binary()),
-        ("confidence", pa.binary()),
-        ("observed_on", pa.date32()),
-        ("season", pa.string()),
-        ("prior_group", pa.string()),
-        ("prior_easting_m", pa.float64()),
-        ("prior_northing_m", pa.float64()),
-        ("prior_radius_m", pa.float64()),
-        ("prior_yaw_deg", pa.float64()),
-        ("prior_yaw_sigma_deg", pa.float64()),
-        ("prior_scale_sigma", pa.float64()),
-        ("candidates", pa.list_(_POSE)),
-        ("vectors", pa.list_(_VECTOR)),
-        ("sequence_id", pa.string()),
-        ("frame", pa.int32()),
-        ("increment", pa.list_(pa.float64())),
-        ("increment_covariance", pa.list_(pa.float64())),
-        ("image", pa.binary()),
-    ],
-    metadata=_META,
-)
-_HEAD_SCHEMA: Final = pa.schema(
-    [
-        QUERY_SCHEMA.field(name)
-        for name in (
-            *("query_id", "track", "suite", "suite_version", "part", "region"),
-            *("rows", "cell_size_m", "prior_group", "candidates"),
-        )
-    ]
-)
-TRUTH_SCHEMA: Final = pa.schema(
-    [
-        ("query_id", pa.string()),
-        ("is_present", pa.bool_()),
-        ("easting_m", pa.float64()),
-        ("northing_m", pa.float64()),
-        ("yaw_deg", pa.float64()),
-        ("scale", pa.float64()),
-        ("candidate", pa.int32()),
-        ("pair_id", pa.string()),
-        ("role", pa.string()),
-        ("kind", pa.string()),
-        ("strength", pa.float64()),
-        ("strength_unit", pa.string()),
-        ("unknown_share", pa.float64()),
-        ("changed_share", pa.float64()),
-        ("feature_density", pa.float64()),
-        ("alias_index", pa.float64()),
-        ("block", pa.string()),
-        ("scene", pa.string()),
-        ("measured", pa.map_(pa.string(), pa.float64())),
-    ],
-    metadata=_META,
-)
-
-
-def query_row(query: Query) -> dict[str, Any]:
-    """One query as a row of `QUERY_SCHEMA`."""
-    seen, prior = query.evidence, query.prior
-    center = prior.center_m or (None, None)
-    return {
-        "query_id": query.query_id,
-        "track": query.track,
-        "suite": query.suite,
-        "suite_version": query.suite_version,
-        "part": query.part,
-        "region": query.region,
-        "cell_size_m": seen.cell_size_m,
-        "rows": seen.shape[0],
-        "cols": seen.shape[1],
-        "classes": list(seen.classes),
-        "evidence": pack(seen.cells),
-        "confidence": None if seen.confidence is None else seen.confidence.tobytes(),
-        "observed_on": query.observed_on,
-        "season": query.season,
-        "prior_group": query.prior_group,
-        "prior_easting_m": center[0],
-        "prior_northing_m": center[1],
-        "prior_radius_m": prior.radius_m,
-        "prior_yaw_deg": prior.yaw_deg,
-        "prior_yaw_sigma_deg": prior.yaw_sigma_deg,
-        "prior_scale_sigma": prior.scale_sigma,
-        "candidates": [_pose_row(pose) for pose in query.candidates],
-        "vectors": None if query.vectors is None else _vector_rows(query.vectors),
-    }
-
-
-def _pose_row(pose: Pose) -> dict[str, float]:
-    return {"easting_m": pose.easting_m, "northing_m": pose.northing_m, "yaw_deg": pose.yaw_deg, "scale": pose.scale}
-
-
-def _vector_rows(vectors: gpd.GeoDataFrame) -> list[dict[str, Any]]:
-    columns = [vectors[name].to_list() for name in ("class", "level", "is_bridge")]
-    shapes = [bytes(shape) for shape in shapely.to_wkb(vectors.geometry.to_numpy())]
-    return [
-        {"class": name, "level": level, "is_bridge": is_bridge, "wkb": wkb}
-        for name, level, is_bridge, wkb in zip(*columns, shapes, strict=True)
-    ]
-
-
-def query_of(row: dict[str, Any]) -> Query:
-    """Inverse of `query_row`."""
-    shape = (len(row["classes"]), row["rows"], row["cols"])
-    confidence = row["confidence"]
-    evidence = Evidence(
-        classes=tuple(row["classes"]),
-        cells=unpack(row["evidence"], shape),
-        cell_size_m=row["cell_size_m"],
-        confidence=None if confidence is None else np.frombuffer(confidence, dtype=np.uint8).reshape(shape).copy(),
-    )
-    has_place = row["prior_radius_m"] is not None
-    prior = Prior(
-        center_m=(row["prior_easting_m"], row["prior_northing_m"]) if has_place else None,
-        radius_m=row["prior_radius_m"],
-        yaw_deg=row["prior_yaw_deg"],
-        yaw_sigma_deg=row["prior_yaw_sigma_deg"],
-        scale_sigma=row["prior_scale_sigma"],
-    )
-    return Query(
-        query_id=row["query_id"],
-        track=row["track"],
-        suite=row["suite"],
-        suite_version=row["suite_version"],
-        part=row["part"],
-        region=row["region"],
-        evidence=evidence,
-        observed_on=row["observed_on"],
-        season=row["season"],
-        prior=prior,
-        prior_group=row["prior_group"],
-        candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
-        vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
-    )
-
-
-def _vectors_of(rows: list[dict[str, Any]]) -> gpd.GeoDataFrame:
-    return gpd.GeoDataFrame(
-        {
-            "class": np.array([row["class"] for row in rows], dtype=object),
-            "level": np.array([row["level"] for row in rows], dtype=np.int16),
-            "is_bridge": np.array([row["is_bridge"] for row in rows], dtype=bool),
-        },
-        geometry=gpd.GeoSeries(shapely.from_wkb([row["wkb"] for row in rows]), dtype="geometry"),
-    )
-
-
-def truth_row(truth: Truth) -> dict[str, Any]:
-    """One truth as a row of `TRUTH_SCHEMA`."""
-    pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(("easting_m", "northing_m", "yaw_deg", "scale"))
-    names = [name for name in TRUTH_SCHEMA.names if name not in pose and name != "measured"]
-    return {name: getattr(truth, name) for name in names} | pose | {"measured": list(truth.measured.items())}
-
-
-def truth_of(row: dict[str, Any]) -> Truth:
-    """Inverse of `truth_row`."""
-    names = ("easting_m", "northing_m", "yaw_deg", "scale")
-    pose = None if row["easting_m"] is None else Pose(**{name: row[name] for name in names})
-    rest = {name: value for name, value in row.items() if name not in (*names, "measured")}
-    return Truth(**rest, pose=pose, measured=dict(row["measured"]))
 
 
 def write_task(
@@ -445,24 +271,6 @@ def read_hidden(truth_folder: Path) -> dict[str, Any]:
         return {}
 
 
-def query_bytes(query: Query) -> bytes:
-    """One query as it goes to a matcher's process: a row in Arrow's stream format."""
-    return _stream(pa.RecordBatch.from_pylist([query_row(query)], schema=QUERY_SCHEMA))
-
-
-def query_from(data: bytes) -> Query:
-    """Inverse of `query_bytes`."""
-    with pa.ipc.open_stream(data) as stream:
-        return query_of(stream.read_all().to_pylist()[0])
-
-
-def _stream(batch: pa.RecordBatch) -> bytes:
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, batch.schema) as stream:
-        stream.write_batch(batch)
-    return bytes(sink.getvalue())
-
-
 def read_some(folder: Path, wanted: frozenset[str]) -> Iterator[tuple[Query, bytes]]:
     """The queries of some ids, each with its bytes for a matcher's process; a row group in memory at a time."""
     with pq.ParquetFile(folder / QUERIES) as source:
@@ -470,7 +278,7 @@ def read_some(folder: Path, wanted: frozenset[str]) -> Iterator[tuple[Query, byt
             for row in range(batch.num_rows):
                 one = batch.slice(row, 1)
                 if one.column("query_id")[0].as_py() in wanted:
-                    yield query_of(one.to_pylist()[0]), _stream(one)
+                    yield query_of(one.to_pylist()[0]), stream_of(one)
 
 
 def read_ids(folder: Path) -> list[str]:
@@ -497,7 +305,7 @@ def read_queries(folder: Path) -> Iterator[Query]:
 
 def read_heads(folder: Path) -> Iterator[Head]:
     """Queries of a task without their views, in the order of their ids."""
-    for row in _rows(folder / QUERIES, _HEAD_SCHEMA):
+    for row in _rows(folder / QUERIES, HEAD_SCHEMA):
         poses = row.pop("candidates") or ()
         yield Head(view_cells=row.pop("rows"), candidates=tuple(Pose(**pose) for pose in poses), **row)
 

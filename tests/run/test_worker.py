@@ -9,7 +9,7 @@ import pytest
 
 from sasgeo_bench.run import sandbox
 from sasgeo_bench.run.worker import Limits, Reach, Worker
-from sasgeo_bench.store import taskdir
+from sasgeo_bench.store import taskdir, taskrows
 
 QUICK = Limits(match_s=2.0, prepare_s=20.0, memory_bytes=768 * 2**20)
 HAS_LANDLOCK = sandbox.landlock_version() > 0
@@ -18,7 +18,7 @@ shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlo
 
 def ask(place, task, name, *, limits=QUICK, times=1, is_shut_in=True):
     """The replies of a hostile matcher to the first query, and its worker after its end."""
-    query = taskdir.query_bytes(next(iter(taskdir.read_queries(task))))
+    query = taskrows.query_bytes(next(iter(taskdir.read_queries(task))))
     region = place / "out" / "regions" / task.name
     reach = Reach(readable=[region], hidden=[place / "out" / "truth", place / "out" / "runs"], is_shut_in=is_shut_in)
     with Worker(spec=f"hostile:{name}", reach=reach, limits=limits) as worker:

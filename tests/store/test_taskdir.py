@@ -20,20 +20,16 @@ from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.taskdir import (
     QUERIES,
-    QUERY_SCHEMA,
     TASK,
     TRUTH,
     TRUTH_OF,
-    query_of,
-    query_row,
     read_queries,
     read_task,
     read_truths,
     task_faults,
-    truth_of,
-    truth_row,
     write_task,
 )
+from sasgeo_bench.store.taskrows import QUERY_SCHEMA, query_of, query_row, truth_of, truth_row
 
 ABOUT = {"suite": "clean", "title": "Clean", "region": "here", "map_fingerprint": "0"}
 

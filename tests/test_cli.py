@@ -142,9 +142,14 @@ def test_a_folder_without_the_right_to_write_is_told(tmp_path):
     assert "cannot be written" in mistake("build-region", "town-grid", "--out", "locked", cwd=tmp_path)
 
 
+# What is started in the background of a shell does not hear Ctrl-C, nor does what it starts.
+HEEDS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+
+
 def test_ctrl_c_leaves_nothing_half_written(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    words = [*PROGRAM, "build-region", "town-riverside", "town-old-town", "town-suburb", "town-grid"]
+    program = [*PROGRAM[:2], HEEDS_CTRL_C + PROGRAM[2]]
+    words = [*program, "build-region", "town-riverside", "town-old-town", "town-suburb", "town-grid"]
     with subprocess.Popen(  # noqa: S603 - our own program
         words, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:

@@ -32,6 +32,7 @@ def rows(folder):
     return {item.query_id: replace(item, latency_s=None) for item in rundir.read_predictions(folder)}
 
 
+@pytest.mark.slow  # the next one holds as much against a run without a cluster, with a kill on the way
 def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     alone, spread = (
         plan_run(request_of(task, tmp_path / name, dask=dask)) for name, dask in (("one", None), ("two", "local:2"))

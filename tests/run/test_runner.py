@@ -134,9 +134,18 @@ def env_with(place):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task, undisturbed, tmp_path, jobs):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
-    command = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()", "run", "--matcher", "hostile:Slow"]
+    # What is started in the background of a shell does not hear Ctrl-C, nor does what it starts.
+    heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    program = heeds + "from sasgeo_bench.cli import main; main()"
+    command = [sys.executable, "-c", program, "run", "--matcher", "hostile:Slow"]
     command += ["--tasks", str(task), "--out", str(tmp_path), "--match-s", "5", "--jobs", str(jobs)]
-    process = subprocess.Popen(command, cwd=place, env=env_with(place), stderr=subprocess.PIPE, text=True)  # noqa: S603
+    process = subprocess.Popen(  # noqa: S603 - our own program
+        command,
+        cwd=place,
+        env=env_with(place),
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     while process.poll() is None and not rundir.parts_of(folder):
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)

@@ -14,9 +14,10 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.query import TASK_VERSION
+from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
+from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import judge
@@ -89,13 +90,14 @@ class Entry:
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A board in memory: scored rows by matcher, and the leaderboard."""
+    """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard."""
 
     entries: tuple[Entry, ...]
     scores: dict[str, pd.DataFrame]
     predictions: dict[str, dict[str, Prediction]]
     table: pd.DataFrame
     findings: tuple[Finding, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
     tasks: tuple[dict[str, Any], ...] = field(default=())
 
 
@@ -200,7 +202,13 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     for entry in entries:
         if entry.how == AS_SUBMITTED:
             _check_file(entry.sources[0], folders)
-    scores = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
+    everything = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
+    verdicts = hold_controls(everything)
+    entries = tuple(entry for entry in entries if not _is_for_controls(entry))
+    scores = {entry.name: _ranked(everything[entry.name]) for entry in entries}
+    if not any(map(len, scores.values())):
+        message = f"there is nothing to rank: only queries of the suite {CONTROLS!r} are answered"
+        raise ConfigError(message)
     rows = [leaderboard(scores, draws=request.draws)]
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     for entry in entries:
@@ -217,10 +225,26 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     table = pd.concat([item for item in rows if len(item)], ignore_index=True)
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
     board = Board(
-        entries=entries, scores=scores, predictions=predictions, table=table, findings=findings, tasks=tuple(abouts)
+        entries=entries,
+        scores=scores,
+        predictions=predictions,
+        table=table,
+        findings=findings,
+        verdicts=verdicts,
+        tasks=tuple(abouts),
     )
     _write(request, board)
     return board
+
+
+def _is_for_controls(entry: Entry) -> bool:
+    """Whether a matcher was run on the controls alone, as the reference of a board is."""
+    return bool(entry.runs) and all(about["suite"] == CONTROLS for about in entry.runs)
+
+
+def _ranked(scores: pd.DataFrame) -> pd.DataFrame:
+    """Scored rows that make figures."""
+    return scores[~is_control(scores)].reset_index(drop=True)
 
 
 def _judges(request: ScoreRequest) -> dict[str, Judge]:
@@ -334,9 +358,14 @@ def _write(request: ScoreRequest, board: Board) -> None:
     scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
     write_board(
         request.board,
-        tables={"leaderboard": board.table, "scores": scores, "contrasts": contrast_frame(board.findings)},
+        tables={
+            "leaderboard": board.table,
+            "scores": scores,
+            "contrasts": contrast_frame(board.findings),
+            "controls": verdict_frame(board.verdicts),
+        },
         texts={
-            "leaderboard.md": board_markdown(board.table, about, board.findings),
+            "leaderboard.md": board_markdown(board.table, about, board.findings, board.verdicts),
             "leaderboard.tex": board_latex(board.table, about),
         },
         about=about,

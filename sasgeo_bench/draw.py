@@ -61,7 +61,7 @@ class Drawer:
             )
             for site in sites
             for variant in self.suite.variants
-            for track in self.suite.card.tracks
+            for track in self.suite.tracks(variant)
         ]
         return sorted(jobs, key=lambda job: job.query_id)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline file -> queries, runs and a board; what is up to date is not done again."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -9,7 +9,7 @@ from typing import Final
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pipelinefile import PipelineFile
-from sasgeo_bench.query import PriorGroup
+from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.run.plan import RunRequest, plan_run
@@ -17,6 +17,12 @@ from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.tasks import made_tasks, make_tasks
 
+# Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
+CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
+CONTROL_SPLIT: Final = "crossfit"
+CONTROL_SITES: Final = 8
+CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
+REFERENCE: Final = "fft_vote"  # on the controls of every board
 MOST_LINES: Final = 6  # of what could not be drawn; the rest is counted
 
 Tell = Callable[[str], None]
@@ -24,10 +30,11 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class PipelinePlan:
-    """What a pipeline will do; `requests` in the order of the file."""
+    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board."""
 
     spec: PipelineFile
     requests: tuple[Request, ...]
+    controls: tuple[Request, ...]
     out: Path
     jobs: int
     dask: str | None = None
@@ -41,10 +48,16 @@ class PipelinePlan:
             f"    {request.suite} on {request.region.id}: {'up to date' if done else 'to be drawn'}"
             for request, done in zip(self.requests, made, strict=True)
         ]
-        lines.append(f"  run: {', '.join(self.spec.matchers)}")
+        lines.append(f"  controls: on {', '.join(request.region.id for request in self.controls)}")
+        lines.append(f"  run: {', '.join(self.matchers)}; {REFERENCE} on the controls")
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
         lines.append(f"  board: {board_folder(self)}")
         return "\n".join(lines)
+
+    @property
+    def matchers(self) -> tuple[str, ...]:
+        """Those of the file, and those that every board has."""
+        return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
 
 
 def board_folder(plan: PipelinePlan) -> Path:
@@ -102,7 +115,23 @@ def plan_pipeline(
     if not requests:
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)
-    return PipelinePlan(spec=spec, requests=tuple(requests), out=out, jobs=jobs, dask=dask)
+    controls = Wanted(
+        suites=(CONTROLS,),
+        regions=CONTROL_REGIONS,
+        split=CONTROL_SPLIT,
+        count=CONTROL_SITES,
+        seed=spec.seed,
+        out=out,
+        may_be_fewer=True,
+    )
+    return PipelinePlan(
+        spec=spec,
+        requests=tuple(requests),
+        controls=plan_requests(controls, tell=_silent),
+        out=out,
+        jobs=jobs,
+        dask=dask,
+    )
 
 
 def _silent(line: str) -> None:
@@ -132,29 +161,17 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
     ConfigError
         If no region can carry any of the suites.
     """
-    tasks = _draw(plan, tell)
+    tasks = _draw(plan.requests, tell)
     if not tasks:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
-    folders: list[Path] = []
-    for spec in plan.spec.matchers:
-        request = RunRequest(
-            spec=spec,
-            tasks=tasks,
-            out=plan.out,
-            top_k=plan.spec.top_k,
-            limits=Limits(match_s=plan.spec.match_s),
-            jobs=plan.jobs,
-            dask=plan.dask,
-        )
-        planned = plan_run(request)
-        left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
-        tell(f"{spec}: {left} queries to ask, {done} answered before")
-        run(planned, tell=tell if left else _silent, progress=progress)
-        folders += [part.folder for part in planned.parts]
+    controls = _draw(plan.controls, tell)
+    folders = [folder for spec in plan.matchers for folder in _run(plan, spec, [*tasks, *controls], tell, progress)]
+    if REFERENCE not in plan.matchers:
+        folders += _run(plan, REFERENCE, controls, tell, progress)
     request_board = ScoreRequest(
         predictions=folders,
-        tasks=tasks,
+        tasks=[*tasks, *controls],
         root=plan.out,
         board=board_folder(plan),
         split=plan.requests[0].split,
@@ -165,11 +182,29 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
     return make_board(request_board, tell=tell)
 
 
-def _draw(plan: PipelinePlan, tell: Tell) -> list[Path]:
+def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress: Progress | None) -> list[Path]:
+    """Folders of the runs of one matcher, after whatever had no row was asked."""
+    request = RunRequest(
+        spec=spec,
+        tasks=tasks,
+        out=plan.out,
+        top_k=plan.spec.top_k,
+        limits=Limits(match_s=plan.spec.match_s),
+        jobs=plan.jobs,
+        dask=plan.dask,
+    )
+    planned = plan_run(request)
+    left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
+    tell(f"{spec}: {left} queries to ask, {done} answered before")
+    run(planned, tell=tell if left else _silent, progress=progress)
+    return [part.folder for part in planned.parts]
+
+
+def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
     """Task folders of every request that a region carries; those that are up to date are left as they are."""
     tasks: list[Path] = []
     lacking: list[str] = []
-    for request in plan.requests:
+    for request in requests:
         made = made_tasks(request)
         if made is None:
             try:

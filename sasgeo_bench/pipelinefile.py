@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sasgeo_bench.query import PriorGroup
+from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.tomlfile import Document
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
@@ -69,6 +69,9 @@ class PipelineFile(Document):
             if twice:
                 message = f"{what} {twice[0]!r} is listed twice"
                 raise ValueError(message)
+        if CONTROLS in suites:
+            message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
+            raise ValueError(message)
         for item in self.contrast:
             lost = next((name for name in item.suites if name not in suites), None)
             if lost is not None:

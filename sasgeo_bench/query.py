@@ -15,6 +15,13 @@ TASK_VERSION: Final = 1  # of queries.parquet and truth.parquet: raised whenever
 
 Track = Literal["retrieval", "localization"]
 Role = Literal["control", "stress", "falsifier"]
+# Kinds of the queries whose right score is known beforehand: those who draw and those who score agree on these words.
+CONTROLS: Final = "controls"  # their suite
+NOISE_FREE: Final = "noise-free"
+SHUFFLED: Final = "shuffled map"
+TURNED: Final = "turned map"
+TWINS: Final = "identical twins"
+BLIND: Final = "all unknown"
 YAW_SIGMA_DEG: Final = {"known": 5.0, "weak": 20.0, "unknown": None}
 
 
@@ -67,14 +74,14 @@ class PriorGroup:
         }
         if name not in groups:
             message = (
-                f"{name!r} is no prior group: r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
+                f"{name!r} is no prior group: r100, r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
                 "then s3, s10 or s15, as in r500-weak-s3"
             )
             raise ConfigError(message)
         return groups[name]
 
 
-RADII_M: Final = (None, 250.0, 500.0, 2000.0)
+RADII_M: Final = (None, 100.0, 250.0, 500.0, 2000.0)
 SCALE_SIGMAS: Final = (0.03, 0.10, 0.15)
 
 

@@ -60,7 +60,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("base", "sites", "mining", "vectors", "twins"),
         *("clean", "occlusion", "false_unknown", "local_warp", "topology_twins", "instance_twins", "grade_separation"),
         *("no_priors", "real_age", "synthetic_age", "volatile_lure", "growth", "season", "stable_not_distinctive"),
-        *("alias", "absent", "all_suites"),
+        *("alias", "absent", "board_controls", "all_suites"),
     ),
     "matcher": None,
     "results": None,
@@ -85,7 +85,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "validate": None,
     "score": None,
     "report": (
-        *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "costs", "text"),
+        *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
         *("plots", "site"),
     ),
     "boards": None,

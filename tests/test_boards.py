@@ -269,6 +269,7 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
     assert sorted(path.name for path in Path(told.out.splitlines()[-1]).iterdir()) == [
         "board.json",
         "contrasts.parquet",
+        "controls.parquet",
         "leaderboard.csv",
         "leaderboard.md",
         "leaderboard.parquet",

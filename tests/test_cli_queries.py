@@ -106,7 +106,7 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
         (("--regions", "none.toml"), "there is no region file none.toml"),
         (("--split", "crosfit"), "there is no split 'crosfit', did you mean 'crossfit'"),
         (("--split", "none.toml"), "there is no split file none.toml"),
-        (("--prior", "r500-weak"), "'r500-weak' is no prior group: r250, r500, r2000 or rnone"),
+        (("--prior", "r500-weak"), "'r500-weak' is no prior group: r100, r250, r500, r2000 or rnone"),
         (("--prior", "r300-weak-s3"), "'r300-weak-s3' is no prior group"),
         (("--region-files", "nowhere"), "there is no folder nowhere"),
     ],

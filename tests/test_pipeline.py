@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline draws, runs and scores; a second time it does only what is not up to date."""
 
+import pandas as pd
 import pytest
 
+from sasgeo_bench import pipeline
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
@@ -37,6 +39,15 @@ def small(**changes):
     return parse_toml(text, PipelineFile, source="small.toml")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_controls():
+    """One site of one town: what the controls find is tested beside their suite."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "CONTROL_REGIONS", ("town-suburb",))
+        patch.setattr(pipeline, "CONTROL_SITES", 1)
+        yield
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("pipeline") / "out"
@@ -49,11 +60,26 @@ def made(tmp_path_factory):
 def test_a_pipeline_ends_with_a_board(made):
     plan, board, lines = made
     count = len(taskdir.read_ids(plan.out / "tasks" / "clean" / "town-suburb"))
-    assert f"random: {count} queries to ask, 0 answered before" in lines
-    assert {entry.name for entry in board.entries} == {"random", "prior_centre"}
+    controls = len(taskdir.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls"))
+    assert f"random: {count + controls} queries to ask, 0 answered before" in lines
+    assert f"fft_vote: {controls} queries to ask, 0 answered before" in lines
+    assert {entry.name for entry in board.entries} == {"random", "prior_centre", "oracle_pose"}
     assert [item.name for item in board.findings] == ["nothing"]
     assert (plan.out / "boards" / "small" / "leaderboard.parquet").is_file()
     assert "Registered contrasts" in (plan.out / "boards" / "small" / "leaderboard.md").read_text(encoding="utf-8")
+
+
+def test_every_board_has_controls_and_figures_without_them(made):
+    plan, board, _ = made
+    assert {item.matcher for item in board.verdicts} == {"random", "prior_centre", "oracle_pose", "fft_vote"}
+    assert all(item.holds for item in board.verdicts)
+    assert set(board.table["suite"]) == {"clean", "all suites"}
+    assert "fft_vote" not in set(board.table["matcher"])
+    folder = plan.out / "boards" / "small"
+    assert len(pd.read_parquet(folder / "controls.parquet")) == len(board.verdicts)
+    text = (folder / "leaderboard.md").read_text(encoding="utf-8")
+    assert f"- Controls: all {len(board.verdicts)} held." in text
+    assert "## Controls" in text
 
 
 def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
@@ -64,7 +90,7 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     again = run_pipeline(plan, tell=lines.append)
     assert queries.stat().st_mtime_ns == before
     assert [line.split(",")[0] for line in lines if "to ask" in line] == [
-        f"{name}: 0 queries to ask" for name in plan.spec.matchers
+        f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
     ]
     assert again.table.equals(board.table)
     assert "up to date" in plan.to_text()
@@ -105,6 +131,7 @@ def test_a_task_that_was_touched_is_not_up_to_date(made):
         ),
         ({"sites = 1": "sites = 0"}, "greater than or equal to 1"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
+        ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
         (
             {'second = "prior_centre"': 'second = "prior_centre"\nmetric = "aurc"'},

@@ -3,21 +3,18 @@
 
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
-import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.boards import ScoreRequest, make_board
+from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
-from sasgeo_bench.report.contrasts import Finding
-from sasgeo_bench.report.text import finding_table, summary, warnings_of
+from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.split import Split, make_split
 from sasgeo_bench.store.catalog import (
     find_pipeline_file,
@@ -65,8 +62,9 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         draws=draws,
     )
     board = make_board(request, tell=tell)
-    show_board(board.table, board.findings)
+    show_board(board)
     typer.echo(str(request.board))
+    _check_controls(board)
 
 
 def leaderboard_command(
@@ -101,8 +99,9 @@ def leaderboard_command(
             board = run_pipeline(plan, tell=tell, progress=bars)
     else:
         board = run_pipeline(plan, tell=tell)
-    show_board(board.table, board.findings)
+    show_board(board)
     typer.echo(str(board_folder(plan)))
+    _check_controls(board)
 
 
 def _split(name: str, folders: list[Path]) -> Split:
@@ -110,14 +109,22 @@ def _split(name: str, folders: list[Path]) -> Split:
     return make_split(read_split_file(find_split_file(name)), grids)
 
 
-def show_board(table: pd.DataFrame, findings: Sequence[Finding]) -> None:
+def _check_controls(board: Board) -> None:
+    """End with a status that a script sees where a control failed; the board is written all the same."""
+    if not all(item.holds for item in board.verdicts):
+        raise typer.Exit(1)
+
+
+def show_board(board: Board) -> None:
     """Print what a board says in short, one table for each track and prior group."""
-    tables = [*summary(table), *([("Registered contrasts", finding_table(findings))] if findings else [])]
+    tables = [*summary(board.table)]
+    if board.findings:
+        tables.append(("Registered contrasts", finding_table(board.findings)))
     for title, short in tables:
         typer.echo(title)
         shown = Table(*map(str, short.columns), box=None, pad_edge=False)
         for row in short.itertuples(index=False):
             shown.add_row(*map(str, row))
         print_table(shown)
-    for line in warnings_of(table):
+    for line in (*control_lines(board.verdicts), *warnings_of(board.table)):
         tell(line)

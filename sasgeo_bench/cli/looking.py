@@ -23,7 +23,7 @@ from sasgeo_bench.store.regiondir import differing_files, read_features, read_ma
 from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
 from sasgeo_bench.store.taskdir import TASK, read_task
-from sasgeo_bench.suites.all_suites import SUITES
+from sasgeo_bench.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks import check_task, has_truths, panels
 
 TOP_DROPS: Final = 12
@@ -55,7 +55,7 @@ def inspect_command(
 def _check_target(target: str, out: Path) -> None:
     """Refuse a task that is not there by naming those that are."""
     suite, _, region = target.partition("/")
-    if suite not in SUITES or (region and Path(target).is_dir()):
+    if suite not in EVERY_SUITE or (region and Path(target).is_dir()):
         return
     made = sorted(path.parent.name for path in (out / "tasks" / suite).glob(f"*/{TASK}"))
     near = [name for name in made if name.split("+")[0].split("@")[0] == region.split("+")[0].split("@")[0]] or made

@@ -14,25 +14,24 @@ from sasgeo_bench.cli.console import ExtractFolders, Out, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.request import Request, Wanted, plan_requests
-from sasgeo_bench.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.suites.all_suites import EVERY_SUITE, SUITES, find_suite
 from sasgeo_bench.tasks import make_tasks
 
 
 def list_suites_command() -> None:
     """List the suites: what each does and what it separates."""
     table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
-    for name, suite in SUITES.items():
+    for name, suite in EVERY_SUITE.items():
         card = suite.card
-        table.add_row(
-            name, card.title, ", ".join(card.tracks), str(len(suite.variants) * len(card.tracks)), card.separates
-        )
+        per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
+        table.add_row(name, card.title, ", ".join(card.tracks), str(per_site), card.separates)
     print_table(table)
 
 
 def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its users need
     *,
     suite: Annotated[
-        list[str] | None, typer.Option(help="name from list-suites; may be repeated; default: all")
+        list[str] | None, typer.Option(help="name from list-suites; may be repeated; default: all but controls")
     ] = None,
     regions: Annotated[
         list[str] | None,

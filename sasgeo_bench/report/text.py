@@ -9,6 +9,7 @@ import pandas as pd
 
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
+from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES
@@ -17,6 +18,7 @@ from sasgeo_bench.report.tables import UNRANKED
 
 _INTEGRITY: Final = ("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05", "brier", "ece", "cost_20")
 _COSTS: Final = ("latency_p50", "latency_p95", "prepare", "peak_memory", "cpu_per_fix")
+_PRIOR_ALONE: Final = "prior_centre"
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
 
@@ -35,14 +37,22 @@ def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """
     means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
     for (suite, track, prior_group), part in means.groupby(["suite", "track", "prior_group"], sort=True):
-        title = f"{suite}, {track}, prior group {prior_group}"
-        yield title, _suite_table(part, primary_of(str(track)).name)
+        primary = primary_of(str(track)).name
+        yield f"{suite}, {track}, prior group {prior_group}{_prior_alone(part, primary)}", _suite_table(part, primary)
     judged = board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
     for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True):
         yield f"Rejection, {track}, prior group {prior_group}, all suites", _judged_table(part)
     costs = board[(board["rejector"] == "") & (board["suite"] == ALL_SUITES)]
     if len(costs):
         yield "Costs", _cost_table(costs)
+
+
+def _prior_alone(part: pd.DataFrame, primary: str) -> str:
+    """What the prior alone is worth, for a title: nobody's merit, and so said beside every group."""
+    mine = part[part["matcher"] == _PRIOR_ALONE]
+    row = _pick(mine, primary, STRESS)
+    row = _pick(mine, primary, ALL) if row is None else row
+    return "" if row is None else f" (the prior alone: {_number(row['value'])})"
 
 
 def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
@@ -154,7 +164,28 @@ _NOTE: Final = (
 )
 
 
-def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], findings: Sequence[Finding] = ()) -> str:
+def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
+    """Whether the controls of a board held, failures one by one.
+
+    Examples
+    --------
+    >>> control_lines([])
+    ['Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them).']
+    """
+    if not verdicts:
+        return ["Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them)."]
+    failed = [item.to_text() for item in verdicts if not item.holds]
+    if not failed:
+        return [f"Controls: all {len(verdicts)} held."]
+    return [f"CONTROLS FAILED, {len(failed)} of {len(verdicts)}: do not trust this board.", *failed]
+
+
+def board_markdown(
+    board: pd.DataFrame,
+    about: Mapping[str, Any],
+    findings: Sequence[Finding] = (),
+    verdicts: Sequence[Verdict] = (),
+) -> str:
     """The board as a document."""
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
@@ -163,14 +194,31 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], findings: Sequ
         "",
         _NOTE.format(draws=about["draws"]),
         "",
-        *(f"- {line}" for line in warnings_of(board)),
+        *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board))),
         "",
     ]
     if findings:
         lines += ["## Registered contrasts", "", *_markdown(finding_table(findings)), ""]
     for title, table in tables_of(board):
         lines += [f"## {title}", "", *_markdown(table), ""]
+    if verdicts:
+        lines += ["## Controls", "", _CONTROLS_NOTE, "", *_markdown(control_table(verdicts)), ""]
     return "\n".join(lines)
+
+
+_CONTROLS_NOTE: Final = (
+    "Queries whose right score is known beforehand. At chance: views of a shuffled map, of a map turned by half, and "
+    "of one of two places that are the same; `expected` is what guessing among the candidates or in the prior's disc "
+    "is worth, `p` the chance of finding as many or more by it (a control fails below 0.0001)."
+)
+
+
+def control_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """Verdicts in words."""
+    table = verdict_frame(verdicts)
+    words = {name: table[name].map(lambda value: f"{value:.3g}") for name in ("found", "expected")}
+    p, holds = table["p"].map(_number), table["holds"].map({True: "held", False: "FAILED"})
+    return table.assign(**words, p=p, holds=holds).rename(columns={"holds": "verdict"})
 
 
 def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.suites import (
     absent,
     alias,
+    board_controls,
     clean,
     false_unknown,
     grade_separation,
@@ -46,6 +47,8 @@ SUITES: Final[dict[str, Suite]] = {
         absent.SUITE,
     )
 }
+# Drawn for every board beside its experiment, and for none of its figures.
+EVERY_SUITE: Final[dict[str, Suite]] = {**SUITES, board_controls.SUITE.card.name: board_controls.SUITE}
 
 
 def find_suite(name: str) -> Suite:
@@ -61,9 +64,9 @@ def find_suite(name: str) -> Suite:
     >>> find_suite("real-age").card.version
     1
     """
-    if name not in SUITES:
-        near = difflib.get_close_matches(name, SUITES, n=1, cutoff=0.5)
+    if name not in EVERY_SUITE:
+        near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
         hint = f", did you mean {near[0]!r}?" if near else ""
         message = f"there is no suite {name!r}{hint} (list-suites shows all)"
         raise ConfigError(message)
-    return SUITES[name]
+    return EVERY_SUITE[name]

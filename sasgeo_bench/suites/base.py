@@ -228,6 +228,11 @@ class Suite(ABC):
         del variant
         return scene.map.region
 
+    def tracks(self, variant: Variant) -> tuple[Track, ...]:
+        """What is asked with a variant's views."""
+        del variant
+        return self.card.tracks
+
     @property
     def main_side_m(self) -> float:
         """Side of the view that most variants share."""

@@ -18,7 +18,7 @@ from sasgeo_bench.region import Region
 from sasgeo_bench.split import blocks_of
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.suites.all_suites import SUITES
+from sasgeo_bench.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant
 from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.twin import paste
@@ -39,6 +39,7 @@ TOWN_OF = {
     "grade-separation": "town-industrial large",
     "volatile-lure": "town-agricultural large",
     "alias": "town-agricultural huge",
+    "controls": "town-suburb large",
 }
 # One overpass, little room for wide views; the others get as many as are asked for.
 SITES = {"grade-separation": 1, "no-priors": 3}
@@ -106,7 +107,7 @@ def scene(town) -> Callable[..., Scene]:
     @cache
     def of_town(name: str, suite: str = "") -> Scene:
         if suite:
-            return replace(of_town(name), view_reach_m=_view_reach_m(SUITES[suite]))
+            return replace(of_town(name), view_reach_m=_view_reach_m(EVERY_SUITE[suite]))
         state = State.of(town(name))
         return Scene(
             map=state,
@@ -141,7 +142,7 @@ def carried(scene, edited) -> Callable[[str], Carried]:
 
     @cache
     def of_suite(name: str) -> Carried:
-        suite, where = SUITES[name], TOWN_OF.get(name, "town-suburb")
+        suite, where = EVERY_SUITE[name], TOWN_OF.get(name, "town-suburb")
         plain = scene(where, name)
         assert suite.lack(plain) is None
         suite = replace(suite, variants=suite.usable(plain))

@@ -106,7 +106,7 @@ class Query:
     observed_on : date
         Of the view.
     season : str
-        What the view's date says about the season: "leaf_on", "leaf_off", "snow", or "".
+        What the view's date says about the season: "leaf_on", "snow", "low_water", "harvest", or "" for nothing said.
     prior : Prior
         What is known before.
     prior_group : str

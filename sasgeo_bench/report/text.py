@@ -167,9 +167,9 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], findings: Sequ
         "",
     ]
     if findings:
-        lines += ["## Registered contrasts", "", *_markdown(finding_table(findings)), ""]
+        lines += ["## Registered contrasts", "", *markdown_table(finding_table(findings)), ""]
     for title, table in tables_of(board):
-        lines += [f"## {title}", "", *_markdown(table), ""]
+        lines += [f"## {title}", "", *markdown_table(table), ""]
     return "\n".join(lines)
 
 
@@ -192,7 +192,8 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _markdown(table: pd.DataFrame) -> Iterator[str]:
+def markdown_table(table: pd.DataFrame) -> Iterator[str]:
+    """Lines of a table."""
     yield "| " + " | ".join(map(str, table.columns)) + " |"
     yield "|" + "---|" * len(table.columns)
     for row in table.itertuples(index=False):

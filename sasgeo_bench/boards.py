@@ -2,7 +2,7 @@
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
@@ -28,7 +28,7 @@ from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.boardfile import write_board
+from sasgeo_bench.store.boardfile import Extra, write_board
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
@@ -61,6 +61,10 @@ class ScoreRequest:
         Folder to write.
     draws : int
         Of the bootstrap.
+    by_region : collection of str
+        Suites whose regions are resampled, not their blocks: those of which each region is a draw of its own.
+    extras : sequence of callable
+        Each makes, of the finished board, files that are written with it.
     """
 
     predictions: Sequence[Path]
@@ -71,6 +75,8 @@ class ScoreRequest:
     contrasts: Sequence[Contrast] = ()
     rejectors: Sequence[str] = ()
     draws: int = DRAWS
+    by_region: Collection[str] = ()
+    extras: Sequence[Callable[["Board"], Extra]] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +239,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         verdicts=verdicts,
         tasks=tuple(abouts),
     )
-    _write(request, board)
+    _write(request, board, [make(board) for make in request.extras])
     return board
 
 
@@ -320,11 +326,12 @@ def _scored(
         heads = list(taskdir.read_heads(folder))
         mine = {head.query_id: predictions[head.query_id] for head in heads if head.query_id in predictions}
         truths = taskdir.read_truths(_truth_folder(about, request.root))
-        frames.append(score_task(heads, truths, mine, place_of=place_of))
+        frame = score_task(heads, truths, mine, place_of=place_of)
+        frames.append(frame.assign(block=frame["region"]) if about["suite"] in request.by_region else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 
-def _write(request: ScoreRequest, board: Board) -> None:
+def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra]) -> None:
     about = {
         "scorer_version": SCORER_VERSION,
         "task_version": TASK_VERSION,
@@ -332,6 +339,7 @@ def _write(request: ScoreRequest, board: Board) -> None:
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
+        "by_region": sorted(request.by_region),
         "entries": [
             {
                 "name": entry.name,
@@ -369,4 +377,5 @@ def _write(request: ScoreRequest, board: Board) -> None:
             "leaderboard.tex": board_latex(board.table, about),
         },
         about=about,
+        extras=extras,
     )

@@ -3,12 +3,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.paper import made_paper_task, make_paper_task
+from sasgeo_bench.paperboard import paper_extra
+from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.request import Request, Wanted, plan_requests
@@ -43,11 +46,13 @@ class PipelinePlan:
         """A line for each stage, with what of it is up to date."""
         made = [made_tasks(request) is not None for request in self.requests]
         lines = [f"{self.spec.id}: {self.spec.title}"]
-        lines.append(f"  queries: {len(made)} suites on regions, {sum(made)} of them up to date")
+        if made:
+            lines.append(f"  queries: {len(made)} suites on regions, {sum(made)} of them up to date")
         lines += [
             f"    {request.suite} on {request.region.id}: {'up to date' if done else 'to be drawn'}"
             for request, done in zip(self.requests, made, strict=True)
         ]
+        lines += _paper_lines(self)
         lines.append(f"  controls: on {', '.join(request.region.id for request in self.controls)}")
         lines.append(f"  run: {', '.join(self.matchers)}; {REFERENCE} on the controls")
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
@@ -58,6 +63,18 @@ class PipelinePlan:
     def matchers(self) -> tuple[str, ...]:
         """Those of the file, and those that every board has."""
         return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
+
+
+def _paper_lines(plan: PipelinePlan) -> list[str]:
+    """A line for each seed of the paper's experiment."""
+    paper = plan.spec.paper
+    if paper is None:
+        return []
+    made = [made_paper_task(seed=seed, trials=paper.trials, out=plan.out) is not None for seed in paper.seeds]
+    return [
+        f"  the paper's {paper.trials} trials, seed {seed}: {'up to date' if done else 'to be drawn'}"
+        for seed, done in zip(paper.seeds, made, strict=True)
+    ]
 
 
 def board_folder(plan: PipelinePlan) -> Path:
@@ -102,7 +119,7 @@ def plan_pipeline(
         wanted = Wanted(
             suites=tuple(task.suites),
             regions=tuple(spec.regions),
-            split=spec.split,
+            split=str(spec.split),  # a file with tasks names one
             count=task.sites,
             seed=spec.seed,
             out=out,
@@ -112,7 +129,7 @@ def plan_pipeline(
             may_be_fewer=True,
         )
         requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
-    if not requests:
+    if spec.task and not requests:
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)
     controls = Wanted(
@@ -161,7 +178,7 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
     ConfigError
         If no region can carry any of the suites.
     """
-    tasks = _draw(plan.requests, tell)
+    tasks = [*_draw(plan.requests, tell), *_draw_paper(plan, tell)]
     if not tasks:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
@@ -174,10 +191,12 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
         tasks=[*tasks, *controls],
         root=plan.out,
         board=board_folder(plan),
-        split=plan.requests[0].split,
+        split=plan.requests[0].split if plan.requests else None,
         rejectors=plan.spec.rejectors,
         contrasts=_contrasts(plan.spec),
         draws=plan.spec.draws,
+        extras=() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),),
+        by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
     )
     return make_board(request_board, tell=tell)
 
@@ -218,6 +237,18 @@ def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
     if len(lacking) > MOST_LINES:
         tell(f"left out: {len(lacking) - MOST_LINES} more")
     return tasks
+
+
+def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
+    """Task folders of every seed of the paper's experiment; those that are up to date are left as they are."""
+    paper = plan.spec.paper
+    if paper is None:
+        return []
+    return [
+        made_paper_task(seed=seed, trials=paper.trials, out=plan.out)
+        or make_paper_task(seed=seed, trials=paper.trials, out=plan.out, tell=tell)
+        for seed in paper.seeds
+    ]
 
 
 def _contrasts(spec: PipelineFile) -> tuple[Contrast, ...]:

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a file in `pipelines/` says: an experiment as data, read before anything is run."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.tomlfile import Document
+
+PAPER_SUITE: Final = "paper-poc"
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
 
@@ -33,8 +35,21 @@ class TaskSpec(Document):
     prior: str | None = None
 
 
+class PaperSpec(Document):
+    """The paper's own experiment: regions and trials of each of these seeds, drawn with no split and no other setting.
+
+    Examples
+    --------
+    >>> PaperSpec().seeds, PaperSpec().trials
+    ([42], 220)
+    """
+
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = [42]
+    trials: Annotated[int, Field(ge=1, le=10_000)] = 220
+
+
 class PipelineFile(Document):
-    """What a pipeline file says.
+    """What a pipeline file says: suites on regions of a split, the paper's experiment, or both.
 
     Examples
     --------
@@ -45,10 +60,11 @@ class PipelineFile(Document):
 
     id: Name
     title: str
-    split: str
+    split: str | None = None
     regions: list[str] = []
     seed: int = 0
-    task: Annotated[list[TaskSpec], Field(min_length=1)]
+    task: list[TaskSpec] = []
+    paper: PaperSpec | None = None
     matchers: Annotated[list[str], Field(min_length=1)]
     rejectors: list[str] = []
     contrast: list[ContrastSpec] = []
@@ -57,13 +73,31 @@ class PipelineFile(Document):
     draws: Annotated[int, Field(ge=100, le=100_000)] = 10_000
 
     @model_validator(mode="after")
+    def _has_what_it_needs(self) -> Self:
+        if self.rejectors and (self.split is None or not self.task):
+            message = "rejectors are fitted on the calibration places of a split: name 'split' and a [[task]], or none"
+            raise ValueError(message)
+        if not self.task and self.paper is None:
+            message = "'task' is missing: draw suites by [[task]], or the paper's experiment by [paper]"
+            raise ValueError(message)
+        if self.task and self.split is None:
+            message = "'split' is missing: [[task]] is drawn on the regions of a split"
+            raise ValueError(message)
+        if not self.task and (self.split is not None or self.regions):
+            message = "'split' and 'regions' are for [[task]], and there is none: leave them out"
+            raise ValueError(message)
+        return self
+
+    @model_validator(mode="after")
     def _names_once(self) -> Self:
         suites = [name for task in self.task for name in task.suites]
+        suites += [] if self.paper is None else [PAPER_SUITE]
         for what, listed in (
             ("suite", suites),
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
             ("contrast", [item.name for item in self.contrast]),
+            ("seed", [] if self.paper is None else [str(seed) for seed in self.paper.seeds]),
         ):
             twice = sorted({name for name in listed if listed.count(name) > 1})
             if twice:
@@ -76,6 +110,9 @@ class PipelineFile(Document):
             lost = next((name for name in item.suites if name not in suites), None)
             if lost is not None:
                 message = f"contrast {item.name!r} names the suite {lost!r}, which is not drawn"
+                raise ValueError(message)
+            if item.suites == [PAPER_SUITE] and item.track != "retrieval":
+                message = f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"'
                 raise ValueError(message)
             _check_methods(item, self.matchers, self.rejectors)
         for task in self.task:

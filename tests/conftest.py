@@ -12,7 +12,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from sasgeo_bench import cli
+from sasgeo_bench import cli, pipeline
 from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
@@ -161,3 +161,12 @@ def _extracts_folder() -> Path | None:
         if name and any(Path(name).glob("*.osm.pbf")):
             return Path(name).resolve()
     return None
+
+
+@pytest.fixture(scope="session")
+def few_controls() -> Iterator[None]:
+    """Pipelines draw their controls at one site of one town: what these find is tested beside their suite."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "CONTROL_REGIONS", ("town-suburb",))
+        patch.setattr(pipeline, "CONTROL_SITES", 1)
+        yield

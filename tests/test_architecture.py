@@ -67,7 +67,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "rundir", "boardfile", "pluginfiles"),
-        *("preview", "sheet", "splitmap", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
+        *("preview", "sheet", "splitmap", "paperplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,
     "request": None,
@@ -86,9 +86,10 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "score": None,
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
-        *("plots", "site"),
+        *("paper", "papertext", "plots", "site"),
     ),
     "boards": None,
+    "paperboard": None,
     "pipeline": None,
     "scaffold": None,
     "testing": None,

@@ -16,6 +16,7 @@ from sasgeo_bench import boards, cli
 from sasgeo_bench.boards import ScoreRequest, find_entries, make_board
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.report.controls import Verdict
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.run.oracle import right_answer
@@ -284,3 +285,19 @@ def test_a_board_may_not_be_named_like_a_path(out, monkeypatch, capsys):
         cli.main()
     assert left.value.code == 2
     assert "--name must hold letters" in capsys.readouterr().err
+
+
+def test_a_control_that_fails_is_told_first_and_ends_with_status_1(out, monkeypatch, capsys):
+    verdict = Verdict(control="shuffled map at chance", matcher="m", n=8, found=8.0, expected=0.8, p=1e-8, holds=False)
+    monkeypatch.setattr(boards, "hold_controls", lambda _: (verdict,))
+    words = ("score", "--predictions", str(out / "runs"), "--out", str(out), "--name", "mine", "--draws", "200")
+    monkeypatch.setattr("sys.argv", ["sasgeo-bench", *words])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code == 1
+    told = capsys.readouterr()
+    assert "CONTROLS FAILED, 1 of 1: do not trust this board." in told.err
+    assert verdict.to_text() in told.err
+    assert told.out.splitlines()[-1] == str(out / "boards" / "mine")  # written all the same
+    text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
+    assert text.index("CONTROLS FAILED") < text.index("## ")

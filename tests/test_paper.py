@@ -13,7 +13,7 @@ import shapely
 from sasgeo_bench.errors import ConfigError, PerturbError
 from sasgeo_bench.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.layers import OUTSIDE
-from sasgeo_bench.paper import make_paper_task
+from sasgeo_bench.paper import made_paper_task, make_paper_task, task
 from sasgeo_bench.paper.task import VERSION, region_name
 from sasgeo_bench.paper.tiles import CLASSES, GAP_M, TILE_M, TILES, draw_tile, mosaic_grid, tile_centre_m
 from sasgeo_bench.paper.trials import CHANGE_FACTORS, Transformation, draw_crops, draw_view, map_change, rectangle
@@ -218,6 +218,43 @@ def test_decoys_are_far_more_alike_than_windows_are_at_large_and_come_from_all_t
     at_large = np.linalg.norm(shares[::7, None] - shares[None, ::11], axis=2).mean()
     assert np.mean(near) < 0.4 * at_large
     assert tiles == set(range(TILES))
+
+
+# --- what is up to date ---------------------------------------------------------------------------------------------
+
+
+def test_what_was_made_by_the_same_request_is_found_without_drawing_it(out, other):
+    assert made_paper_task(seed=42, out=out) == out / "tasks" / "paper-poc" / "paper-poc-42"
+    assert made_paper_task(seed=43, out=other, trials=FEW) is not None
+
+
+def test_another_number_of_trials_seed_or_version_is_to_be_drawn(out, monkeypatch):
+    assert made_paper_task(seed=42, out=out, trials=219) is None
+    assert made_paper_task(seed=43, out=out) is None
+    monkeypatch.setattr(task, "VERSION", VERSION + 1)
+    assert made_paper_task(seed=42, out=out) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tasks/paper-poc/paper-poc-43/queries.parquet",
+        "truth/paper-poc/paper-poc-43/truth.parquet",
+        "truth/paper-poc/paper-poc-43/truth.json",
+        "regions/paper-poc-43/layers.tif",
+    ],
+)
+def test_what_was_touched_or_lost_is_not_up_to_date(other, name):
+    path = other / name
+    data = path.read_bytes()
+    try:
+        path.write_bytes(data[:-20])
+        assert made_paper_task(seed=43, out=other, trials=FEW) is None
+        path.unlink()
+        assert made_paper_task(seed=43, out=other, trials=FEW) is None
+    finally:
+        path.write_bytes(data)
+    assert made_paper_task(seed=43, out=other, trials=FEW) is not None
 
 
 # --- the regions ----------------------------------------------------------------------------------------------------

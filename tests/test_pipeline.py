@@ -4,7 +4,6 @@
 import pandas as pd
 import pytest
 
-from sasgeo_bench import pipeline
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
@@ -39,17 +38,8 @@ def small(**changes):
     return parse_toml(text, PipelineFile, source="small.toml")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_controls():
-    """One site of one town: what the controls find is tested beside their suite."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "CONTROL_REGIONS", ("town-suburb",))
-        patch.setattr(pipeline, "CONTROL_SITES", 1)
-        yield
-
-
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def made(tmp_path_factory, few_controls):  # noqa: ARG001
     out = tmp_path_factory.mktemp("pipeline") / "out"
     plan = plan_pipeline(small(), out=out, tell=lambda _: None)
     assert "to be drawn" in plan.to_text()
@@ -145,6 +135,61 @@ def test_a_wrong_file_is_refused_in_one_line(changes, words):
     assert "\n" not in str(error.value)
 
 
+PAPER = """
+id = "few"
+title = "Few"
+matchers = ["random", "oracle_pose"]
+
+[paper]
+seeds = [42, 43]
+trials = 3
+
+[[contrast]]
+name = "nothing"
+first = "random"
+second = "oracle_pose"
+suites = ["paper-poc"]
+track = "retrieval"
+"""
+
+
+def test_the_paper_needs_no_split_no_region_and_no_task_and_has_its_own_defaults():
+    spec = parse_toml(PAPER, PipelineFile, source="few.toml")
+    assert (spec.split, spec.regions, spec.task) == (None, [], [])
+    text = PAPER.replace("seeds = [42, 43]\n", "").replace("trials = 3\n", "")
+    paper = parse_toml(text, PipelineFile, source="few.toml").paper
+    assert (paper.seeds, paper.trials) == ([42], 220)
+
+
+def test_the_paper_and_suites_may_stand_in_one_file():
+    text = TEXT.replace("[[task]]", "[paper]\n\n[[task]]").replace('["clean"]\n', '["clean", "paper-poc"]\n')
+    text = text.replace('suites = ["clean", "paper-poc"]\nsites', 'suites = ["clean"]\nsites')
+    spec = parse_toml(text, PipelineFile, source="both.toml")
+    assert spec.contrast[0].suites == ["clean", "paper-poc"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[42, 43]", "[42, 42]", "seed '42' is listed twice"),
+        ("[42, 43]", "[-1]", "greater than or equal to 0"),
+        ("[42, 43]", "[]", "at least 1 item"),
+        ("trials = 3", "trials = 0", "greater than or equal to 1"),
+        ("trials = 3", "trails = 3", "unknown key 'paper.trails', did you mean 'trials'"),
+        ('["paper-poc"]', '["paper-pock"]', "names the suite 'paper-pock', which is not drawn"),
+        ('track = "retrieval"', "", "the paper's trials are retrieval"),
+        ("[paper]", 'rejectors = ["margin"]\n[paper]', "rejectors are fitted on the calibration places of a split"),
+        ("[paper]", 'split = "crossfit"\n[paper]', "for \\[\\[task\\]\\], and there is none: leave them out"),
+        ("[paper]\nseeds = [42, 43]\ntrials = 3\n", "", "'task' is missing"),
+        ("[paper]", '[[task]]\nsuites = ["clean"]\nsites = 1\n\n[paper]', "'split' is missing"),
+    ],
+)
+def test_a_wrong_file_of_the_paper_is_refused_in_one_line(old, new, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        parse_toml(PAPER.replace(old, new), PipelineFile, source="few.toml")
+    assert "\n" not in str(error.value)
+
+
 def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp_path):
     for old, new in (("claen", "clean"), ("town-suburbia", "town-suburb"), ("crosfit", "crossfit")):
         spec = parse_toml(TEXT.replace(f'"{new}"', f'"{old}"'), PipelineFile, source="small.toml")
@@ -158,5 +203,5 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
     spec = read_pipeline_file(find_pipeline_file(name))
     assert spec.id == name
     plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
-    assert plan.requests
+    assert plan.requests or plan.spec.paper is not None
     assert list(tmp_path.iterdir()) == []

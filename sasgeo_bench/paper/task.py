@@ -2,6 +2,8 @@
 """The experiment as a region and a task on disk: the order of the steps."""
 
 import datetime as dt
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,7 +16,7 @@ import shapely
 
 from sasgeo_bench.build import build_made
 from sasgeo_bench.draw import make_prior
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.evidence import PRESENT
 from sasgeo_bench.extract.locate import Extract
 from sasgeo_bench.extract.read import Reading
@@ -28,23 +30,26 @@ from sasgeo_bench.paper.trials import (
     true_pose,
 )
 from sasgeo_bench.paper.windows import MARGIN_M, WINDOW_CELLS, WINDOW_M, Windows
+from sasgeo_bench.pipelinefile import PAPER_SUITE
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import PriorGroup, Query, Truth
-from sasgeo_bench.region import Region
+from sasgeo_bench.query import TASK_VERSION, PriorGroup, Query, Truth
+from sasgeo_bench.region import DATA_VERSION, SCHEMA_VERSION, Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import check_roots
-from sasgeo_bench.store import regiondir
+from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.suites.base import DRAWN_CLASSES, Seeds, State, changed_share
 from sasgeo_bench.suites.mining import Windows as MinedWindows
 from sasgeo_bench.suites.mining import describe, mine
-from sasgeo_bench.tasks import put_task
+from sasgeo_bench.tasks import check_task, has_truths, put_task
+from sasgeo_bench.taxonomy import load_taxonomy
 
-SUITE: Final = "paper-poc"
+SUITE: Final = PAPER_SUITE
 VERSION: Final = 1
 TRIALS: Final = 220
 GROUP: Final = PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15)
 DATE: Final = dt.date(2026, 1, 1)
 STRENGTH_UNIT: Final = "map-change probability"
+DATA: Final = "procedural regions, no OSM data in them"  # what pictures and tables say of where they come from
 
 Tell = Callable[[str], None]
 
@@ -87,9 +92,43 @@ def make_paper_task(*, seed: int, out: Path, trials: int = TRIALS, tell: Tell) -
     folder = build_made(_spec(seed), _generated(seed, seeds), out=out, tell=tell)
     drawer = PaperDrawer.of(regiondir.read_region(folder), seeds)
     pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
-    made = put_task(pairs, _about(drawer.region), {"seed": seed}, out=out, tell=tell)
+    hidden = {"seed": seed, "request_sha256": _request_sha256(seed, trials)}
+    made = put_task(pairs, _about(drawer.region), hidden, out=out, tell=tell)
     tell(f"{SUITE} on {region_name(seed)}: {made.queries} trials in {made.folder}")
     return made.folder
+
+
+def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS) -> Path | None:
+    """Task folder of these trials, or None if they have to be drawn; nothing is drawn to find out.
+
+    Task, truths and region are as they were written, and nothing that decides what they hold has changed since.
+
+    Examples
+    --------
+    >>> made_paper_task(seed=42, out=Path("nowhere")) is None
+    True
+    """
+    folder = out / "tasks" / SUITE / region_name(seed)
+    said = taskdir.read_hidden(out / "truth" / SUITE / region_name(seed))
+    if said.get("request_sha256") != _request_sha256(seed, trials):
+        return None
+    try:
+        faults = [*check_task(folder, out=out), *regiondir.differing_files(out / "regions" / region_name(seed))]
+        return folder if not faults and has_truths(folder, out=out) else None
+    except StoreError:
+        return None
+
+
+def _request_sha256(seed: int, trials: int) -> str:
+    """Hash of all that decides which trials come of a seed; the recipe itself is in it by its version."""
+    said = {
+        "suite": [SUITE, VERSION, TASK_VERSION],
+        "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().model_dump(mode="json")],
+        "seed": seed,
+        "trials": trials,
+        "made_by": version("sasgeo-bench"),
+    }
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def region_name(seed: int) -> str:

@@ -13,6 +13,7 @@ from sasgeo_bench.metrics.base import Bools
 ALL: Final = "all"
 STRESS: Final = "stress"
 CONTROL: Final = "control"
+_MOST_STEPS: Final = 24  # more are no steps: a strength drawn from a range is another one for each query
 _EDGES: Final = {  # fixed, so that boards can be compared
     "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
     "changed_share": (0.0, 0.1, 0.2, 0.4, 1.0),
@@ -46,7 +47,7 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
         mine = kind == one
         yield one, mine
         steps = sorted({(step, size) for step, size in zip(strength[mine], cells[mine], strict=True)})
-        if len(steps) > 1:
+        if 1 < len(steps) <= _MOST_STEPS:
             for step, size in steps:
                 yield f"{one} {step:g}, {size} cells", mine & (strength == step) & (cells == size)
     sizes = sorted(set(cells[role == CONTROL]))

@@ -198,11 +198,11 @@ def board_markdown(
         "",
     ]
     if findings:
-        lines += ["## Registered contrasts", "", *_markdown(finding_table(findings)), ""]
+        lines += ["## Registered contrasts", "", *markdown_table(finding_table(findings)), ""]
     for title, table in tables_of(board):
-        lines += [f"## {title}", "", *_markdown(table), ""]
+        lines += [f"## {title}", "", *markdown_table(table), ""]
     if verdicts:
-        lines += ["## Controls", "", _CONTROLS_NOTE, "", *_markdown(control_table(verdicts)), ""]
+        lines += ["## Controls", "", _CONTROLS_NOTE, "", *markdown_table(control_table(verdicts)), ""]
     return "\n".join(lines)
 
 
@@ -240,7 +240,8 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _markdown(table: pd.DataFrame) -> Iterator[str]:
+def markdown_table(table: pd.DataFrame) -> Iterator[str]:
+    """Lines of a table."""
     yield "| " + " | ".join(map(str, table.columns)) + " |"
     yield "|" + "---|" * len(table.columns)
     for row in table.itertuples(index=False):

@@ -2,7 +2,8 @@
 """Boards on disk: `leaderboard.parquet` is the master, all others say the same for other readers."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,11 +18,32 @@ from sasgeo_bench.store.regiondir import fresh_folder, locked
 LEADERBOARD: Final = "leaderboard"
 SCORES: Final = "scores"
 BOARD: Final = "board.json"
+FIGURES: Final = "figures"
 _KNOWN: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
     *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
-    *("figures", "site"),
+    *("paper.parquet", "trials.parquet", "paper.md"),
+    *(FIGURES, "site"),
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extra:
+    """Files of a board besides its own.
+
+    Parameters
+    ----------
+    tables : mapping of str to pandas.DataFrame
+        Each becomes <name>.parquet.
+    texts : mapping of str to str
+        File name -> text.
+    figures : mapping of str to callable
+        Name in `figures/` -> what draws it to a path.
+    """
+
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
 
 
 def write_board(
@@ -30,6 +52,7 @@ def write_board(
     tables: Mapping[str, pd.DataFrame],
     texts: Mapping[str, str],
     about: Mapping[str, Any],
+    extras: Sequence[Extra] = (),
 ) -> None:
     """Write a board, whole or not at all.
 
@@ -43,6 +66,8 @@ def write_board(
         File name -> text.
     about : mapping
         What `board.json` says: versions, hashes, what was scored.
+    extras : sequence of Extra
+        Files besides.
 
     Raises
     ------
@@ -52,14 +77,22 @@ def write_board(
     check_board(folder, scorer_version=int(about["scorer_version"]))
     with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
         said = {"attribution": ATTRIBUTION, "licence": LICENCE, "scorer_version": str(about["scorer_version"])}
-        for name, frame in tables.items():
-            table = pa.Table.from_pandas(frame, preserve_index=False)
-            pq.write_table(table.replace_schema_metadata(said), scratch / f"{name}.parquet", compression="zstd")
+        for part in (Extra(tables=tables, texts=texts), *extras):
+            _write_part(scratch, part, said)
         tables[LEADERBOARD].to_csv(scratch / f"{LEADERBOARD}.csv", index=False, lineterminator="\n")
-        for name, text in texts.items():
-            (scratch / name).write_text(text, encoding="utf-8")
         content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
         (scratch / BOARD).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
+    for name, frame in part.tables.items():
+        table = pa.Table.from_pandas(frame, preserve_index=False)
+        pq.write_table(table.replace_schema_metadata(said), folder / f"{name}.parquet", compression="zstd")
+    for name, text in part.texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    for name, draw in part.figures.items():
+        (folder / FIGURES).mkdir(exist_ok=True)
+        draw(folder / FIGURES / name)
 
 
 def check_board(folder: Path, *, scorer_version: int) -> None:

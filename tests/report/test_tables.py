@@ -181,6 +181,12 @@ def test_every_query_is_in_each_way_to_cut_a_suite():
     assert (np.sum(bins, axis=0) == 1).all()
 
 
+def test_a_strength_drawn_from_a_range_has_no_steps():
+    table = scores(np.ones(40), kind="trial", strength=np.arange(40) / 100)
+    assert not [name for name, _ in strata(table) if "cells" in name]
+    assert len([name for name, _ in strata(table.iloc[:24]) if "cells" in name]) == 24
+
+
 def test_the_texts_say_the_figures_and_what_is_missing():
     tables = {
         "mine": scores([1.0, 99.0, math.inf, math.inf], status=["ok", "ok", "missing", "missing"]),

@@ -166,6 +166,17 @@ def reach_of(request: RunRequest, region: Path | None) -> Reach:
     return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
 
 
+def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
+    """Tasks in groups that one process may answer: those on the same map, and no other date or edit of its place.
+
+    The control that is given the truth is given that of one task at a time.
+    """
+    groups: dict[Path, list[RunPart]] = {}
+    for part in parts:
+        groups.setdefault(part.truth if spec == ORACLE else part.region.resolve(), []).append(part)
+    return list(groups.values())
+
+
 def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about: dict[str, Any]) -> RunPart:
     folder = request.out / "runs" / card.name / found / about["suite"] / about["region"]
     before = rundir.read_run(folder)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who works on what: a map for each thread first, then help for the map that has most to do."""
+"""Who works on what: a map for each thread first, then help for the map that has most left."""
 
 import threading
 import time
@@ -8,8 +8,8 @@ from typing import Final, Generic, TypeVar
 
 Item = TypeVar("Item")
 
-# A helper begins by starting a process and preparing the map, 1.6 s of a core or far more. How long a query takes is
-# not known before the first answers, 10 ms or 10 s; with this many for each process a start is seldom lost on either.
+# Help begins with a start and a map to prepare: 1.6 s of a core, or far more. While nobody knows what a query takes,
+# 10 ms or 10 s, fewer than this for each process are not worth one; chunks for a cluster are no smaller either.
 LEAST_ITEMS: Final = 8
 
 
@@ -82,8 +82,9 @@ class Schedule(Generic[Item]):
         return None
 
     def _in_need(self) -> "_Line[Item] | None":
-        """Of the maps where help pays, the one with most queries left."""
-        return max((line for line in self._lines if line.pays()), key=lambda line: line.left, default=None)
+        """Of the maps where help pays, the one with most queries left for each who would work on it."""
+        in_need = (line for line in self._lines if line.pays())
+        return max(in_need, key=lambda line: line.left / (line.askers + 1), default=None)
 
     def items(self, number: int) -> Iterator[Item]:
         """Queries of a map, each to one of those who ask; the time until the next one is asked for is noted."""

@@ -77,7 +77,10 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "doctor": None,
     "sasgeo": ("weights", "raster", "graph", "temporal", "joint", "integrity"),
     "plugins": None,
-    "run": ("sandbox", "wire", "serve", "child", "worker", "oracle", "plan", "answers", "cluster", "runner"),
+    "run": (
+        *("sandbox", "wire", "serve", "child", "worker", "oracle"),
+        *("plan", "schedule", "answers", "cluster", "runner"),
+    ),
     "metrics": (
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
         *("sequence", "cost", "intervals", "compare", "power"),

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries of one task -> rows in its run folder: by one process or several, in whatever order they finish."""
+"""Queries of some tasks -> rows in their run folders; a process answers all tasks that search its map."""
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import MatchError
@@ -15,7 +14,8 @@ from sasgeo_bench.plugins import ORACLE
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.run.oracle import Oracle
-from sasgeo_bench.run.plan import RunPart, RunPlan, reach_of
+from sasgeo_bench.run.plan import RunPart, RunPlan, by_map, reach_of
+from sasgeo_bench.run.schedule import Schedule
 from sasgeo_bench.run.worker import Reply, Worker
 from sasgeo_bench.store import rundir, taskdir
 
@@ -24,7 +24,7 @@ PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill 
 
 _AND: Final = " | "  # between ways in which parts of one run were shut in
 
-Watch = Callable[[int], None]  # is told how many more queries have a row
+Question = tuple["_Writer", Query, bytes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +40,7 @@ class Cost:
     cpu_s : float
         Processor seconds inside of `match`, all queries together.
     peak_bytes : int
-        Most memory that all processes of one matcher held at once.
+        Most memory that a matcher's process and all that came from it held at once, in whatever task of its map.
     isolation : dict of str to str
         How the matcher was shut in.
     messages : dict of str to str
@@ -84,21 +84,38 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
     )
 
 
-def answer(plan: RunPlan, part: RunPart, ids: Sequence[str], *, jobs: int, watch: Watch) -> Cost:
-    """Ask some queries of a task, by as many processes as are wanted, and write their rows.
+class Watch:
+    """Whoever is told how tasks come along, by several threads at once; this one takes no note.
+
+    Examples
+    --------
+    >>> isinstance(Watch(), Watch)
+    True
+    """
+
+    def begin(self, part: RunPart) -> None:
+        """Take note that a task is begun."""
+
+    def advance(self, part: RunPart) -> None:
+        """Take note that one more query has a row."""
+
+    def end(self, part: RunPart, cost: Cost) -> None:
+        """Take note that all rows there will be are written, and what they took."""
+
+
+def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) -> Cost:
+    """Ask what is left of some tasks, by as many processes as are wanted, and write the rows.
 
     Parameters
     ----------
     plan : RunPlan
         From `plan_run`.
-    part : RunPart
-        The task.
-    ids : sequence of str
-        Queries to ask.
+    parts : sequence of RunPart
+        The tasks. Those that search one map share processes; no process has more than one map.
     jobs : int
         Processes at once.
-    watch : callable
-        Is told how many more queries have a row.
+    watch : Watch
+        Is told of each task and each row.
 
     Returns
     -------
@@ -110,53 +127,83 @@ def answer(plan: RunPlan, part: RunPart, ids: Sequence[str], *, jobs: int, watch
     StoreError
         If rows cannot be written; those that were stay.
     """
-    writer = _Writer(part.folder, watch=watch)
-    questions = _Questions(part.task, ids)
-    workers = [_asked(plan, part) for _ in range(min(jobs, len(ids)))]
-    try:
-        with ThreadPoolExecutor(max_workers=max(1, len(workers))) as pool:
+    groups = [[_Writer(part, watch=watch) for part in group] for group in by_map(plan.request.spec, parts)]
+    maps = [_Map(plan, group) for group in groups]
+    writers = [writer for group in groups for writer in group]
+    schedule = Schedule([(place.questions(), place.count) for place in maps])
+    threads = min(jobs, sum(place.count for place in maps))
+    with ExitStack() as ends:
+        for writer in writers:
+            ends.callback(writer.end)
+        with ThreadPoolExecutor(max_workers=threads + 1) as pool:
             try:
-                costs = list(pool.map(lambda worker: _ask_all(plan, part, worker, questions, writer), workers))
+                writing = pool.submit(_write_in_time, writers, schedule)
+                for asking in as_completed([pool.submit(_ask_all, schedule, maps) for _ in range(threads)]):
+                    asking.result()
             finally:
-                questions.stop()  # before the pool waits for its threads: each ends with the query it is at
+                schedule.stop()  # before the pool waits for its threads: each ends with the query it is at
+            writing.result()
+    return pool_costs([writer.cost for writer in writers])
+
+
+def _ask_all(schedule: Schedule[Question], maps: Sequence["_Map"]) -> None:
+    """One thread: map after map, each by a process of its own."""
+    while (number := schedule.take()) is not None:
+        maps[number].ask(schedule, number)
+
+
+def _write_in_time(writers: Sequence["_Writer"], schedule: Schedule[Question]) -> None:
+    """Write rows every now and then; whoever cannot stops the run."""
+    try:
+        while not schedule.wait_for_stop(PART_S):
+            for writer in writers:
+                writer.flush()
     finally:
-        writer.flush()
-    return pool_costs([*costs, Cost(counts=writer.counts, messages=writer.messages)])
+        schedule.stop()
 
 
-def _asked(plan: RunPlan, part: RunPart) -> Worker | Oracle:
-    """Whoever is asked: a plugin in a process of its own, or the one control that is given the truth."""
-    if plan.request.spec == ORACLE:
-        return Oracle(part.truth)
-    reach = reach_of(plan.request, part.region)
-    return Worker(spec=plan.request.spec, reach=reach, limits=plan.request.limits)
+class _Map:
+    """A map and the tasks that search it."""
 
+    def __init__(self, plan: RunPlan, writers: Sequence["_Writer"]) -> None:
+        self.count = sum(len(writer.part.left) for writer in writers)
+        self._plan, self._writers = plan, writers
 
-def _ask_all(plan: RunPlan, part: RunPart, worker: Worker | Oracle, questions: "_Questions", writer: "_Writer") -> Cost:
-    """One process: prepare, then query after query."""
-    with worker:
-        ready = worker.prepare(part.region)
-        is_warm = False
-        for query, blob in questions:
-            reason = lacks(plan.card, query)
-            if reason is not None:
-                writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
-                continue
-            reply = ready
-            if ready.status == "ok":
-                if not is_warm:
-                    worker.match(blob, top_k=plan.request.top_k)
-                    is_warm, worker.cpu_s = True, 0.0
-                reply = worker.match(blob, top_k=plan.request.top_k)
-            writer.add(_prediction(query, reply, plan.request.top_k))
-        return Cost(
-            prepare_s=ready.seconds,
-            index_bytes=ready.grown_bytes,
-            cpu_s=worker.cpu_s,
-            peak_bytes=worker.peak_bytes,
-            isolation=dict(worker.isolation)
-            or dict.fromkeys(("files", "truth", "network", "processes"), "trusted code, not shut in"),
-        )
+    def questions(self) -> Iterator[Question]:
+        """Query after query, task after task, each with where its row goes; a row group in memory."""
+        for writer in self._writers:
+            writer.begin()
+            for query, blob in taskdir.read_some(writer.part.task, frozenset(writer.part.left)):
+                yield writer, query, blob
+
+    def ask(self, schedule: Schedule[Question], number: int) -> None:
+        """One process: prepare with the first query, then answer one after the other."""
+        top_k, ready, is_warm = self._plan.request.top_k, None, False
+        with self._asked() as worker:
+            for writer, query, blob in schedule.items(number):
+                if ready is None:
+                    ready = worker.prepare(self._writers[0].part.region)
+                    if schedule.is_stopped:
+                        return
+                writer.told_by(worker, ready)
+                reason = lacks(self._plan.card, query)
+                if reason is not None:
+                    writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
+                    continue
+                reply = ready
+                if ready.status == "ok":
+                    if not is_warm:
+                        worker.match(blob, top_k=top_k)
+                        is_warm = True
+                    reply = worker.match(blob, top_k=top_k)
+                writer.add(_prediction(query, reply, top_k), cpu_s=reply.cpu_s)
+
+    def _asked(self) -> Worker | Oracle:
+        """Whoever is asked: a plugin in a process of its own, or the one control that is given the truth."""
+        request, part = self._plan.request, self._writers[0].part
+        if request.spec == ORACLE:
+            return Oracle(part.truth)
+        return Worker(spec=request.spec, reach=reach_of(request, part.region), limits=request.limits)
 
 
 def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
@@ -178,59 +225,73 @@ def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
     )
 
 
-class _Questions:
-    """Queries of a task, one at a time to whoever asks; a row group in memory."""
-
-    def __init__(self, task: Path, ids: Sequence[str]) -> None:
-        self._lock = threading.Lock()
-        self._rows = taskdir.read_some(task, frozenset(ids))
-        self._is_stopped = False
-
-    def __iter__(self) -> Iterator[tuple[Query, bytes]]:
-        """Give each query to one of those that ask."""
-        while True:
-            with self._lock:
-                if self._is_stopped:
-                    return
-                item = next(self._rows, None)
-            if item is None:
-                return
-            yield item
-
-    def stop(self) -> None:
-        """Give nothing more."""
-        self._is_stopped = True
-
-
 class _Writer:
-    """Rows of one task: gathered, counted, and written a part at a time."""
+    """Rows of one task: gathered, counted, and written a part at a time; and what they took."""
 
-    def __init__(self, folder: Path, *, watch: Watch) -> None:
-        self.counts: dict[str, int] = {}
-        self.messages: dict[str, str] = {}
-        self._folder, self._watch = folder, watch
-        self._lock = threading.Lock()
+    def __init__(self, part: RunPart, *, watch: Watch) -> None:
+        self.part = part
+        self._watch = watch
+        self._lock = threading.RLock()
         self._rows: list[Prediction] = []
-        self._written = time.monotonic()
+        self._counts: dict[str, int] = {}
+        self._messages: dict[str, str] = {}
+        self._cpu_s = 0.0
+        self._askers: dict[int, tuple[Worker | Oracle, Reply]] = {}
+        self._is_open = False
 
-    def add(self, prediction: Prediction) -> None:
-        """Take a row."""
+    def begin(self) -> None:
+        """Take rows from here on."""
+        self._watch.begin(self.part)
+        self._is_open = True
+
+    def told_by(self, worker: Worker | Oracle, ready: Reply) -> None:
+        """Take note of who answers, and of what came of the map there."""
+        with self._lock:
+            self._askers[id(worker)] = (worker, ready)
+
+    def add(self, prediction: Prediction, *, cpu_s: float = 0.0) -> None:
+        """Take a row; with the last one the task is at its end."""
         with self._lock:
             self._rows.append(prediction)
-            self.counts[prediction.status] = self.counts.get(prediction.status, 0) + 1
+            self._cpu_s += cpu_s
+            self._counts[prediction.status] = self._counts.get(prediction.status, 0) + 1
             if prediction.message:
-                self.messages.setdefault(prediction.status, prediction.message)
-            if len(self._rows) >= PART_ROWS or time.monotonic() - self._written > PART_S:
-                self._write()
-            self._watch(1)
+                self._messages.setdefault(prediction.status, prediction.message)
+            if len(self._rows) >= PART_ROWS:
+                self.flush()
+            self._watch.advance(self.part)
+            if sum(self._counts.values()) == len(self.part.left):
+                self.end()
 
     def flush(self) -> None:
-        """Write what is left."""
+        """Write what there is."""
         with self._lock:
-            self._write()
+            if self._rows:
+                rundir.write_part(self.part.folder, self._rows)
+            self._rows = []
 
-    def _write(self) -> None:
-        if self._rows:
-            rundir.write_part(self._folder, self._rows)
-        self._rows = []
-        self._written = time.monotonic()
+    def end(self) -> None:
+        """Write what is left and say what it took; a second time, or where nothing was begun, nothing."""
+        with self._lock:
+            self.flush()
+            if self._is_open:
+                self._is_open = False
+                self._watch.end(self.part, self.cost)
+
+    @property
+    def cost(self) -> Cost:
+        """What the rows have taken so far, and the processes they come from."""
+        with self._lock:
+            own = Cost(counts=dict(self._counts), cpu_s=self._cpu_s, messages=dict(self._messages))
+            return pool_costs([own, *(_process_cost(*asker) for asker in self._askers.values())])
+
+
+def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
+    """What a process has told of its map and of itself."""
+    return Cost(
+        prepare_s=ready.seconds,
+        index_bytes=ready.grown_bytes,
+        peak_bytes=worker.peak_bytes,
+        isolation=dict(worker.isolation)
+        or dict.fromkeys(("files", "truth", "network", "processes"), "trusted code, not shut in"),
+    )

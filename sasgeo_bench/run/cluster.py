@@ -4,10 +4,11 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.run.answers import Cost, answer
+from sasgeo_bench.run.answers import Cost, Watch, answer
 from sasgeo_bench.run.plan import RunPart, RunPlan
 from sasgeo_bench.store import rundir
 
@@ -115,5 +116,5 @@ def _chunks(ids: Sequence[str], threads: int) -> Iterator[tuple[str, ...]]:
 def _answer_chunk(plan: RunPlan, part: RunPart, ids: Sequence[str]) -> Cost:
     """Ask one chunk in the process of a dask worker; what an earlier try of it has written is not asked again."""
     done = rundir.ids_done(part.folder, again=plan.request.again) if part.folder.is_dir() else set()
-    left = [name for name in ids if name not in done]
-    return answer(plan, part, left, jobs=1, watch=lambda _: None)
+    left = tuple(name for name in ids if name not in done)
+    return answer(plan, [replace(part, left=left)], jobs=1, watch=Watch())

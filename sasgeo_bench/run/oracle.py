@@ -39,7 +39,6 @@ class Oracle:
     def __init__(self, truth_folder: Path) -> None:
         self.isolation = dict(_ISOLATION)
         self.peak_bytes = 0
-        self.cpu_s = 0.0
         self._folder = truth_folder
         self._truths: dict[str, Truth] = {}
 

@@ -159,11 +159,25 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str]:
 
 
 def reach_of(request: RunRequest, region: Path | None) -> Reach:
-    """The map may be read; truths, and whatever other runs wrote, may not."""
+    """The map may be read; other maps, truths, and whatever other runs wrote, may not."""
     roots = {folder.resolve().parent.parent.parent for folder in request.tasks} | {request.out.resolve()}
     hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards")]
     readable = [] if region is None else [region.resolve()]
+    # Other dates of a place, and the map that a twin was edited from, would give the world away.
+    maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
+    hidden += [path for path in maps if path not in readable]
     return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
+
+
+def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
+    """Tasks in groups that one process may answer: those on the same map, and no other date or edit of its place.
+
+    The control that is given the truth is given that of one task at a time.
+    """
+    groups: dict[Path, list[RunPart]] = {}
+    for part in parts:
+        groups.setdefault(part.truth if spec == ORACLE else part.region.resolve(), []).append(part)
+    return list(groups.values())
 
 
 def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about: dict[str, Any]) -> RunPart:

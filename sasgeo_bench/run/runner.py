@@ -1,27 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """A matcher over tasks: whatever happens, a row for every query, and a run that goes on where it was cut off."""
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.run.answers import Cost, answer, pool_costs
+from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
-from sasgeo_bench.run.plan import RunPart, RunPlan
+from sasgeo_bench.run.plan import RunPart, RunPlan, by_map
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import locked
 
 TOLD_S: Final = 10.0
+MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
 
 Tell = Callable[[str], None]
 
 
 class Progress(Protocol):
-    """Whoever shows how far a run is."""
+    """Whoever shows how far a run is; is called by one thread at a time."""
 
     def begin(self, label: str, total: int) -> None:
         """Begin a task of so many queries."""
@@ -104,21 +106,61 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
     if plan.request.dask is not None and parts:
         costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
     else:
-        costs += [_run_here(plan, part, tell, progress) for part in parts]
+        costs += _run_here(plan, parts, tell, progress)
     pooled = pool_costs(costs)
     folders = tuple(part.folder for part in plan.parts)
     return RunReport(counts=pooled.counts, messages=pooled.messages, folders=folders)
 
 
-def _run_here(plan: RunPlan, part: RunPart, tell: Tell, progress: Progress) -> Cost:
-    """Ask the queries of one task on this machine."""
-    label = str(part.folder)
-    with locked(part.folder, tell=tell):
-        before = _begin(plan, part, progress)
-        jobs = plan.request.jobs
-        cost = answer(plan, part, part.left, jobs=jobs, watch=lambda count: progress.advance(label, count))
-        _say(plan, part, cost, before)
-    return cost
+def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
+    """Ask the queries of all tasks on this machine."""
+    costs = []
+    for batch in _batches(by_map(plan.request.spec, parts)):
+        with ExitStack() as locks:
+            _lock(locks, batch, tell)
+            costs.append(answer(plan, batch, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
+    return costs
+
+
+def _batches(groups: Sequence[Sequence[RunPart]]) -> Iterator[list[RunPart]]:
+    """Tasks that are locked together: those of some maps, never of half a one."""
+    batch: list[RunPart] = []
+    for group in groups:
+        if batch and len(batch) + len(group) > MOST_LOCKED:
+            yield batch
+            batch = []
+        batch += group
+    if batch:
+        yield batch
+
+
+def _lock(locks: ExitStack, parts: Sequence[RunPart], tell: Tell) -> None:
+    """Hold the folders of some tasks; all runs lock them in one order, so that no two wait for each other."""
+    for folder in sorted({part.folder for part in parts}):
+        locks.enter_context(locked(folder, tell=tell))
+
+
+class _Notes(Watch):
+    """Keeps `run.json` of each task, and tells of each row; progress is told by one thread at a time."""
+
+    def __init__(self, plan: RunPlan, progress: Progress) -> None:
+        self._plan, self._progress = plan, progress
+        self._lock = threading.Lock()
+        self._before: dict[Path, Cost] = {}
+
+    def begin(self, part: RunPart) -> None:
+        """Say that a task begins."""
+        with self._lock:
+            self._before[part.folder] = _begin(self._plan, part, self._progress)
+
+    def advance(self, part: RunPart) -> None:
+        """Tell of a row."""
+        with self._lock:
+            self._progress.advance(str(part.folder), 1)
+
+    def end(self, part: RunPart, cost: Cost) -> None:
+        """Write what it took."""
+        _say(self._plan, part, cost, self._before[part.folder])
 
 
 def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
@@ -127,8 +169,7 @@ def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tel
     left = [len(part.left) for part in parts]
     with ExitStack() as locks:
         client = locks.enter_context(connected(address))
-        for part in parts:
-            locks.enter_context(locked(part.folder, tell=tell))
+        _lock(locks, parts, tell)
         before = [_begin(plan, part, progress) for part in parts]
         for number, count, cost in answer_on(client, plan, parts):
             costs[number].append(cost)

@@ -95,7 +95,6 @@ class Worker:
     limits: Limits
     isolation: dict[str, str] = field(default_factory=dict)
     peak_bytes: int = 0
-    cpu_s: float = 0.0
     starts: int = 0
     _process: subprocess.Popen[bytes] | None = None
     _channel: socket.socket | None = None
@@ -132,7 +131,6 @@ class Worker:
             if again.status != "ok":
                 return again
         reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
-        self.cpu_s += reply.cpu_s
         if reply.status in {"timeout", "crash"} and self._is_gone():
             self.end()
         return reply

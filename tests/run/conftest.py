@@ -17,7 +17,7 @@ def made(tmp_path_factory):
     """A folder with out/ and hostile.py in it."""
     root = tmp_path_factory.mktemp("run")
     wanted = Wanted(
-        suites=("false-unknown",),
+        suites=("false-unknown", "clean"),
         regions=(TOWN,),
         split="crossfit",
         count=3,

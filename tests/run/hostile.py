@@ -41,6 +41,60 @@ class Slow(Plain):
         return super().match(query, top_k=top_k)
 
 
+class TellsProcess(Plain):
+    """Says which process it is in, how many maps that has prepared, and how many maps it can read."""
+
+    def __init__(self):
+        self.token, self.maps = float(int.from_bytes(os.urandom(6), "big")), 0
+
+    def prepare(self, region, training):
+        self.maps += 1
+        self.readable = 0
+        for name in ("town-riverside", "town-copy"):
+            try:
+                (Path(__file__).parent / "out" / "regions" / name / "region.json").read_bytes()
+            except OSError:
+                continue
+            self.readable += 1
+
+    def match(self, query, *, top_k):
+        told = {"process": self.token, "maps": float(self.maps), "readable maps": float(self.readable)}
+        return Match(poses=(), scores=(), diagnostics=told)
+
+
+class Works(Plain):
+    """Takes 0.2 s of a processor for each query."""
+
+    def match(self, query, *, top_k):
+        begun = time.process_time()
+        while time.process_time() - begun < 0.2:
+            pass
+        return super().match(query, top_k=top_k)
+
+
+class ExitsOnce(TellsProcess):
+    """Leaves its process at the third question, which is the second query: the first was asked twice."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = 0
+
+    def match(self, query, *, top_k):
+        self.asked += 1
+        if self.asked == 3:
+            os._exit(3)
+        return super().match(query, top_k=top_k)
+
+
+class HangsLater(ExitsOnce):
+    """Does not come back from its third question."""
+
+    def match(self, query, *, top_k):
+        if self.asked == 2:
+            time.sleep(1000)
+        return super().match(query, top_k=top_k)
+
+
 class Hangs(Plain):
     def match(self, query, *, top_k):
         while True:

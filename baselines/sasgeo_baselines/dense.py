@@ -4,18 +4,18 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.view import NOWHERE, Patch, Samples, View
-from sasgeo_baselines.voting import transform, transform_window, vote_spectra
+from sasgeo_baselines.voting import ByPlanes, ByRows
 from sasgeo_bench.pose import Pose, Prior
 
+_FEW: Final = 32  # places a side: more cost less by transforms of planes
 _TILE: Final = 256  # places a side that are searched at once; larger ones take more memory and save no time
 _SPREAD: Final = 2.0  # standard deviations of heading and scale that are searched
 _MARGIN_M: Final = 12.0  # how far a mode may move while it is refined
@@ -102,17 +102,18 @@ class Disc:
 
     def has(self, pose: Pose) -> bool:
         """Whether a pose lies within."""
-        return bool(self.holds(np.array([(pose.easting_m, pose.northing_m)]))[0])
+        return self.center_m is None or math.dist((pose.easting_m, pose.northing_m), self.center_m) <= self.radius_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Tile:
-    """A square of places, row by row, and the transformed map under all views from there.
+    """A square of places, row by row, and the map under all views from there.
 
-    `points_m` has shape (n * n, 2); `allowed`, of shape (n * n,), is False for places outside of what is searched.
+    `layers` has shape (B + 1, side, side), `points_m` (n * n, 2); `allowed`, of shape (n * n,), is False for places
+    outside of what is searched.
     """
 
-    window: NDArray[np.complexfloating]
+    layers: NDArray[np.float32]
     points_m: NDArray[np.float64]
     allowed: NDArray[np.bool_]
 
@@ -134,13 +135,28 @@ def turns(prior: Prior, plan: Plan) -> tuple[Pose, ...]:
     >>> [pose.yaw_deg for pose in turns(known, Plan())]
     [354.0, 357.0, 0.0, 3.0, 6.0]
     """
-    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or _SPREAD * prior.yaw_sigma_deg >= 180:  # noqa: PLR2004
-        count = math.ceil(360 / plan.yaw_step_deg)
-        yaws = [360 * index / count for index in range(count)]
-    else:
-        yaws = [prior.yaw_deg + offset for offset in _steps(_SPREAD * prior.yaw_sigma_deg, plan.yaw_step_deg)]
     scales = [1 + offset for offset in _steps(min(_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
-    return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws)
+    yaws_deg = _yaws_deg(prior, plan)
+    return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)
+
+
+def is_any_heading(prior: Prior) -> bool:
+    """Whether all headings are to be tried.
+
+    Examples
+    --------
+    >>> is_any_heading(Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=60.0, scale_sigma=0.0))
+    False
+    """
+    return prior.yaw_sigma_deg is None or _SPREAD * prior.yaw_sigma_deg >= 180  # noqa: PLR2004
+
+
+def _yaws_deg(prior: Prior, plan: Plan) -> list[float]:
+    """Headings to be tried; where all are, each has three others at right angles."""
+    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or is_any_heading(prior):
+        count = 4 * math.ceil(90 / plan.yaw_step_deg)
+        return [360 * index / count for index in range(count)]
+    return [prior.yaw_deg + offset for offset in _steps(_SPREAD * prior.yaw_sigma_deg, plan.yaw_step_deg)]
 
 
 def _steps(reach: float, step: float) -> list[float]:
@@ -262,8 +278,7 @@ class Search:
         points_m = self.chart.grid.window(row, col, count * factor, count * factor).coarsen(factor).to_centres_m(cells)
         west_m, south_m, east_m, north_m = self.chart.grid.bounds_m
         on_map = (points_m >= (west_m, south_m)).all(axis=1) & (points_m <= (east_m, north_m)).all(axis=1)
-        size = _transform_size(side)
-        return _Tile(window=transform_window(layers, size), points_m=points_m, allowed=disc.holds(points_m) & on_map)
+        return _Tile(layers=layers, points_m=points_m, allowed=disc.holds(points_m) & on_map)
 
     # Coarse
 
@@ -273,28 +288,43 @@ class Search:
 
     def _vote(self, tiles: Sequence[_Tile], factor: int) -> list[_Votes]:
         """Best score and turn for every place of every tile; each template is transformed once for all tiles."""
-        step_m = factor * self.chart.grid.cell_size_m
-        half, blurred = self._half(factor), self.view.blurred(step_m)
         votes = [
             _Votes(score=np.full(len(tile.points_m), NOWHERE), turn=np.zeros(len(tile.points_m), dtype=np.int64))
             for tile in tiles
         ]
-        for index, turn in enumerate(self._turns if tiles else ()):
-            template = self.view.turned(blurred, turn, half=half, step_m=step_m)
-            known = float(template[-1].sum(dtype=np.float64))
-            if known <= 0:
-                continue
-            size = _transform_size(math.isqrt(len(tiles[0].points_m)) + 2 * half)
-            spectrum = transform(template, size)
-            for tile, best in zip(tiles, votes, strict=True):
-                side = math.isqrt(len(tile.points_m))
-                total, counted = (part[:side, :side].ravel() for part in vote_spectra(tile.window, spectrum, size))
-                enough = tile.allowed & (counted >= self.plan.least_overlap * known)
-                score = np.where(enough, total / np.where(enough, counted, 1.0), NOWHERE)
-                better = score > best.score
+        if not tiles:
+            return votes
+        step_m = factor * self.chart.grid.cell_size_m
+        half, blurred = self._half(factor), self.view.blurred(step_m)
+        places = math.isqrt(len(tiles[0].points_m))
+        how = (ByRows if places <= _FEW else ByPlanes)(places=places, high=2 * half + 1)
+        # Headings at right angles share a template where all are tried; many large windows would take too much memory.
+        quarters = 4 if is_any_heading(self.prior) and (places <= _FEW or len(tiles) == 1) else 1
+        windows = [how.window(_turned_back(tile.layers, quarters)) for tile in tiles]
+        for some in self._batches(quarters, how.at_once(len(blurred))):
+            templates = np.stack(
+                [self.view.turned(blurred, self._turns[at], half=half, step_m=step_m) for at in some[:, 0]]
+            )
+            known = templates[:, -1].sum(axis=(1, 2), dtype=np.float64)
+            least = np.where(known > 0, self.plan.least_overlap * known, math.inf)[:, None, None, None]
+            spectrum = how.templates(templates)
+            for tile, window, best in zip(tiles, windows, votes, strict=True):
+                total, counted = how.votes(window, spectrum)
+                score = np.divide(total, counted, out=np.full_like(total, NOWHERE), where=counted >= least)
+                score = np.stack([np.rot90(part, -k, (1, 2)) for k, part in enumerate(score.swapaxes(0, 1))], axis=1)
+                score = score.reshape(some.size, -1)
+                at = score.argmax(axis=0)
+                score = score[at, np.arange(len(at))]
+                better = tile.allowed & (score > best.score)
                 best.score[better] = score[better]
-                best.turn[better] = index
+                best.turn[better] = some.ravel()[at[better]]
         return votes
+
+    def _batches(self, quarters: int, at_once: int) -> list[NDArray[np.int64]]:
+        """Indices of turns, shape (some, quarters): each with those that are right angles from it."""
+        index = np.arange(len(self._turns)).reshape(-1, quarters, len(_yaws_deg(self.prior, self.plan)) // quarters)
+        together = index.transpose(0, 2, 1).reshape(-1, quarters)
+        return np.split(together, range(at_once, len(together), at_once))
 
     def _best(self, tile: _Tile, votes: _Votes) -> Mode | None:
         """Best place of a tile, if there is any."""
@@ -309,13 +339,15 @@ class Search:
     def _peaks(self, votes: _Votes, points_m: NDArray[np.float64], *, most: int) -> list[Mode]:
         """Best modes, none nearer to a better one than `apart_m`."""
         left = votes.score.copy()
+        easting_m, northing_m = points_m.T.copy()
         found: list[Mode] = []
         while len(found) < min(most, len(left)):
             at = int(np.argmax(left))
             if not left[at] > NOWHERE:
                 break
             found.append(self._mode(points_m[at], votes, at))
-            left[np.hypot(*(points_m - points_m[at]).T) < self.plan.apart_m] = NOWHERE
+            away_m2 = (easting_m - easting_m[at]) ** 2 + (northing_m - northing_m[at]) ** 2
+            left[away_m2 < self.plan.apart_m**2] = NOWHERE
         return found
 
     # Fine
@@ -360,8 +392,9 @@ class Search:
         low, high = self._turns[0].scale - _WIDEN, self._turns[-1].scale + _WIDEN
         near = Disc(center_m=(mode.pose.easting_m, mode.pose.northing_m), radius_m=_MARGIN_M)
 
+        @cache
         def score_of(pose: Pose) -> float:
-            """Score a pose of the mode's neighbourhood; NOWHERE beyond it."""
+            """Score a pose of the mode's neighbourhood, NOWHERE beyond it; the climb comes by some poses twice."""
             if not (low <= pose.scale <= high and near.has(pose) and disc.has(pose)):
                 return NOWHERE
             return patch.score(level.samples, pose, least_overlap=self.plan.least_overlap)
@@ -370,6 +403,11 @@ class Search:
         for halving in range(level.halvings):
             best = _climb(best, score_of, tuple(step / 2**halving for step in level.steps))
         return best
+
+
+def _turned_back(layers: NDArray[np.float32], quarters: int) -> NDArray[np.float32]:
+    """Squares turned counter-clockwise by 0, 1, .. right angles, for a template that is to be turned clockwise."""
+    return np.stack([np.rot90(layers, k, (1, 2)) for k in range(quarters)])
 
 
 def _joined(tiles: Sequence[_Tile], parts: Sequence[_Votes]) -> tuple[_Votes, NDArray[np.float64]]:
@@ -411,11 +449,6 @@ def _climb(best: Mode, score_of: Callable[[Pose], float], steps: Sequence[float]
         if best is before:
             break
     return best
-
-
-def _transform_size(side: int) -> tuple[int, int]:
-    size = fft.next_fast_len(side, real=True)
-    return size, size
 
 
 def ranked(modes: Iterable[Mode]) -> list[Mode]:

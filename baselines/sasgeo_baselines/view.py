@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Self
+from typing import Final, Self
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose, inverse
 
 NOWHERE = -math.inf  # the score of a pose that shows too little of the map
+_AT_ONCE: Final = 16384  # samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +71,12 @@ class View:
         zeros = np.zeros(1, dtype=np.int64)
         up_m = self.grid.to_centres_m(np.column_stack((rows, zeros.repeat(len(rows)))))[:, 1]
         right_m = self.grid.to_centres_m(np.column_stack((zeros.repeat(len(cols)), cols)))[:, 0]
-        chosen = template[:, first::stride, first::stride].reshape(len(template), -1)
+        chosen = template[:, first::stride, first::stride]
         counts = np.ascontiguousarray(chosen[-1])
         return Samples(
             up_m=up_m,
             right_m=right_m,
-            weights=np.ascontiguousarray(chosen[:-1].T),
+            weights=_interleaved(chosen[:-1]),
             counts=counts,
             known=float(counts.sum(dtype=np.float64)),
         )
@@ -83,7 +84,10 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """Cells of a template: offsets from the middle of the view, weights of shape (n, B + 1), classes known in each."""
+    """Cells of a template: offsets from the middle of the view, weights, and how many classes are known in each.
+
+    `weights` are interleaved as the cells of a `Patch` are, `counts` has their first two axes.
+    """
 
     up_m: NDArray[np.float64]
     right_m: NDArray[np.float64]
@@ -94,9 +98,10 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True)
 class Patch:
-    """A square of the map, cell after cell: `cells` has shape (rows * cols, B + 1)."""
+    """A square of the map, cell after cell: `cells` has shape (rows * cols, bands), `known_band` is that of knowing."""
 
     cells: NDArray[np.float32]
+    known_band: int
     grid: Grid
 
     @classmethod
@@ -114,7 +119,8 @@ class Patch:
         if factor > 1:
             square = np.stack([cv2.blur(band, (3, 3)) for band in square])
         grid = chart.grid.window(row - back, col - back, side * factor, side * factor).coarsen(factor)
-        return cls(cells=np.ascontiguousarray(square.reshape(len(square), -1).T), grid=grid)
+        cells = _interleaved(square)
+        return cls(cells=cells.reshape(-1, cells.shape[-1]), known_band=len(bands), grid=grid)
 
     def score(self, samples: Samples, pose: Pose, *, least_overlap: float) -> float:
         """Score a pose on this square by the samples of a view: Eq. (8) over the number of known cells.
@@ -125,9 +131,28 @@ class Patch:
         corners = pose.to_map(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
         middle, right, up = self.grid.to_uv(corners)
         along, across = np.outer(up - middle, samples.up_m), np.outer(right - middle, samples.right_m)
-        cols, rows = np.floor((middle[:, None] + along)[:, :, None] + across[:, None, :]).astype(np.int64)
-        found = self.cells.take((rows * self.grid.cols + cols).ravel(), axis=0)
-        counted = float(np.einsum("i,i->", found[:, -1], samples.counts))
-        if counted < max(least_overlap * samples.known, 1.0 / len(samples.counts)):
+        along += middle[:, None]
+        total = counted = 0.0
+        for rows in _blocks(*samples.counts.shape):
+            # Nothing lies left of the square or above it, so to cut off is to round down.
+            col, row = (along[:, rows, None] + across[:, None, :]).astype(np.int32)
+            found = self.cells.take(row * self.grid.cols + col, axis=0)
+            total += float(np.vdot(found, samples.weights[rows]))
+            counted += float(np.vdot(found[..., self.known_band], samples.counts[rows]))
+        if counted < max(least_overlap * samples.known, 1.0 / samples.counts.size):
             return NOWHERE
-        return float(np.einsum("ij,ij->", found, samples.weights)) / counted
+        return total / counted
+
+
+def _blocks(rows: int, cols: int) -> list[slice]:
+    """Rows of a view, as many at a time as stay in the cache while they are looked up."""
+    step = max(1, _AT_ONCE // cols)
+    return [slice(start, start + step) for start in range(0, rows, step)]
+
+
+def _interleaved(bands: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cell by cell, shape (rows, cols, B'): with bands of zeros up to a power of two, which NumPy looks up faster."""
+    shape = bands.shape[1:]
+    spare = (1 << (len(bands) - 1).bit_length()) - len(bands)
+    merged = cv2.merge([*bands, *([np.zeros(shape, dtype=np.float32)] * spare)])
+    return np.asarray(merged, dtype=np.float32).reshape(*shape, -1)

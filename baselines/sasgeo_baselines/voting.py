@@ -2,7 +2,7 @@
 """The three-state score of a view on a map (Eqs. 7-8 of the SASGeo paper): cell by cell, and for all shifts by FFT."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,9 @@ from scipy import fft
 
 from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN
 
-_HALF_A_CELL: float = 0.5  # a count that is whole is at least 1 or at most 0, whatever the transform rounds
+_HALF_A_CELL: Final = 0.5  # a count that is whole is at least 1 or at most 0, whatever the transform rounds
+
+_MOST_VALUES: Final = 4_000_000  # of transformed templates at a time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +171,7 @@ class Spectrum:
 def transform(template: NDArray[np.floating], size: tuple[int, int]) -> Spectrum:
     """Transform a template, padded with zeros; a half of the rows that are all zeros is never computed."""
     bands = fft.fft(fft.rfft(template, n=size[1], axis=-1), n=size[0], axis=-2)
-    return Spectrum(score=bands[:-1], counts=bands[-1])
+    return Spectrum(score=bands[..., :-1, :, :], counts=bands[..., -1, :, :])
 
 
 def transform_window(layers: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.complexfloating]:
@@ -188,3 +190,87 @@ def vote_spectra(
     total = fft.irfft2(np.conj((window * template.score).sum(axis=0)), s=size)
     counted = fft.irfft2(np.conj(window[-1] * template.counts), s=size)
     return total, counted
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ByPlanes:
+    """Votes for templates of `high` cells a side at `places` shifts a side, by transforms of whole squares.
+
+    Templates have shape (T, B + 2, high, high), windows (Q, B + 1, side, side), where side = places + high - 1.
+    """
+
+    places: int
+    high: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of a transform."""
+        side = fft.next_fast_len(self.places + self.high - 1, real=True)
+        return side, side
+
+    def at_once(self, bands: int) -> int:
+        """How many templates are to be made ready together."""
+        del bands
+        return 1
+
+    def window(self, layers: NDArray[np.floating]) -> NDArray[np.complexfloating]:
+        """Make some squares of the map ready, once for all templates."""
+        return transform_window(layers, self.size)
+
+    def templates(self, templates: NDArray[np.floating]) -> Spectrum:
+        """Make some templates ready, once for all windows."""
+        return transform(templates, self.size)
+
+    def votes(
+        self, window: NDArray[np.complexfloating], templates: Spectrum
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Sum of gains and number of known cells, shape (T, Q, places, places) each."""
+        shape = (len(templates.score), len(window), self.places, self.places)
+        total, counted = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        for at, square in np.ndindex(shape[:2]):
+            template = Spectrum(score=templates.score[at], counts=templates.counts[at])
+            pair = vote_spectra(window[square], template, self.size)
+            total[at, square], counted[at, square] = (part[: self.places, : self.places] for part in pair)
+        return total, counted
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ByRows:
+    """The same as `ByPlanes` by transforms of rows alone: what few places cost less by.
+
+    All rows of a template at all places they may have are one matrix product for each frequency.
+    """
+
+    places: int
+    high: int
+
+    @property
+    def size(self) -> int:
+        """Columns of a transform."""
+        return int(fft.next_fast_len(self.places + self.high - 1, real=True))
+
+    def at_once(self, bands: int) -> int:
+        """How many templates are to be made ready together: as many as stay small."""
+        return max(1, _MOST_VALUES // (bands * self.high * self.size))
+
+    def window(self, layers: NDArray[np.floating]) -> NDArray[np.complexfloating]:
+        """Make some squares of the map ready, once for all templates."""
+        return np.asarray(fft.rfft(layers, n=self.size, axis=-1))
+
+    def templates(self, templates: NDArray[np.floating]) -> Spectrum:
+        """Rows of some templates, conjugated, shapes (frequencies, (B + 1) * high, T) and (frequencies, high, T)."""
+        rows = np.conj(fft.rfft(templates, n=self.size, axis=-1).transpose(3, 1, 2, 0), order="C")
+        rows = rows.reshape(len(rows), -1, len(templates))
+        return Spectrum(score=rows[:, : -self.high], counts=rows[:, -self.high :])
+
+    def votes(
+        self, window: NDArray[np.complexfloating], templates: Spectrum
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Sum of gains and number of known cells, shape (T, Q, places, places) each."""
+        # What lies under a template at each row: frequencies first, then Q * places, then (B + 1) * high.
+        under = np.lib.stride_tricks.sliding_window_view(window, self.high, axis=2).transpose(3, 0, 2, 1, 4)
+        under = under.reshape(len(under), len(window) * self.places, -1)
+        products = (under @ templates.score, under[:, :, -self.high :] @ templates.counts)
+        total, counted = (fft.irfft(product, n=self.size, axis=0)[: self.places] for product in products)
+        shape = (self.places, -1, self.places, total.shape[-1])
+        return total.reshape(shape).transpose(3, 1, 2, 0), counted.reshape(shape).transpose(3, 1, 2, 0)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sasgeo_baselines.dense import Disc, Plan, turns
+from sasgeo_baselines import dense
+from sasgeo_baselines.dense import Disc, Plan, Search, turns
 from sasgeo_baselines.fft_vote import FftVote
 from sasgeo_baselines.full_unknown import FullUnknown
 from sasgeo_baselines.raster_graph import RasterGraph
@@ -120,6 +121,24 @@ def test_a_view_is_found_without_any_prior_and_on_cells_of_another_size(made) ->
     query = made.query_of(made.view_of(region, pose, size_cells=128), nothing)
     best = check_match(matcher.match(query, top_k=1), query, top_k=1).poses[0]
     assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 1.0
+
+
+@pytest.mark.parametrize("candidates", [(), SOME])
+def test_headings_at_right_angles_may_share_a_template(made, monkeypatch, candidates) -> None:
+    region = made.region_of(made.textured(1))
+    matcher = FftVote(Plan(yaw_step_deg=10.0))
+    matcher.prepare(region, None)
+    prior = prior_near(SOME[1], sigma_deg=None)
+    query = made.query_of(made.view_of(region, SOME[1], size_cells=96), prior, candidates=candidates)
+    shared = matcher.match(query, top_k=3)
+    batches = Search._batches
+    monkeypatch.setattr(dense, "_turned_back", lambda layers, _: layers[None])
+    monkeypatch.setattr(Search, "_batches", lambda self, _, at_once: batches(self, 1, at_once))
+    alone = matcher.match(query, top_k=3)
+    assert shared.poses == alone.poses
+    assert shared.scores == pytest.approx(alone.scores, abs=1e-6)
+    # Cells on an edge, as many are at heading 0, go either way by rounding.
+    assert shared.diagnostics == pytest.approx(alone.diagnostics, rel=1e-3)
 
 
 def test_a_view_that_reaches_beyond_the_map_is_found(made) -> None:

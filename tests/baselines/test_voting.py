@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sasgeo_baselines.chart import Chart, fade
 from sasgeo_baselines.view import Patch, View
-from sasgeo_baselines.voting import Gains, make_template, score_cells, vote, vote_directly
+from sasgeo_baselines.voting import ByPlanes, ByRows, Gains, make_template, score_cells, vote, vote_directly
 
 from sasgeo_bench.evidence import UNKNOWN, LayerBits, observe
 from sasgeo_bench.pose import Pose
@@ -26,6 +26,26 @@ GAINS = st.builds(Gains, agree=POSITIVE, extra=POSITIVE, missed=POSITIVE)
 def test_the_sum_by_fft_is_the_sum_cell_by_cell(seen, mapped, unknown, gains) -> None:
     mapped = np.where(unknown, UNKNOWN, mapped).astype(np.uint8)
     np.testing.assert_allclose(vote(seen, mapped, gains), vote_directly(seen, mapped, gains), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("how", [ByPlanes, ByRows])
+@given(
+    seen=arrays(np.uint8, (2, 3, 5, 5), elements=st.integers(0, 2)),
+    mapped=arrays(np.uint8, (2, 3, 8, 8), elements=st.integers(0, 1)),
+    unknown=arrays(np.bool_, (2, 8, 8)),
+    gains=GAINS,
+)
+def test_templates_and_windows_together_vote_as_each_pair_does(how, seen, mapped, unknown, gains) -> None:
+    known = ~unknown[:, None]
+    layers = np.concatenate((mapped * known, known), axis=1).astype(np.float32)
+    templates = np.stack([make_template(view, gains) for view in seen]).astype(np.float32)
+    votes = how(places=4, high=5)
+    total, counted = votes.votes(votes.window(layers), votes.templates(templates))
+    for view, square in np.ndindex(2, 2):
+        cells = np.where(unknown[square], UNKNOWN, mapped[square]).astype(np.uint8)
+        expected = vote_directly(seen[view], cells, gains)[4:8, 4:8]
+        found = np.where(counted[view, square] > 0.5, total[view, square] / np.maximum(counted[view, square], 1.0), 0.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_view_of_two_cells_scores_as_worked_by_hand() -> None:

@@ -67,7 +67,11 @@ class Chart:
 
         The result has shape (bands + 1, size, size); its first cell is (row, col) of the map.
         """
-        return np.stack([self._cut(layer, row, col, size) for layer in self._layers(bands)])
+        return np.divide(self.steps(row, col, size, bands), np.float32(FULL), dtype=np.float32)
+
+    def steps(self, row: int, col: int, size: int, bands: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Read a `square` as it is kept, in steps of 1 / `FULL`."""
+        return np.stack([_window(layer, row, col, size) for layer in self._layers(bands)])
 
     def pooled(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
         """Mean degrees over blocks of `factor` cells a side, shape (bands + 1, size, size)."""

@@ -298,8 +298,7 @@ class Search:
         half, blurred = self._half(factor), self.view.blurred(step_m)
         places = math.isqrt(len(tiles[0].points_m))
         how = (ByRows if places <= _FEW else ByPlanes)(places=places, high=2 * half + 1)
-        # Headings at right angles share a template where all are tried; many large windows would take too much memory.
-        quarters = 4 if is_any_heading(self.prior) and (places <= _FEW or len(tiles) == 1) else 1
+        quarters = self._quarters(places, len(tiles))
         windows = [how.window(_turned_back(tile.layers, quarters)) for tile in tiles]
         for some in self._batches(quarters, how.at_once(len(blurred))):
             templates = np.stack(
@@ -311,14 +310,18 @@ class Search:
             for tile, window, best in zip(tiles, windows, votes, strict=True):
                 total, counted = how.votes(window, spectrum)
                 score = np.divide(total, counted, out=np.full_like(total, NOWHERE), where=counted >= least)
-                score = np.stack([np.rot90(part, -k, (1, 2)) for k, part in enumerate(score.swapaxes(0, 1))], axis=1)
+                for k in range(1, quarters):
+                    score[:, k] = np.rot90(score[:, k], -k, (1, 2))
                 score = score.reshape(some.size, -1)
-                at = score.argmax(axis=0)
-                score = score[at, np.arange(len(at))]
-                better = tile.allowed & (score > best.score)
-                best.score[better] = score[better]
-                best.turn[better] = some.ravel()[at[better]]
+                highest = score.max(axis=0)
+                better = tile.allowed & (highest > best.score)
+                best.score[better] = highest[better]
+                best.turn[better] = some.ravel()[score[:, better].argmax(axis=0)]
         return votes
+
+    def _quarters(self, places: int, tiles: int) -> int:
+        """How many headings at right angles share a template: 4 where all are tried and windows take little memory."""
+        return 4 if is_any_heading(self.prior) and (places <= _FEW or tiles == 1) else 1
 
     def _batches(self, quarters: int, at_once: int) -> list[NDArray[np.int64]]:
         """Indices of turns, shape (some, quarters): each with those that are right angles from it."""

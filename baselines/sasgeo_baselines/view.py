@@ -3,19 +3,21 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, Self, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.chart import Chart
+from sasgeo_baselines.chart import FULL, Chart
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose, inverse
 
 NOWHERE = -math.inf  # the score of a pose that shows too little of the map
 _AT_ONCE: Final = 16384  # samples
+
+Number = TypeVar("Number", np.float32, np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +56,16 @@ class View:
         `pose` says heading and scale; its place is not looked at.
         """
         side = 2 * half + 1
-        steps = np.arange(-half, half + 1) * step_m
-        points = np.column_stack((np.tile(steps, side), np.repeat(-steps, side)))
-        here = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=pose.yaw_deg, scale=pose.scale)
-        rows, cols = self.grid.to_cells(inverse(here).to_map(points)).T
-        inside = (rows >= 0) & (rows < self.grid.rows) & (cols >= 0) & (cols < self.grid.cols)
-        at = np.where(inside, rows * self.grid.cols + cols, 0)
+        steps_m, zeros = np.arange(-half, half + 1) * step_m, np.zeros(side)
+        back = inverse(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=pose.yaw_deg, scale=pose.scale))
+        across_m, along_m = (back.to_map(np.column_stack(at)).T for at in ((steps_m, zeros), (zeros, -steps_m)))
+        right_m, up_m = along_m[:, :, None] + across_m[:, None, :]
+        col = (right_m - self.grid.west_m) / self.grid.cell_size_m
+        row = (up_m - self.grid.north_m) / -self.grid.cell_size_m
+        inside = (row >= 0) & (row < self.grid.rows) & (col >= 0) & (col < self.grid.cols)
+        at = np.where(inside, np.floor(row) * self.grid.cols + np.floor(col), 0).astype(np.int64).ravel()
         laid = blurred.reshape(len(blurred), -1).take(at, axis=1)
-        laid *= inside
+        laid *= inside.ravel()
         return laid.reshape(-1, side, side)
 
     def samples(self, template: NDArray[np.float32], *, stride: int) -> "Samples":
@@ -98,9 +102,13 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True)
 class Patch:
-    """A square of the map, cell after cell: `cells` has shape (rows * cols, bands), `known_band` is that of knowing."""
+    """A square of the map, cell after cell: `cells` has shape (rows * cols, bands), `known_band` is that of knowing.
 
-    cells: NDArray[np.float32]
+    They hold `full` where the map has a class for certain: the map's own cells are kept as small as they are.
+    """
+
+    cells: NDArray[np.float32] | NDArray[np.uint8]
+    full: float
     known_band: int
     grid: Grid
 
@@ -115,12 +123,14 @@ class Patch:
         row, col = chart.grid.to_cells(np.array([place_m]))[0].tolist()
         half = math.ceil(half_m / chart.grid.cell_size_m / factor)
         side, back = 2 * half + 1, half * factor + factor // 2
-        square = chart.pooled(row - back, col - back, side, factor, bands)
-        if factor > 1:
-            square = np.stack([cv2.blur(band, (3, 3)) for band in square])
+        cells: NDArray[np.float32] | NDArray[np.uint8]
+        if factor == 1:
+            cells, full = _interleaved(chart.steps(row - back, col - back, side, bands)), float(FULL)
+        else:
+            pooled = chart.pooled(row - back, col - back, side, factor, bands)
+            cells, full = _interleaved(np.stack([cv2.blur(band, (3, 3)) for band in pooled])), 1.0
         grid = chart.grid.window(row - back, col - back, side * factor, side * factor).coarsen(factor)
-        cells = _interleaved(square)
-        return cls(cells=cells.reshape(-1, cells.shape[-1]), known_band=len(bands), grid=grid)
+        return cls(cells=cells.reshape(-1, cells.shape[-1]), full=full, known_band=len(bands), grid=grid)
 
     def score(self, samples: Samples, pose: Pose, *, least_overlap: float) -> float:
         """Score a pose on this square by the samples of a view: Eq. (8) over the number of known cells.
@@ -136,9 +146,10 @@ class Patch:
         for rows in _blocks(*samples.counts.shape):
             # Nothing lies left of the square or above it, so to cut off is to round down.
             col, row = (along[:, rows, None] + across[:, None, :]).astype(np.int32)
-            found = self.cells.take(row * self.grid.cols + col, axis=0)
+            found = self.cells.take(row * self.grid.cols + col, axis=0).astype(np.float32, copy=False)
             total += float(np.vdot(found, samples.weights[rows]))
             counted += float(np.vdot(found[..., self.known_band], samples.counts[rows]))
+        total, counted = total / self.full, counted / self.full
         if counted < max(least_overlap * samples.known, 1.0 / samples.counts.size):
             return NOWHERE
         return total / counted
@@ -150,9 +161,8 @@ def _blocks(rows: int, cols: int) -> list[slice]:
     return [slice(start, start + step) for start in range(0, rows, step)]
 
 
-def _interleaved(bands: NDArray[np.float32]) -> NDArray[np.float32]:
+def _interleaved(bands: NDArray[Number]) -> NDArray[Number]:
     """Cell by cell, shape (rows, cols, B'): with bands of zeros up to a power of two, which NumPy looks up faster."""
-    shape = bands.shape[1:]
-    spare = (1 << (len(bands) - 1).bit_length()) - len(bands)
-    merged = cv2.merge([*bands, *([np.zeros(shape, dtype=np.float32)] * spare)])
-    return np.asarray(merged, dtype=np.float32).reshape(*shape, -1)
+    spare: int = (1 << (len(bands) - 1).bit_length()) - len(bands)
+    merged = cv2.merge([*bands, *np.zeros((spare, *bands.shape[1:]), dtype=bands.dtype)])
+    return np.asarray(merged, dtype=bands.dtype).reshape(*bands.shape[1:], -1)

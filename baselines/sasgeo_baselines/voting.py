@@ -187,9 +187,11 @@ def vote_spectra(
     Entry (i, j) has the template's first cell on the window's cell (i, j); entries where the template would reach
     beyond the window wrap around and mean nothing. One inverse transform each for the sum and for the count.
     """
-    total = fft.irfft2(np.conj((window * template.score).sum(axis=0)), s=size)
-    counted = fft.irfft2(np.conj(window[-1] * template.counts), s=size)
-    return total, counted
+    total = window[0] * template.score[0]
+    for layer, band in zip(window[1:], template.score[1:], strict=True):
+        total += layer * band  # one by one they stay in the cache
+    counted = window[-1] * template.counts
+    return fft.irfft2(np.conj(total, out=total), s=size), fft.irfft2(np.conj(counted, out=counted), s=size)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

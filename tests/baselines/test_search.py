@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sasgeo_baselines import dense
 from sasgeo_baselines.dense import Disc, Plan, Search, turns
 from sasgeo_baselines.fft_vote import FftVote
 from sasgeo_baselines.full_unknown import FullUnknown
@@ -131,9 +130,7 @@ def test_headings_at_right_angles_may_share_a_template(made, monkeypatch, candid
     prior = prior_near(SOME[1], sigma_deg=None)
     query = made.query_of(made.view_of(region, SOME[1], size_cells=96), prior, candidates=candidates)
     shared = matcher.match(query, top_k=3)
-    batches = Search._batches
-    monkeypatch.setattr(dense, "_turned_back", lambda layers, _: layers[None])
-    monkeypatch.setattr(Search, "_batches", lambda self, _, at_once: batches(self, 1, at_once))
+    monkeypatch.setattr(Search, "_quarters", lambda *_: 1)
     alone = matcher.match(query, top_k=3)
     assert shared.poses == alone.poses
     assert shared.scores == pytest.approx(alone.scores, abs=1e-6)

@@ -12,6 +12,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.paper import made_paper_task, make_paper_task
 from sasgeo_bench.paperboard import paper_extra
 from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
+from sasgeo_bench.plugins import check_names
 from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.request import Request, Wanted, plan_requests
@@ -113,7 +114,10 @@ def plan_pipeline(
     ------
     ConfigError
         If a suite, region or split is unknown, or no region can be built here.
+    MatchError
+        If no installed package has a matcher or a rejector of a name.
     """
+    check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
         wanted = Wanted(

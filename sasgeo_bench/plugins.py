@@ -137,16 +137,39 @@ def _from_module(spec: str) -> Callable[[], Any]:
         raise MatchError(message) from error
 
 
-def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
+def _known(name: str, group: str, kind: str) -> EntryPoint:
     points = list_entry_points(group)
     if name not in points:
         near = difflib.get_close_matches(name, points, n=1, cutoff=0.6)
         hint = f", did you mean {near[0]!r}?" if near else ""
         message = f"there is no {kind} {name!r}{hint} (list-{kind}s shows all; or module:Class)"
         raise MatchError(message)
+    return points[name]
+
+
+def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) -> None:
+    """Refuse names that no installed package has; nothing is imported, and module:Class is taken at its word.
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name.
+
+    Examples
+    --------
+    >>> check_names(matchers=["mine:Matcher", "oracle_pose"])
+    """
+    for listed, group, kind in ((matchers, MATCHERS, "matcher"), (rejectors, REJECTORS, "rejector")):
+        for name in listed:
+            if ":" not in name and not (group == MATCHERS and name == ORACLE):
+                _known(name, group, kind)
+
+
+def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
+    point = _known(name, group, kind)
     try:
-        return points[name].load()  # type: ignore[no-any-return]
+        return point.load()  # type: ignore[no-any-return]
     except Exception as error:
         said = one_line(f"{type(error).__name__}: {error}")
-        message = f"{name}: {points[name].value} of {_home(points[name])} cannot be imported ({said})"
+        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({said})"
         raise MatchError(message) from error

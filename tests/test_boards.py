@@ -287,14 +287,14 @@ def test_a_board_may_not_be_named_like_a_path(out, monkeypatch, capsys):
     assert "--name must hold letters" in capsys.readouterr().err
 
 
-def test_a_control_that_fails_is_told_first_and_ends_with_status_1(out, monkeypatch, capsys):
+def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, monkeypatch, capsys):
     verdict = Verdict(control="shuffled map at chance", matcher="m", n=8, found=8.0, expected=0.8, p=1e-8, holds=False)
     monkeypatch.setattr(boards, "hold_controls", lambda _: (verdict,))
     words = ("score", "--predictions", str(out / "runs"), "--out", str(out), "--name", "mine", "--draws", "200")
     monkeypatch.setattr("sys.argv", ["sasgeo-bench", *words])
     with pytest.raises(SystemExit) as left:
         cli.main()
-    assert left.value.code == 1
+    assert left.value.code == 3
     told = capsys.readouterr()
     assert "CONTROLS FAILED, 1 of 1: do not trust this board." in told.err
     assert verdict.to_text() in told.err

@@ -4,7 +4,7 @@
 import pandas as pd
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.store import taskdir
@@ -195,6 +195,14 @@ def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp
         spec = parse_toml(TEXT.replace(f'"{new}"', f'"{old}"'), PipelineFile, source="small.toml")
         with pytest.raises(ConfigError, match=f"did you mean '{new}'"):
             plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("old", "new"), [("random", "randon"), ("prior_centre", "prior_center")])
+def test_a_matcher_that_nobody_has_is_refused_before_anything_is_made(tmp_path, old, new):
+    spec = parse_toml(TEXT.replace(f'"{old}"', f'"{new}"'), PipelineFile, source="small.toml")
+    with pytest.raises(MatchError, match=f"there is no matcher '{new}', did you mean '{old}'"):
+        plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
     assert not (tmp_path / "out").exists()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.plugins import BUILT_IN, MATCHERS, list_entry_points, load_matcher
+from sasgeo_bench.plugins import BUILT_IN, MATCHERS, check_names, list_entry_points, load_matcher
 
 SOUND = """
 from sasgeo_bench.matcher import WITHHELD, MatcherCard
@@ -247,3 +247,10 @@ def test_what_is_wrong_with_a_module_or_a_class_is_told_in_one_line(own, spec, w
     told = refusal(spec)
     assert told.startswith(f"{spec}: ")
     assert words in told
+
+
+@pytest.mark.parametrize("kind", ["matcher", "rejector"])
+def test_names_are_checked_without_an_import(kind):
+    check_names(**{f"{kind}s": ["no_such_module:Class"]})
+    with pytest.raises(MatchError, match=f"there is no {kind} 'nobody'"):
+        check_names(**{f"{kind}s": ["nobody"]})

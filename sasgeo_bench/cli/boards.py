@@ -25,6 +25,7 @@ from sasgeo_bench.store.catalog import (
     read_split_file,
 )
 
+CONTROL_FAILED: Final = 3  # exit status
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
@@ -67,9 +68,13 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     _check_controls(board)
 
 
-def leaderboard_command(
+def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its users need
     pipeline: Annotated[str, typer.Argument(help="id of a shipped pipeline, or a file of your own (*.toml)")],
     *,
+    matcher: Annotated[
+        list[str] | None,
+        typer.Option(help="one more than the file names: a name, or module:Class; may be repeated"),
+    ] = None,
     extracts: ExtractFolders = None,
     region_folders: Annotated[
         list[Path] | None, typer.Option("--region-files", help="folder with region files of your own")
@@ -82,8 +87,9 @@ def leaderboard_command(
     out: Out = Path("out"),
 ) -> None:
     """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
+    spec = read_pipeline_file(find_pipeline_file(pipeline))
     plan = plan_pipeline(
-        read_pipeline_file(find_pipeline_file(pipeline)),
+        spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(matcher or ()))))}),
         out=out,
         tell=tell,
         extract_folders=tuple(extracts or ()),
@@ -112,7 +118,7 @@ def _split(name: str, folders: list[Path]) -> Split:
 def _check_controls(board: Board) -> None:
     """End with a status that a script sees where a control failed; the board is written all the same."""
     if not all(item.holds for item in board.verdicts):
-        raise typer.Exit(1)
+        raise typer.Exit(CONTROL_FAILED)
 
 
 def show_board(board: Board) -> None:

@@ -4,13 +4,15 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
 import pandas as pd
 
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.paper import METRICS, PUBLISHED, used_interval
 from sasgeo_bench.report.text import markdown_table
+
+_LEAST_P: Final = 0.001
 
 
 def paper_markdown(
@@ -135,7 +137,7 @@ def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
                     "ours, paired": f"{one.difference:+.3f}"
                     + ("" if math.isnan(one.lo) else f" [{one.lo:+.3f}, {one.hi:+.3f}]"),
                     "won and lost": f"{one.first_only} and {one.second_only} of {one.n}",
-                    "p (Holm)": f"{one.p_holm:.3f}",
+                    "p (Holm)": "< 0.001" if one.p_holm < _LEAST_P else f"{one.p_holm:.3f}",
                     "verdict": one.verdict,
                 }
             )

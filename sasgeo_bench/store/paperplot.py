@@ -274,7 +274,7 @@ def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
                     ls=_DASHES[number % len(_DASHES)],
                     lw=1.6,
                     drawstyle="steps-pre",
-                    label=f"{first['title']} (AURC {first['aurc']:.3f}, n {first['n']})",
+                    label=f"{first['title']} (AURC {first['aurc']:.4f}, n {first['n']})",
                 )
         for chart, top in zip(charts, (max(most.values()), low), strict=True):
             chart.set_xlim(0, 1)

@@ -91,7 +91,7 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
         return None
     folders = tuple(request.out / "tasks" / request.suite / name for name in mine)
     try:
-        if any(check_task(folder, out=request.out) for folder in folders):
+        if any(check_task(folder, out=request.out) or not has_truths(folder, out=request.out) for folder in folders):
             return None
     except StoreError:
         return None

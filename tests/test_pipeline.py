@@ -110,6 +110,17 @@ def test_a_task_that_was_touched_is_not_up_to_date(made):
     assert made_tasks(plan.requests[0]) is not None
 
 
+def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
+    plan, _, _ = made
+    path = plan.out / "truth" / "clean" / "town-suburb" / taskdir.TRUTH
+    path.rename(tmp_path / taskdir.TRUTH)
+    try:
+        assert made_tasks(plan.requests[0]) is None
+    finally:
+        (tmp_path / taskdir.TRUTH).rename(path)
+    assert made_tasks(plan.requests[0]) is not None
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -14,7 +14,7 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.query import TASK_VERSION
+from sasgeo_bench.query import TASK_VERSION, Head, Truth
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.costs import cost_rows
@@ -196,11 +196,11 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     if not folders:
         message = "there is nothing to score: no task of this folder is answered by these predictions"
         raise ConfigError(message)
-    abouts = [_check_task(folder, request.root) for folder in folders]
+    tasks = [_read_task(folder, request.root) for folder in folders]
     for entry in entries:
         if entry.how == AS_SUBMITTED:
             _check_file(entry.sources[0], folders)
-    scores = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
+    scores = {entry.name: _scored(entry, predictions[entry.name], tasks, request) for entry in entries}
     rows = [leaderboard(scores, draws=request.draws)]
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     for entry in entries:
@@ -216,9 +216,8 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         tell(f"{entry.name}: {int(frame['is_answered'].sum())} of {len(frame)} queries answered")
     table = pd.concat([item for item in rows if len(item)], ignore_index=True)
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
-    board = Board(
-        entries=entries, scores=scores, predictions=predictions, table=table, findings=findings, tasks=tuple(abouts)
-    )
+    abouts = tuple(task.about for task in tasks)
+    board = Board(entries=entries, scores=scores, predictions=predictions, table=table, findings=findings, tasks=abouts)
     _write(request, board)
     return board
 
@@ -266,11 +265,23 @@ def _check_file(path: Path, folders: Sequence[Path]) -> None:
         raise ConfigError(message)
 
 
-def _check_task(folder: Path, root: Path) -> dict[str, Any]:
-    """What `task.json` says, after it was held against the truths."""
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """A task as it is scored: read once, for all contestants."""
+
+    folder: Path
+    about: dict[str, Any]
+    heads: tuple[Head, ...]
+    truths: tuple[Truth, ...]
+
+
+def _read_task(folder: Path, root: Path) -> _Task:
+    """A task and its truths, after they were held against each other."""
     about = taskdir.read_task(folder)
-    taskdir.check_truths(folder, _truth_folder(about, root))
-    return about
+    truth = _truth_folder(about, root)
+    taskdir.check_truths(folder, truth)
+    heads, truths = tuple(taskdir.read_heads(folder)), tuple(taskdir.read_truths(truth))
+    return _Task(folder=folder, about=about, heads=heads, truths=truths)
 
 
 def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:
@@ -278,25 +289,19 @@ def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:
 
 
 def _scored(
-    entry: Entry,
-    predictions: Mapping[str, Prediction],
-    folders: Sequence[Path],
-    abouts: Sequence[Mapping[str, Any]],
-    request: ScoreRequest,
+    entry: Entry, predictions: Mapping[str, Prediction], tasks: Sequence[_Task], request: ScoreRequest
 ) -> pd.DataFrame:
     """All tasks of one contestant, one row for each query."""
     ran_on = {(about["suite"], about["region"]): about["queries_sha256"] for about in entry.runs}
     place_of = {} if request.split is None else request.split.place_of
     frames = []
-    for folder, about in zip(folders, abouts, strict=True):
-        asked = ran_on.get((about["suite"], about["region"]))
-        if asked is not None and asked != about["files"][taskdir.QUERIES]["sha256"]:
-            message = f"{entry.name} answered other queries than {folder} holds now: run it again"
+    for task in tasks:
+        asked = ran_on.get((task.about["suite"], task.about["region"]))
+        if asked is not None and asked != task.about["files"][taskdir.QUERIES]["sha256"]:
+            message = f"{entry.name} answered other queries than {task.folder} holds now: run it again"
             raise StoreError(message)
-        heads = list(taskdir.read_heads(folder))
-        mine = {head.query_id: predictions[head.query_id] for head in heads if head.query_id in predictions}
-        truths = taskdir.read_truths(_truth_folder(about, request.root))
-        frames.append(score_task(heads, truths, mine, place_of=place_of))
+        mine = {head.query_id: predictions[head.query_id] for head in task.heads if head.query_id in predictions}
+        frames.append(score_task(task.heads, task.truths, mine, place_of=place_of))
     return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 

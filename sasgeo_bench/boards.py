@@ -19,7 +19,7 @@ from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
-from sasgeo_bench.report.rejection import judge
+from sasgeo_bench.report.rejection import OWN, judge, own_word
 from sasgeo_bench.report.rows import to_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_latex, board_markdown
@@ -28,12 +28,14 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import write_board
+from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
 Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+M2_PER_KM2: Final = 1e6
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 
@@ -203,9 +205,15 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     scores = {entry.name: _scored(entry, predictions[entry.name], tasks, request) for entry in entries}
     rows = [leaderboard(scores, draws=request.draws)]
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
+    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
+    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
     for entry in entries:
         frame = scores[entry.name]
-        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs))))
+        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+        own = own_word(frame, request.split)
+        if len(own):
+            all_judged[entry.name, OWN] = own
+            rows.append(to_frame(list(integrity_rows(entry.name, OWN, own))))
         for name, judged_by in judges.items():
             judged = judged_by(frame, predictions[entry.name])
             all_judged[entry.name, name] = judged
@@ -230,6 +238,9 @@ def _judges(request: ScoreRequest) -> dict[str, Judge]:
         message = "rejectors are fitted on the calibration places of a split: name one with --split"
         raise ConfigError(message)
     names = {load_rejector(spec).card.name: spec for spec in request.rejectors}
+    if OWN in names:
+        message = f"{names[OWN]}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
+        raise ConfigError(message)
     makers = {name: partial(load_rejector, spec) for name, spec in names.items()}
     return {name: partial(judge, make=make, split=request.split) for name, make in makers.items()}
 
@@ -273,6 +284,8 @@ class _Task:
     about: dict[str, Any]
     heads: tuple[Head, ...]
     truths: tuple[Truth, ...]
+    view_bytes: dict[str, int]
+    area_km2: float | None
 
 
 def _read_task(folder: Path, root: Path) -> _Task:
@@ -281,7 +294,24 @@ def _read_task(folder: Path, root: Path) -> _Task:
     truth = _truth_folder(about, root)
     taskdir.check_truths(folder, truth)
     heads, truths = tuple(taskdir.read_heads(folder)), tuple(taskdir.read_truths(truth))
-    return _Task(folder=folder, about=about, heads=heads, truths=truths)
+    return _Task(
+        folder=folder,
+        about=about,
+        heads=heads,
+        truths=truths,
+        view_bytes=taskdir.read_view_bytes(folder),
+        area_km2=_area_km2(folder.resolve().parents[2] / "regions" / about["region"]),
+    )
+
+
+def _area_km2(region: Path) -> float | None:
+    """Mapped area of a region; None where it is not beside the tasks, for scores need no map."""
+    try:
+        manifest = read_manifest(region)
+    except StoreError:
+        return None
+    west, south, east, north = manifest.bounds_m
+    return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
 def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:

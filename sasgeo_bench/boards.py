@@ -14,13 +14,13 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.query import CONTROLS, TASK_VERSION
+from sasgeo_bench.query import CONTROLS, TASK_VERSION, Head, Truth
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
-from sasgeo_bench.report.rejection import judge
+from sasgeo_bench.report.rejection import OWN, judge, own_word
 from sasgeo_bench.report.rows import to_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_latex, board_markdown
@@ -29,12 +29,14 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import Extra, write_board
+from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
 Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+M2_PER_KM2: Final = 1e6
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 
@@ -204,11 +206,11 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     if not folders:
         message = "there is nothing to score: no task of this folder is answered by these predictions"
         raise ConfigError(message)
-    abouts = [_check_task(folder, request.root) for folder in folders]
+    tasks = [_read_task(folder, request.root) for folder in folders]
     for entry in entries:
         if entry.how == AS_SUBMITTED:
             _check_file(entry.sources[0], folders)
-    everything = {entry.name: _scored(entry, predictions[entry.name], folders, abouts, request) for entry in entries}
+    everything = {entry.name: _scored(entry, predictions[entry.name], tasks, request) for entry in entries}
     verdicts = hold_controls(everything)
     entries = tuple(entry for entry in entries if not _is_for_controls(entry))
     scores = {entry.name: _ranked(everything[entry.name]) for entry in entries}
@@ -217,9 +219,15 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         raise ConfigError(message)
     rows = [leaderboard(scores, draws=request.draws)]
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
+    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
+    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
     for entry in entries:
         frame = scores[entry.name]
-        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs))))
+        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+        own = own_word(frame, request.split)
+        if len(own):
+            all_judged[entry.name, OWN] = own
+            rows.append(to_frame(list(integrity_rows(entry.name, OWN, own))))
         for name, judged_by in judges.items():
             judged = judged_by(frame, predictions[entry.name])
             all_judged[entry.name, name] = judged
@@ -237,7 +245,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         table=table,
         findings=findings,
         verdicts=verdicts,
-        tasks=tuple(abouts),
+        tasks=tuple(task.about for task in tasks),
     )
     _write(request, board, [make(board) for make in request.extras])
     return board
@@ -261,6 +269,9 @@ def _judges(request: ScoreRequest) -> dict[str, Judge]:
         message = "rejectors are fitted on the calibration places of a split: name one with --split"
         raise ConfigError(message)
     names = {load_rejector(spec).card.name: spec for spec in request.rejectors}
+    if OWN in names:
+        message = f"{names[OWN]}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
+        raise ConfigError(message)
     makers = {name: partial(load_rejector, spec) for name, spec in names.items()}
     return {name: partial(judge, make=make, split=request.split) for name, make in makers.items()}
 
@@ -296,11 +307,42 @@ def _check_file(path: Path, folders: Sequence[Path]) -> None:
         raise ConfigError(message)
 
 
-def _check_task(folder: Path, root: Path) -> dict[str, Any]:
-    """What `task.json` says, after it was held against the truths."""
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """A task as it is scored: read once, for all contestants."""
+
+    folder: Path
+    about: dict[str, Any]
+    heads: tuple[Head, ...]
+    truths: tuple[Truth, ...]
+    view_bytes: dict[str, int]
+    area_km2: float | None
+
+
+def _read_task(folder: Path, root: Path) -> _Task:
+    """A task and its truths, after they were held against each other."""
     about = taskdir.read_task(folder)
-    taskdir.check_truths(folder, _truth_folder(about, root))
-    return about
+    truth = _truth_folder(about, root)
+    taskdir.check_truths(folder, truth)
+    heads, truths = tuple(taskdir.read_heads(folder)), tuple(taskdir.read_truths(truth))
+    return _Task(
+        folder=folder,
+        about=about,
+        heads=heads,
+        truths=truths,
+        view_bytes=taskdir.read_view_bytes(folder),
+        area_km2=_area_km2(folder.resolve().parents[2] / "regions" / about["region"]),
+    )
+
+
+def _area_km2(region: Path) -> float | None:
+    """Mapped area of a region; None where it is not beside the tasks, for scores need no map."""
+    try:
+        manifest = read_manifest(region)
+    except StoreError:
+        return None
+    west, south, east, north = manifest.bounds_m
+    return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
 def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:
@@ -308,26 +350,20 @@ def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:
 
 
 def _scored(
-    entry: Entry,
-    predictions: Mapping[str, Prediction],
-    folders: Sequence[Path],
-    abouts: Sequence[Mapping[str, Any]],
-    request: ScoreRequest,
+    entry: Entry, predictions: Mapping[str, Prediction], tasks: Sequence[_Task], request: ScoreRequest
 ) -> pd.DataFrame:
     """All tasks of one contestant, one row for each query."""
     ran_on = {(about["suite"], about["region"]): about["queries_sha256"] for about in entry.runs}
     place_of = {} if request.split is None else request.split.place_of
     frames = []
-    for folder, about in zip(folders, abouts, strict=True):
-        asked = ran_on.get((about["suite"], about["region"]))
-        if asked is not None and asked != about["files"][taskdir.QUERIES]["sha256"]:
-            message = f"{entry.name} answered other queries than {folder} holds now: run it again"
+    for task in tasks:
+        asked = ran_on.get((task.about["suite"], task.about["region"]))
+        if asked is not None and asked != task.about["files"][taskdir.QUERIES]["sha256"]:
+            message = f"{entry.name} answered other queries than {task.folder} holds now: run it again"
             raise StoreError(message)
-        heads = list(taskdir.read_heads(folder))
-        mine = {head.query_id: predictions[head.query_id] for head in heads if head.query_id in predictions}
-        truths = taskdir.read_truths(_truth_folder(about, request.root))
-        frame = score_task(heads, truths, mine, place_of=place_of)
-        frames.append(frame.assign(block=frame["region"]) if about["suite"] in request.by_region else frame)
+        mine = {head.query_id: predictions[head.query_id] for head in task.heads if head.query_id in predictions}
+        frame = score_task(task.heads, task.truths, mine, place_of=place_of)
+        frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in request.by_region else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 

@@ -22,7 +22,7 @@ _MOST_CLASSES: Final = 31
 _NOT_KNOWN: Final = np.uint32(1 << 31)
 Value = TypeVar("Value", np.uint8, np.uint32)
 
-_CELLS_PER_BYTE: Final = 4
+CELLS_PER_BYTE: Final = 4
 _SHIFTS: Final = np.arange(0, 8, 2, dtype=np.uint8)  # of the four cells within a byte, the first one lowest
 
 
@@ -153,11 +153,11 @@ def pack(cells: NDArray[np.uint8]) -> bytes:
     >>> pack(np.array([1, 2, 0, 1, 2], dtype=np.uint8)).hex()
     '4902'
     """
-    flat = np.zeros(-(-cells.size // _CELLS_PER_BYTE) * _CELLS_PER_BYTE, dtype=np.uint8)
+    flat = np.zeros(-(-cells.size // CELLS_PER_BYTE) * CELLS_PER_BYTE, dtype=np.uint8)
     flat[: cells.size] = cells.ravel()
-    packed = np.zeros(len(flat) // _CELLS_PER_BYTE, dtype=np.uint8)
+    packed = np.zeros(len(flat) // CELLS_PER_BYTE, dtype=np.uint8)
     for first, shift in enumerate(_SHIFTS):
-        packed |= flat[first::_CELLS_PER_BYTE] << shift
+        packed |= flat[first::CELLS_PER_BYTE] << shift
     return packed.tobytes()
 
 
@@ -175,9 +175,9 @@ def unpack(packed: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     [1, 2, 0, 1, 2]
     """
     count = int(np.prod(shape))
-    if len(packed) != -(-count // _CELLS_PER_BYTE):
+    if len(packed) != -(-count // CELLS_PER_BYTE):
         message = (
-            f"{count} cells of shape {shape} take {-(-count // _CELLS_PER_BYTE)} bytes, got {len(packed)}: "
+            f"{count} cells of shape {shape} take {-(-count // CELLS_PER_BYTE)} bytes, got {len(packed)}: "
             "rows, cols or classes do not belong to this evidence"
         )
         raise ShapeError(message)

@@ -41,7 +41,8 @@ class Pose:
         if self.scale <= 0:
             message = f"scale must be positive, got {self.scale!r}"
             raise PoseError(message)
-        object.__setattr__(self, "yaw_deg", float(normalize_deg(self.yaw_deg)))
+        if type(self.yaw_deg) is not float or not 0.0 < self.yaw_deg < 360.0:  # noqa: PLR2004 - in its range already
+            object.__setattr__(self, "yaw_deg", float(normalize_deg(self.yaw_deg)))
 
     def to_map(self, offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """(right, up) of the view, shape (N, 2), metres -> easting/northing, shape (N, 2).

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Final
 
 import pandas as pd
@@ -20,6 +20,9 @@ SCORER_VERSION: Final = 1  # raised whenever the same predictions get other figu
 FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"
+
+Errors = tuple[float, float, float]
+_NO_ERROR: Final[Errors] = (math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,21 +142,39 @@ def score_task(
     if foreign is not None:
         message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
         raise MetricError(message)
-    rows = [_score(head, by_id[head.query_id], predictions.get(head.query_id), place_of or {}) for head in asked]
-    return pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
+    told = [predictions.get(head.query_id) for head in asked]
+    errors = _errors(asked, [by_id[head.query_id] for head in asked], told)
+    rows = [
+        _score(head, by_id[head.query_id], prediction, error, place_of or {})
+        for head, prediction, error in zip(asked, told, errors, strict=True)
+    ]
+    return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
 
 
-def _score(head: Head, truth: Truth, prediction: Prediction | None, place_of: Mapping[str, str]) -> Score:
+def _errors(heads: Sequence[Head], truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
+    """Metres, degrees and logarithm of the scale of each first pose; NaN where there is no pose to be right about."""
+    found = [_NO_ERROR] * len(heads)
+    asked = [
+        (at, truth.pose)
+        for at, (head, truth) in enumerate(zip(heads, truths, strict=True))
+        if truth.is_present and head.track != "retrieval" and truth.pose is not None
+    ]
+    errors = pose_errors([first_pose(told[at]) for at, _ in asked], [pose for _, pose in asked])
+    columns = (errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist())
+    for (at, _), *error in zip(asked, *columns, strict=True):
+        found[at] = (error[0], error[1], error[2])
+    return found
+
+
+def _score(
+    head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, place_of: Mapping[str, str]
+) -> Score:
     fix = first_pose(prediction)
-    rank, errors = MISS, (math.nan, math.nan, math.nan)
-    is_right = False
+    rank = MISS
+    is_right = errors[0] <= FIX_M
     if truth.is_present and head.track == "retrieval":
         rank = _rank(prediction, truth, head.candidates)
         is_right = fix is not None and rank.right > 0 and _is_at(fix, head.candidates[truth.candidate])
-    elif truth.is_present and truth.pose is not None:
-        found = pose_errors([fix], [truth.pose])
-        errors = (float(found.position_m[0]), float(found.yaw_deg[0]), float(found.log_scale[0]))
-        is_right = errors[0] <= FIX_M
     base = head.region.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
     return Score(
         query_id=head.query_id,

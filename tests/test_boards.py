@@ -2,6 +2,7 @@
 """Boards from runs and files: the same figures either way; faults are told in one line and nothing is written."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from sasgeo_bench import boards, cli
 from sasgeo_bench.boards import ScoreRequest, find_entries, make_board
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.controls import Verdict
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.results import Prediction
@@ -42,6 +44,10 @@ class Doubt:
 
     def p_false(self, predictions):
         return np.full(len(predictions), self.rate)
+
+
+class Own(Doubt):
+    card = replace(Doubt.card, name="own")
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +153,35 @@ def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_
     assert set(board.scores["mine"]["place"]) == {f"place-{town}" for town in TOWNS}
     pooled = rows[rows["suite"] == "all suites"]
     assert {"present 0.9", "present 0.7", "present 0.5"} < set(pooled["stratum"])
+
+
+def test_the_own_word_of_a_matcher_stands_beside_its_rejectors_and_needs_no_split(out, tmp_path, split):
+    submission(out, tmp_path / "mine.parquet")
+    board = board_of(out, tmp_path / "mine.parquet")
+    own = board.table[board.table["rejector"] == "own"].set_index("metric")
+    assert own.loc["brier", "value"].max() == 0.0  # right, and sure of it
+    assert "coverage_at_risk_0.05" not in own.index
+    contrast = Contrast(name="own", first="mine x own", second="mine x doubt", suites=("clean",), metric="aurc")
+    changes = {"rejectors": [f"{__name__}:Doubt"], "split": split, "contrasts": [contrast]}
+    judged = board_of(out, tmp_path / "mine.parquet", **changes)
+    assert {"own", "doubt"} < set(judged.table["rejector"])
+    assert "coverage_at_risk_0.05" in set(judged.table[judged.table["rejector"] == "own"]["metric"])
+    assert judged.findings[0].n > 0
+    with pytest.raises(ConfigError, match="'own' is what a board calls a matcher's own confidence: rename"):
+        board_of(out, rejectors=[f"{__name__}:Own"], split=split)
+
+
+def test_what_was_sent_and_what_maps_take_is_told(out, tmp_path):
+    submission(out, tmp_path / "mine.parquet")
+    board = board_of(out, out / "runs", tmp_path / "mine.parquet")
+    told = board.table.set_index(["matcher", "metric"])["value"]
+    sizes = [size for town in TOWNS for size in taskdir.read_view_bytes(out / "tasks" / "clean" / town).values()]
+    fixes = int(board.scores["mine"]["is_answered"].sum())
+    assert told["mine", "observation_per_fix"] == pytest.approx(sum(sizes) / 1e3 / fixes)
+    assert told["oracle_pose", "map_per_km2"] > 0
+    shutil.rmtree(out / "regions")  # scores need no map
+    again = board_of(out).table.set_index(["matcher", "metric"])["value"]
+    assert math.isnan(again["oracle_pose", "map_per_km2"])
 
 
 def test_rejectors_need_a_split_and_must_be_known(out, split):

@@ -127,13 +127,13 @@ def check_weights(weights: ArrayLike | None, count: int) -> Floats:
     return column
 
 
-def block_codes(blocks: Sequence[str], count: int) -> tuple[Ints, Ints]:
+def block_codes(blocks: Sequence[str] | Ints, count: int) -> tuple[Ints, Ints]:
     """Sizes of K blocks in the order of their names, shape (K,), and the number of each query's block, shape (N,).
 
     Parameters
     ----------
-    blocks : sequence of str, length N
-        Block of each query.
+    blocks : sequence of str or ndarray of int, length N
+        Block of each query; numbers that stand in the order of the names give the same.
     count : int
         N.
 
@@ -156,7 +156,9 @@ def block_codes(blocks: Sequence[str], count: int) -> tuple[Ints, Ints]:
     if len(blocks) != count:
         message = f"{len(blocks)} blocks for {count} queries, expected one each"
         raise MetricError(message)
-    _, code, sizes = np.unique(np.asarray(blocks, dtype=str), return_inverse=True, return_counts=True)
+    names = np.asarray(blocks)
+    names = names if names.dtype.kind == "i" else names.astype(str)
+    _, code, sizes = np.unique(names, return_inverse=True, return_counts=True)
     return np.asarray(sizes, dtype=np.int64), np.asarray(code, dtype=np.int64)
 
 

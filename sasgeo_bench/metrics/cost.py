@@ -17,6 +17,7 @@ from sasgeo_bench.metrics.base import Floats, Metric, weighted_quantile
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import Prediction
 
+BYTES_PER_KB: Final = 1e3
 BYTES_PER_MB: Final = 1e6
 
 
@@ -185,7 +186,8 @@ def observation_bytes(query: Query) -> int:
     -------
     int
         Two bits for each cell and class, one byte for each confidence, WKB for each vector; nothing is compressed, so
-        that the figure does not depend on a library's version.
+        that the figure does not depend on a library's version. `store.taskdir.read_view_bytes` gives the same of all
+        queries of a task without unpacking one.
     """
     evidence = query.evidence
     total = len(pack(evidence.cells))

@@ -273,7 +273,8 @@ def cost_values(
         Cost of a false fix.
     charged : {"right fix", "place"}
         What costs 1 when withheld: a right fix (Eq. (13); it judges the decision, whatever the answers are worth), or
-        every place that is present (it judges the whole method: false answers withheld are still no fixes).
+        every place that is present (it judges the whole method: false answers withheld are still no fixes). By the
+        first alone a matcher that is never right and withholds all would have cost 0.
 
     Returns
     -------

@@ -123,6 +123,54 @@ def _area(group: Floats, false: Floats) -> float:
     return float(np.clip(area, 0.0, 1.0))  # rounding of digamma can leave [0, 1] by 1e-16
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnAreas:
+    """`aurc` and `augrc` of D draws, each of shape (D,); NaN for a draw of no queries."""
+
+    aurc: Floats
+    augrc: Floats
+
+
+def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
+    """Areas of many draws at once: the same as `aurc` and `augrc` with each row of weights, and some times faster.
+
+    Parameters
+    ----------
+    answers : Answers
+        Of N queries.
+    weights : ndarray of float, shape (D, N)
+        Of each draw, finite and not negative, as from `ClusterDraws.weights`.
+
+    Returns
+    -------
+    DrawnAreas
+        One of each for each draw.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 0], is_present=[1, 1])
+    >>> found = drawn_areas(some, np.array([[1.0, 1.0], [2.0, 0.0]]))
+    >>> found.aurc.tolist(), found.augrc.tolist()
+    ([0.25, 0.0], [0.125, 0.0])
+    """
+    order = np.argsort(answers.tie, kind="stable")
+    if not len(order):
+        return DrawnAreas(aurc=np.full(len(weights), np.nan), augrc=np.full(len(weights), np.nan))
+    first = np.flatnonzero(np.diff(answers.tie[order], prepend=-1))
+    sorted_mass = weights[:, order]
+    group, false = sorted_mass, sorted_mass * ~answers.is_right[order]
+    if len(first) < len(order):
+        group, false = (np.add.reduceat(each, first, axis=1) for each in (group, false))
+    accepted = np.cumsum(group, axis=1)
+    total, after = accepted[:, -1], np.cumsum(false, axis=1)
+    harmonic = np.diff(digamma(accepted + 1.0), axis=1, prepend=digamma(1.0))
+    slope = np.divide(false, group, out=np.zeros_like(group), where=group > 0)
+    area = (false + (after - false - (accepted - group) * slope) * harmonic).sum(axis=1)
+    undetected = (group * (after - false / 2)).sum(axis=1)
+    some = np.where(total > 0, total, np.nan)
+    return DrawnAreas(aurc=np.clip(area / some, 0.0, 1.0), augrc=np.asarray(undetected / some**2))
+
+
 def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
     """E-AURC: how much larger the AURC is than that of the best order of the same answers.
 

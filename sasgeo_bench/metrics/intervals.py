@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 from statsmodels.stats.proportion import proportion_confint
 
 from sasgeo_bench.errors import MetricError
@@ -131,7 +132,7 @@ class ClusterDraws:
 
     Parameters
     ----------
-    blocks : sequence of str, length N
+    blocks : sequence of str or ndarray of int, length N
         Block of each query. Figures that are to be compared are given for the same queries in the same order.
     seed : int
         The same seed, blocks and number of draws give the same draws, whatever is computed from them.
@@ -158,7 +159,7 @@ class ClusterDraws:
     ((1000, 3), True, 1.0)
     """
 
-    blocks: Sequence[str]
+    blocks: Sequence[str] | Ints
     seed: int
     draws: int = DRAWS
     draws_queries: bool = True
@@ -184,27 +185,76 @@ class ClusterDraws:
 
     def weights(self) -> Iterator[Floats]:
         """How often each query is drawn, shape (D, N), some draws at a time; all of them hold `draws` rows."""
+        for rows, parts in self._chunks():
+            drawn = np.empty((rows, self.count))
+            for part in parts:
+                drawn[:, part.queries] = part.weights(rows)
+            yield drawn
+
+    def sums(self, table: Floats) -> Iterator[Floats]:
+        """Sums of the columns of a table, shape (N, M), over the queries of each draw, shape (D, M), some at a time.
+
+        The same as `weights() @ table` to the last digits, and some times faster: no weight is ever written down.
+        """
+        for rows, parts in self._chunks():
+            total = np.zeros((rows, table.shape[1]))
+            for part in parts:
+                total += part.picks(rows) @ table[part.queries]
+            yield total
+
+    def _chunks(self) -> Iterator[tuple[int, Iterator["_Picked"]]]:
+        """How many draws at a time, and what each of them takes from the blocks of each size."""
         rng = np.random.default_rng(self.seed)
         step = max(1, _CHUNK_CELLS // max(self.count, 1))
         for begin in range(0, self.draws if self.count else 0, step):
-            yield self._some(rng, min(step, self.draws - begin))
+            rows = min(step, self.draws - begin)
+            yield rows, self._some(rng, rows)
 
-    def _some(self, rng: np.random.Generator, rows: int) -> Floats:
-        """Give the weights of some draws."""
+    def _some(self, rng: np.random.Generator, rows: int) -> Iterator["_Picked"]:
+        """Draw blocks, then queries in them."""
         blocks = self.blocks_count
         shifted = rng.integers(0, blocks, size=(rows, blocks)) + blocks * np.arange(rows)[:, None]
         times = np.bincount(shifted.ravel(), minlength=rows * blocks).reshape(rows, blocks)
-        drawn = np.empty((rows, self.count))
         for size, which, queries in self._sizes:
             copies = times[:, which]
             if size == 1 or not self.draws_queries:
-                drawn[:, queries.ravel()] = np.repeat(copies, size, axis=1)
+                yield _Picked(size=size, queries=queries.ravel(), copies=copies, within=None)
                 continue
-            cells = copies.ravel() * size  # of each draw and block: so many queries are drawn from `size`
-            picked = rng.integers(0, size, size=int(cells.sum()), dtype=_small(size))
-            flat = np.repeat(np.arange(len(cells)) * size, cells) + picked
-            drawn[:, queries.ravel()] = np.bincount(flat, minlength=len(cells) * size).reshape(rows, -1)
-        return drawn
+            # Of each draw and block so many queries are drawn from `size`.
+            within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=_small(size))
+            yield _Picked(size=size, queries=queries.ravel(), copies=copies, within=within)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Picked:
+    """What some draws take from K blocks of one size.
+
+    `queries`, shape (K * size,), are those of the blocks, one block after the other; `copies`, shape (D, K), says how
+    often each block is drawn; `within` which of its queries, draw after draw and block after block: each of them as
+    often as its block where it is None.
+    """
+
+    size: int
+    queries: Ints
+    copies: Ints
+    within: NDArray[np.integer] | None
+
+    def weights(self, rows: int) -> Floats:
+        """How often each query is taken, shape (D, K * size)."""
+        if self.within is None:
+            return np.repeat(self.copies, self.size, axis=1).astype(np.float64)
+        cells = self.copies.ravel() * self.size
+        flat = np.repeat(np.arange(len(cells)) * self.size, cells) + self.within
+        return np.bincount(flat, minlength=len(cells) * self.size).reshape(rows, -1).astype(np.float64)
+
+    def picks(self, rows: int) -> csr_array | Floats:
+        """The same, as a table with one entry for each query that is taken."""
+        if self.within is None:
+            return self.weights(rows)
+        first = np.arange(self.copies.shape[1], dtype=np.int32) * self.size
+        column = np.repeat(np.tile(first, rows), self.copies.ravel() * self.size) + self.within
+        ends = np.concatenate(([0], np.cumsum(self.copies.sum(axis=1) * self.size)))
+        return csr_array((np.ones(len(column)), column, ends), shape=(rows, len(self.queries)))
 
 
 def _small(size: int) -> type[np.uint16] | type[np.uint32]:
@@ -247,9 +297,7 @@ def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike |
         raise MetricError(message)
     mass = check_weights(weights, drawn.count)
     columns = np.column_stack((table.reshape(len(table), -1) * mass[:, None], mass))
-    sums = np.concatenate(
-        [some @ columns for some in drawn.weights()] or [np.full((drawn.draws, columns.shape[1]), 0.0)]
-    )
+    sums = np.concatenate(list(drawn.sums(columns)) or [np.full((drawn.draws, columns.shape[1]), 0.0)])
     total = sums[:, -1:]
     means = np.divide(sums[:, :-1], total, out=np.full(sums[:, :-1].shape, np.nan), where=total > 0)
     return np.asarray(means[:, 0] if table.ndim == 1 else means)

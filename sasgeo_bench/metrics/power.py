@@ -11,21 +11,21 @@ from numpy.typing import ArrayLike
 from scipy.stats import norm
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.metrics.base import block_codes, check_column
+from sasgeo_bench.metrics.base import Ints, block_codes, check_column
 
 ALPHA: Final = 0.05
 POWER: Final = 0.8
 _NOTHING: Final = 1e-12  # a spread this small is one of rounding
 
 
-def intraclass_correlation(values: ArrayLike, blocks: Sequence[str]) -> float:
+def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> float:
     """How much more alike queries of one block are than queries of different blocks.
 
     Parameters
     ----------
     values : array_like, shape (N,)
         Finite; for two methods, the difference of their hits on each query.
-    blocks : sequence of str, length N
+    blocks : sequence of str or ndarray of int, length N
         Block of each query.
 
     Returns
@@ -229,7 +229,7 @@ class Sensitivity:
 
 
 def sensitivity(
-    first: ArrayLike, second: ArrayLike, blocks: Sequence[str], *, alpha: float = ALPHA, power: float = POWER
+    first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints, *, alpha: float = ALPHA, power: float = POWER
 ) -> Sensitivity:
     """Minimum detectable difference of two methods on a suite.
 
@@ -237,7 +237,7 @@ def sensitivity(
     ----------
     first, second : array_like, shape (N,)
         Hits of two methods for the same queries, in [0, 1]; shared hits of tied poses count in proportion.
-    blocks : sequence of str, length N
+    blocks : sequence of str or ndarray of int, length N
         Block of each query.
     alpha, power : float
         As in `pairs_needed`.

@@ -224,7 +224,7 @@ def _means(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws:
 
 
 def _areas(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
-    ours, theirs = (answers_of(frame, frame["p_false"].to_numpy(float)) for frame in (first, second))
+    ours, theirs = (answers_of(frame) for frame in (first, second))
     blocks = first["block"].tolist()
     drawn = ClusterDraws(blocks=blocks, seed=_seed(contrast), draws=SLOW_DRAWS)
     apart = partial(_apart, ours, theirs)

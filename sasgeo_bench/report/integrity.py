@@ -2,10 +2,8 @@
 """Rows of a board for matcher x rejector: how well it is known which answers are false."""
 
 import hashlib
-import math
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,30 +12,34 @@ import pandas as pd
 from sasgeo_bench.metrics.base import Floats, weighted_mean
 from sasgeo_bench.metrics.calibration import brier, calibration_error
 from sasgeo_bench.metrics.decisions import COST_RATIOS, PRESENT_SHARES, Answers, decision_cost, presence_weights
-from sasgeo_bench.metrics.integrity import augrc, aurc, excess_aurc, false_fix_rate
-from sasgeo_bench.metrics.intervals import ClusterDraws, mean_interval, statistic_interval
+from sasgeo_bench.metrics.integrity import augrc, aurc, drawn_areas, excess_aurc, false_fix_rate
+from sasgeo_bench.metrics.intervals import ClusterDraws, percentile_interval
 from sasgeo_bench.report.rejection import RISKS, answers_of
-from sasgeo_bench.report.rows import ALL_SUITES, Row, Told, bare
+from sasgeo_bench.report.rows import ALL_SUITES, Better, Row, Told, bare
 
 AS_DRAWN: Final = "as drawn"
 COVERAGES: Final = (0.5, 0.8)
+_CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take twice the time
 SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
 
 Figure = Callable[[Answers, Floats], float]
 
-# name, which way is good, figure, whether its interval is drawn
-_FIGURES: Final[tuple[tuple[str, Figure, bool], ...]] = (
-    ("aurc", aurc, True),
-    ("e_aurc", excess_aurc, False),
-    ("augrc", augrc, True),
+_FIGURES: Final[tuple[tuple[str, Figure], ...]] = (
+    ("aurc", aurc),
+    ("e_aurc", excess_aurc),
+    ("augrc", augrc),
     *(
-        (f"false_fix_at_coverage_{share:g}", lambda some, mass, share=share: false_fix_rate(some, share, mass), False)
+        (f"false_fix_at_coverage_{share:g}", lambda some, mass, share=share: false_fix_rate(some, share, mass))
         for share in COVERAGES
     ),
-    ("brier", brier, False),
-    ("ece", calibration_error, False),
+    ("brier", brier),
+    ("ece", calibration_error),
+    *((f"cost_{ratio:g}", lambda some, mass, ratio=ratio: decision_cost(some, ratio, mass)) for ratio in COST_RATIOS),
     *(
-        (f"cost_{ratio:g}", lambda some, mass, ratio=ratio: decision_cost(some, ratio, mass), False)
+        (
+            f"cost_{ratio:g}_place",
+            lambda some, mass, ratio=ratio: decision_cost(some, ratio, mass, charged="place"),
+        )
         for ratio in COST_RATIOS
     ),
 )
@@ -51,7 +53,7 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
     matcher, rejector : str
         Their names.
     judged : pandas.DataFrame
-        From `rejection.judge`.
+        From `rejection.judge` or `rejection.own_word`.
 
     Yields
     ------
@@ -74,21 +76,39 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
 
 
 def _rows(told: Told, part: pd.DataFrame) -> Iterator[Row]:
-    some = answers_of(part, part["p_false"].to_numpy(float))
+    some = answers_of(part)
     # Of the queries alone, so that two rejectors are drawn alike.
     text = f"{told.suite}/{told.track}/{told.prior_group}"
     seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
     drawn = ClusterDraws(blocks=part["block"].tolist(), seed=seed, draws=SLOW_DRAWS)
     is_pooled = told.suite == ALL_SUITES
-    for stratum, mass in _mixtures(some, is_pooled=is_pooled):
+    mixtures = dict(_mixtures(some, is_pooled=is_pooled))
+    areas = _drawn_areas(some, mixtures, drawn) if is_pooled and drawn.blocks_count > 1 else {}
+    shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
+    drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
+    for stratum, mass in mixtures.items():
         mine = replace(told, stratum=stratum)
-        for name, figure, is_drawn in _FIGURES:
-            if is_drawn and is_pooled:
-                found = statistic_interval(partial(figure, some), drawn, mass)
-            else:
-                found = bare(figure(some, mass))
+        for name, figure in _FIGURES:
+            value, draws = figure(some, mass), areas.get((stratum, name))
+            found = bare(value) if draws is None else percentile_interval(value, draws)
             yield mine.row(name, "1", "lower", found, "blocks")
-        yield from _operating_rows(mine, part, mass, drawn)
+        for share in shares[stratum]:
+            found = percentile_interval(weighted_mean(share.counted, share.mass), next(drawn_shares))
+            yield mine.row(share.name, "1", share.better, found, "blocks")
+
+
+def _drawn_areas(
+    answers: Answers, mixtures: Mapping[str, Floats], drawn: ClusterDraws
+) -> Mapping[tuple[str, str], Floats]:
+    """The figures that have intervals, by mixture and name, of every draw."""
+    found: dict[tuple[str, str], list[Floats]] = {}
+    parts = (part for some in drawn.weights() for part in np.array_split(some, 1 + some.size // _CACHED))
+    for weights in parts:
+        for stratum, mass in mixtures.items():
+            areas = drawn_areas(answers, weights * mass)
+            found.setdefault((stratum, "aurc"), []).append(areas.aurc)
+            found.setdefault((stratum, "augrc"), []).append(areas.augrc)
+    return {key: np.concatenate(listed) for key, listed in found.items()}
 
 
 def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
@@ -99,13 +119,38 @@ def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]
             yield f"present {share:g}", presence_weights(some.is_present, share)
 
 
-def _operating_rows(told: Told, part: pd.DataFrame, mass: Floats, drawn: ClusterDraws) -> Iterator[Row]:
-    """Coverage at the thresholds chosen on calibration places, and the risk that was really reached."""
-    is_false = ~part["is_right"].to_numpy(bool)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Share:
+    """A share of the queries by mass, as the coverage of a threshold; each column has shape (N,)."""
+
+    name: str
+    better: Better
+    counted: Floats
+    mass: Floats
+
+
+def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
+    """Coverage at the thresholds chosen on calibration places, and the risk that was really reached.
+
+    Nothing where some row has no threshold: the coverage of the others would not be that of the queries told.
+    """
+    is_false = (~part["is_right"].to_numpy(bool)).astype(float)
     for risk in RISKS:
-        accepted = part[f"accepted_{risk:g}"].to_numpy(bool)
-        yield told.row(f"coverage_at_risk_{risk:g}", "1", "higher", mean_interval(accepted, drawn, mass), "blocks")
-        taken = mass * accepted
-        reached = weighted_mean(is_false, taken)
-        found = bare(reached) if math.isnan(reached) else mean_interval(is_false, drawn, taken)
-        yield told.row(f"risk_reached_at_{risk:g}", "1", "lower", found, "blocks")
+        column = part[f"accepted_{risk:g}"]
+        if not column.isna().any():
+            accepted = column.to_numpy(float)
+            yield _Share(name=f"coverage_at_risk_{risk:g}", better="higher", counted=accepted, mass=mass)
+            yield _Share(name=f"risk_reached_at_{risk:g}", better="lower", counted=is_false, mass=mass * accepted)
+
+
+def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Floats]:
+    """Each share in every draw, all by one pass over the draws; NaN where a draw holds nothing that counts.
+
+    No draws for fewer than two blocks: one says nothing of others.
+    """
+    if not shares or drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
+        yield from (np.empty(0) for _ in shares)
+        return
+    columns = [share.counted * share.mass for share in shares] + [share.mass for share in shares]
+    top, bottom = np.hsplit(np.vstack(list(drawn.sums(np.column_stack(columns)))), 2)
+    yield from np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0).T

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matcher x rejector: fitted on calibration places, thresholds chosen there too, and counted on test places alone."""
+"""Matcher x rejector: fitted on calibration places, thresholds chosen there too, and counted on test places alone.
 
-import math
+A matcher's own confidence stands beside the rejectors as one that needs no fit.
+"""
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -11,13 +13,14 @@ import pandas as pd
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.metrics.base import Bools, Floats
-from sasgeo_bench.metrics.decisions import Answers
+from sasgeo_bench.metrics.decisions import Answers, accept
 from sasgeo_bench.metrics.integrity import choose_threshold
 from sasgeo_bench.rejector import Rejector, check_p_false
 from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.score import NOT_APPLICABLE
 from sasgeo_bench.split import Split
 
+OWN: Final = "own"  # what a board calls a matcher's own confidence; no rejector can have the name
 RISKS: Final = (0.01, 0.05)
 _PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
 
@@ -81,7 +84,7 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
     Returns
     -------
     pandas.DataFrame
-        The rows that were tested, with the columns `p_false` (NaN without an answer), `accepted_<risk>` for each of
+        The rows that were tested, with the columns `p_right` (NaN without an answer), `accepted_<risk>` for each of
         `RISKS`, and `is_own_calibration`.
     """
     frames = []
@@ -91,22 +94,73 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
-    columns = [*scores.columns, "p_false", *(f"accepted_{risk:g}" for risk in RISKS), "is_own_calibration"]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=columns)
+    return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS), "is_own_calibration"])
+
+
+def own_word(scores: pd.DataFrame, split: Split | None = None) -> pd.DataFrame:
+    """What a matcher itself says of its answers: its confidence, as a rejector that learns nothing.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Of one matcher. Of a hold-out split only the test part counts, as for any rejector.
+    split : Split, optional
+        Says on which places thresholds for `RISKS` are chosen; all else needs none.
+
+    Returns
+    -------
+    pandas.DataFrame
+        As of `judge`, with `accepted_<risk>` NaN where no place calibrates. Only tracks and prior groups in which some
+        answer has a confidence; an answer without one is trusted least.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.score import score_task
+    >>> len(own_word(score_task([], [], {})))
+    0
+    """
+    usable = scores[scores["status"] != NOT_APPLICABLE]
+    frames = []
+    for _, group in usable.groupby(["track", "prior_group"], sort=True):
+        p_right = np.where(group["is_answered"].to_numpy(bool), group["confidence"].to_numpy(float), np.nan)
+        if not np.isnan(p_right).all():
+            frames.append(_own_of_group(group.assign(p_right=p_right), split))
+    return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS)])
+
+
+def _own_of_group(group: pd.DataFrame, split: Split | None) -> pd.DataFrame:
+    """The rows of one track and prior group that are tested, with what thresholds of other places accept."""
+    accepted = {_accepted(risk): np.full(len(group), np.nan) for risk in RISKS}
+    for turn in () if split is None else turns(group, split):
+        known = group[turn.calibration]
+        if known["is_answered"].any():
+            for name, taken in _accepted_rows(known, group[turn.test]).items():
+                accepted[name][turn.test] = taken
+    group = group.assign(**accepted)
+    is_holdout = split is not None and split.spec.kind == "holdout"
+    return group[(group["part"] == "test").to_numpy(bool)] if is_holdout else group
+
+
+def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
+
+
+def _accepted(risk: float) -> str:
+    return f"accepted_{risk:g}"
 
 
 def _judged(
     test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
 ) -> pd.DataFrame:
-    p_false = _fit_and_say(make, calibration, test, predictions)
-    held_back = _held_back(make, calibration, predictions)
-    known = answers_of(calibration, held_back)
-    accepted = {}
-    for risk in RISKS:
-        threshold = choose_threshold(known, risk)
-        sure = np.where(np.isnan(p_false), -math.inf, 1.0 - p_false)
-        accepted[f"accepted_{risk:g}"] = test["is_answered"].to_numpy(bool) & (sure >= threshold)
-    return test.assign(p_false=p_false, **accepted)
+    asked = test.assign(p_right=1.0 - _fit_and_say(make, calibration, test, predictions))
+    known = calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
+    return asked.assign(**_accepted_rows(known, asked))
+
+
+def _accepted_rows(known: pd.DataFrame, asked: pd.DataFrame) -> dict[str, Bools]:
+    """Which fixes the thresholds accept that are chosen on some rows, by the name of the column."""
+    calibration, test = answers_of(known), answers_of(asked)
+    return {_accepted(risk): accept(test, choose_threshold(calibration, risk)) for risk in RISKS}
 
 
 def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
@@ -145,11 +199,11 @@ def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Seque
     return [predictions[name] for name in rows["query_id"]]
 
 
-def answers_of(scores: pd.DataFrame, p_false: Floats) -> Answers:
-    """Scored rows as the integrity figures take them."""
+def answers_of(judged: pd.DataFrame) -> Answers:
+    """Judged rows as the integrity figures take them."""
     return Answers(
-        confidence=1.0 - p_false,
-        is_answered=scores["is_answered"].to_numpy(bool),
-        is_right=scores["is_right"].to_numpy(bool),
-        is_present=scores["is_present"].to_numpy(bool),
+        confidence=judged["p_right"].to_numpy(float),
+        is_answered=judged["is_answered"].to_numpy(bool),
+        is_right=judged["is_right"].to_numpy(bool),
+        is_present=judged["is_present"].to_numpy(bool),
     )

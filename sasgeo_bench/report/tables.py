@@ -3,15 +3,17 @@
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.metrics.base import Bools, Floats
+from sasgeo_bench.metrics.base import Bools, Floats, Ints
 from sasgeo_bench.metrics.compare import RankInterval, distinguishable, rank_intervals
 from sasgeo_bench.metrics.intervals import (
     DRAWS,
@@ -26,7 +28,7 @@ from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
 from sasgeo_bench.report.rows import Row, Told, bare, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
-from sasgeo_bench.score import NOT_APPLICABLE
+from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
 GROUP: Final = ("suite", "track", "prior_group")
 UNRANKED: Final = frozenset(
@@ -82,102 +84,153 @@ def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Cell:
-    """Rows of all matchers in one stratum."""
+class _Group:
+    """Queries of one suite, track and prior group as columns: shape (N,), or (N, M) for M matchers.
 
-    group: tuple[str, str, str]
+    What is the same in every part of them is worked out once: values of measures by name, errors by column, and codes
+    of blocks, places and sites in the order of their names.
+    """
+
+    key: tuple[str, str, str]
+    names: tuple[str, ...]
+    first: pd.DataFrame  # rows of any matcher: what they say of the queries is the same in all
+    blocks: Ints
+    places: Ints
+    sites: Ints
+    is_answered: Bools
+    is_missing: Bools
+    measured: dict[str, Floats]
+    errors: dict[str, Floats]
+
+    @classmethod
+    def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame]) -> Self:
+        """Columns of the rows of some matchers."""
+        first = next(iter(frames.values()))
+        columns = dict.fromkeys(quantile.column for quantile in QUANTILE_MEASURES)
+        codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
+
+        def beside(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
+            """A column of each matcher, side by side."""
+            return np.column_stack([np.asarray(column(frame)) for frame in frames.values()])
+
+        return cls(
+            key=key,
+            names=tuple(frames),
+            first=first,
+            blocks=codes[0],
+            places=codes[1],
+            sites=codes[2],
+            is_answered=beside(lambda frame: frame["is_answered"].to_numpy(bool)),
+            is_missing=beside(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
+            measured={measure.name: beside(measure.values) for measure in MEASURES[key[1]]},
+            errors={name: beside(partial(_floats, name=name)) for name in columns},
+        )
+
+
+def _floats(frame: pd.DataFrame, name: str) -> Floats:
+    return np.asarray(frame[name].to_numpy(float))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cell:
+    """Some queries of a group: `chosen` are their numbers in it."""
+
+    group: _Group
     stratum: str
-    frames: dict[str, pd.DataFrame]
+    chosen: Ints
     draws: int
 
     @property
     def seed(self) -> int:
         """Of these queries alone, so that all matchers are drawn alike."""
-        text = "/".join((*self.group, self.stratum))
+        text = "/".join((*self.group.key, self.stratum))
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
-    def counted(self, chosen: Bools) -> "_Cell":
-        """Only some of the rows."""
-        frames = {name: frame[chosen] for name, frame in self.frames.items()}
-        return _Cell(group=self.group, stratum=self.stratum, frames=frames, draws=self.draws)
+    def told(self, at: int) -> Told:
+        """What all rows of one matcher say of these queries."""
+        suite, track, prior_group = self.group.key
+        return Told(
+            matcher=self.group.names[at],
+            suite=suite,
+            track=track,
+            prior_group=prior_group,
+            stratum=self.stratum,
+            n=len(self.chosen),
+            answered=int(self.group.is_answered[self.chosen, at].sum()),
+            missing=int(self.group.is_missing[self.chosen, at].sum()),
+            blocks=len(np.unique(self.group.blocks[self.chosen])),
+            places=len(np.unique(self.group.places[self.chosen])),
+        )
 
-    @property
-    def first(self) -> pd.DataFrame:
-        """Rows of any matcher: what they say of the queries is the same in all."""
-        return next(iter(self.frames.values()))
 
-
-def _rows_of_group(group: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int) -> Iterator[Row]:
+def _rows_of_group(key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
-    for name in frames.keys() - able.keys():
-        yield _not_applicable(name, group, frames[name])
+    for name, frame in frames.items():
+        if name not in able:
+            yield _not_applicable(name, key, frame)
     if not able:
         return
-    for stratum, chosen in strata(next(iter(able.values()))):
-        parts = {name: frame[chosen] for name, frame in able.items()}
-        yield from _rows_of_cell(_Cell(group=group, stratum=stratum, frames=parts, draws=draws))
+    group = _Group.of(key, able)
+    counted = {measure.name: measure.counts(group.first) for measure in MEASURES[key[1]]}
+    for stratum, inside in strata(group.first):
+        by_count: dict[bytes, list[Measure]] = {}
+        for measure in MEASURES[key[1]]:
+            mask = inside & counted[measure.name]
+            if mask.any():
+                by_count.setdefault(mask.tobytes(), []).append(measure)
+        for key_of_mask, measures in by_count.items():
+            chosen = np.flatnonzero(np.frombuffer(key_of_mask, dtype=bool))
+            yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), measures)
 
 
-def _not_applicable(name: str, group: tuple[str, str, str], frame: pd.DataFrame) -> Row:
+def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -> Row:
     """The one row of a matcher that cannot."""
-    primary = primary_of(group[1])
-    told = _told(name, group, ALL, frame)
+    suite, track, prior_group = key
+    primary = primary_of(track)
+    told = Told.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
     return told.row(primary.name, primary.unit, primary.better, bare(math.nan), is_applicable=False)
-
-
-def _told(name: str, group: tuple[str, str, str], stratum: str, frame: pd.DataFrame) -> Told:
-    suite, track, prior_group = group
-    return Told.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=stratum)
-
-
-def _rows_of_cell(cell: _Cell) -> Iterator[Row]:
-    """Every figure of every matcher in one stratum."""
-    track = cell.group[1]
-    by_count: dict[bytes, list[Measure]] = {}
-    masks: dict[bytes, Bools] = {}
-    for measure in MEASURES[track]:
-        mask = measure.counts(cell.first)
-        if mask.any():
-            by_count.setdefault(mask.tobytes(), []).append(measure)
-            masks[mask.tobytes()] = mask
-    for key, measures in by_count.items():
-        yield from _mean_rows(cell.counted(masks[key]), measures)
 
 
 def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
     """Means that share a denominator, by the same draws."""
-    names = list(cell.frames)
-    blocks, sites = cell.first["block"].tolist(), cell.first["pair_id"].tolist()
-    table = np.column_stack([measure.values(frame) for measure in measures for frame in cell.frames.values()])
-    drawn = ClusterDraws(blocks=blocks, seed=cell.seed, draws=cell.draws)
-    below = _thresholds(cell, measures)
-    if below:
-        table = np.column_stack((table, *(column for *_, column in below)))
+    group, count = cell.group, len(cell.group.names)
+    told, sites = [cell.told(at) for at in range(count)], group.sites[cell.chosen]
+    below = list(_thresholds(cell, measures))
+    columns = [group.measured[measure.name][cell.chosen] for measure in measures]
+    table = np.column_stack((*columns, *(item.is_below for item in below)))
+    drawn = ClusterDraws(blocks=group.blocks[cell.chosen], seed=cell.seed, draws=cell.draws)
     means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.full((0, table.shape[1]), np.nan)
     for number, measure in enumerate(measures):
-        columns = slice(number * len(names), (number + 1) * len(names))
-        yield from _ranked(cell, measure, table[:, columns], means[:, columns])
-    offset = len(measures) * len(names)
-    for at, (name, quantile, value, column) in enumerate(below):
-        found, how = mean_with_interval(column, sites, means[:, offset + at])
-        errors = cell.frames[name][quantile.column].to_numpy(float)
+        part = slice(number * count, (number + 1) * count)
+        yield from _ranked(cell, told, measure, table[:, part], means[:, part])
+    for at, item in enumerate(below, start=len(measures) * count):
+        found, how = mean_with_interval(table[:, at], sites, means[:, at])
+        errors = group.errors[item.quantile.column][cell.chosen, item.matcher]
         lo, hi = (_inverse(errors, share) for share in (found.lo, found.hi))
-        told = _told(name, cell.group, cell.stratum, cell.frames[name])
-        yield told.row(quantile.name, quantile.unit, "lower", Interval(value=value, lo=lo, hi=hi), how)
+        interval = Interval(value=item.value, lo=lo, hi=hi)
+        yield told[item.matcher].row(item.quantile.name, item.quantile.unit, "lower", interval, how)
 
 
-def _thresholds(cell: _Cell, measures: Sequence[Measure]) -> list[tuple[str, Quantile, float, Floats]]:
-    """For quantiles of errors: matcher, quantile, its value, and which errors do not exceed it (Woodruff 1952)."""
-    is_pose = cell.group[1] == "localization" and any(measure.is_primary for measure in measures)
+@dataclass(frozen=True, kw_only=True)
+class _Below:
+    """A quantile of the errors of one matcher (its number), and which errors do not exceed it."""
+
+    matcher: int
+    quantile: Quantile
+    value: float
+    is_below: Floats
+
+
+def _thresholds(cell: _Cell, measures: Sequence[Measure]) -> Iterator[_Below]:
+    """Quantiles of errors, whose intervals are those of the share below them (Woodruff 1952)."""
+    is_pose = cell.group.key[1] == "localization" and any(measure.is_primary for measure in measures)
     if not is_pose or cell.stratum not in _WHOLE:
-        return []
-    found = []
-    for name, frame in cell.frames.items():
+        return
+    for at in range(len(cell.group.names)):
         for quantile in QUANTILE_MEASURES:
-            errors = frame[quantile.column].to_numpy(float)
+            errors = cell.group.errors[quantile.column][cell.chosen, at]
             value = error_quantile(errors, quantile.share)
-            found.append((name, quantile, value, (errors <= value).astype(float)))
-    return found
+            yield _Below(matcher=at, quantile=quantile, value=value, is_below=(errors <= value).astype(float))
 
 
 def _inverse(errors: Floats, share: float) -> float:
@@ -187,17 +240,16 @@ def _inverse(errors: Floats, share: float) -> float:
     return error_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
 
 
-def _ranked(cell: _Cell, measure: Measure, table: Floats, means: Floats) -> Iterator[Row]:
+def _ranked(cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, means: Floats) -> Iterator[Row]:
     """Rows of one measure; of the primary one with ranks."""
-    names, blocks, sites = list(cell.frames), cell.first["block"].tolist(), cell.first["pair_id"].tolist()
+    names, blocks, sites = cell.group.names, cell.group.blocks[cell.chosen], cell.group.sites[cell.chosen]
     found = [mean_with_interval(table[:, at], sites, means[:, at]) for at in range(len(names))]
     ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if measure.is_primary else {}
     for at, name in enumerate(names):
         interval, how = found[at]
-        told = _told(name, cell.group, cell.stratum, cell.frames[name])
         rank = ranks.get(name, RankInterval(best=0, worst=0))
         detectable = _detectable(name, names, table, blocks) if measure.is_primary else math.nan
-        yield told.row(
+        yield told[at].row(
             measure.name,
             measure.unit,
             measure.better,
@@ -220,23 +272,23 @@ def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure
     return {names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
 
 
-def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Sequence[str]) -> float:
+def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Ints) -> float:
     """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
     others = [at for at, other in enumerate(names) if other != name and other not in UNRANKED]
-    if not others or name in UNRANKED or len(set(blocks)) < 2:  # noqa: PLR2004 - one block says nothing of others
+    if not others or name in UNRANKED or (blocks == blocks[0]).all():
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable
 
 
-def mean_with_interval(values: Floats, sites: Sequence[str], draws: Floats) -> tuple[Interval, str]:
+def mean_with_interval(values: Floats, sites: Sequence[str] | Ints, draws: Floats) -> tuple[Interval, str]:
     """A mean of values in [0, 1] with its interval, and how it was found.
 
     Parameters
     ----------
     values : ndarray of float, shape (N,)
         One for each query.
-    sites : sequence of str, length N
+    sites : sequence of str or ndarray of int, length N
         Site of each: the queries of one site show one place.
     draws : ndarray of float, shape (D,)
         Means of the bootstrap; none where there are fewer than two blocks.

@@ -5,15 +5,17 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.evidence import CELLS_PER_BYTE
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
@@ -297,6 +299,26 @@ def read_ids(folder: Path) -> list[str]:
         raise StoreError(message) from error
 
 
+def read_view_bytes(folder: Path) -> dict[str, int]:
+    """Bytes of what each query shows, as it travels: the packed view, confidences and vectors, nothing compressed.
+
+    The size of a packed view follows from its shape, so that no view is read.
+    """
+    found: dict[str, int] = {}
+    columns = ["query_id", "rows", "cols", "classes", "confidence", "vectors"]
+    with _named(folder / QUERIES):
+        for batch in _batches_of(folder / QUERIES, columns):
+            shape = (batch["rows"], batch["cols"], pc.list_value_length(batch["classes"]))
+            cells = np.prod([np.asarray(side, dtype=np.int64) for side in shape], axis=0)
+            confidence = np.asarray(pc.fill_null(pc.binary_length(batch["confidence"]), 0))
+            vectors = batch["vectors"]
+            ends = np.concatenate(([0], np.cumsum(np.asarray(pc.binary_length(vectors.values.field("wkb"))))))
+            offsets = np.asarray(vectors.offsets)
+            total = -(-cells // CELLS_PER_BYTE) + confidence + ends[offsets[1:]] - ends[offsets[:-1]]
+            found |= dict(zip(batch["query_id"].to_pylist(), total.tolist(), strict=True))
+    return found
+
+
 def read_queries(folder: Path) -> Iterator[Query]:
     """Queries of a task in the order of their ids, a row group in memory at a time."""
     for row in _rows(folder / QUERIES, QUERY_SCHEMA):
@@ -324,13 +346,22 @@ def _check_columns(path: Path, found: Sequence[str], needed: Sequence[str]) -> N
 
 
 def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:
+    with _named(path):
+        for batch in _batches_of(path, schema.names):
+            yield from batch.to_pylist()
+
+
+def _batches_of(path: Path, columns: list[str]) -> Iterator[pa.RecordBatch]:
+    with pq.ParquetFile(path) as source:
+        _check_columns(path, source.schema_arrow.names, columns)
+        yield from source.iter_batches(batch_size=_ROWS, columns=columns)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Tell what cannot be read in one line that names the file."""
     try:
-        with pq.ParquetFile(path) as source:
-            _check_columns(path, source.schema_arrow.names, schema.names)
-            for batch in source.iter_batches(batch_size=_ROWS, columns=schema.names):
-                yield from batch.to_pylist()
-    except StoreError:
-        raise
+        yield
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         text = " ".join(str(error).split())[:200]
         message = f"{path} cannot be read ({text}): make the queries again"

@@ -18,6 +18,7 @@ from sasgeo_bench.metrics.integrity import (
     aurc,
     choose_threshold,
     coverage_at_risk,
+    drawn_areas,
     excess_aurc,
     false_fix_rate,
     operate,
@@ -65,6 +66,16 @@ def test_the_area_with_ties_is_the_mean_over_all_their_orders(rows) -> None:
     assert augrc(answers) == pytest.approx(np.mean(generalized))
     best = min(area_of_order(false[list(order)]) for order in itertools.permutations(range(len(rows))))
     assert excess_aurc(answers) == pytest.approx(aurc(answers) - best, abs=1e-12)
+
+
+@given(rows=ROWS, seed=st.integers(0, 2**32))
+def test_areas_of_many_draws_are_those_of_each(rows, seed) -> None:
+    answers = answers_of(rows)
+    rng = np.random.default_rng(seed)
+    weights = rng.integers(0, 3, (4, len(rows))) * rng.choice((1.0, 0.7))
+    found = drawn_areas(answers, weights)
+    np.testing.assert_allclose(found.aurc, [aurc(answers, row) for row in weights], atol=1e-12)
+    np.testing.assert_allclose(found.augrc, [augrc(answers, row) for row in weights], atol=1e-12)
 
 
 def test_areas_worked_by_hand() -> None:

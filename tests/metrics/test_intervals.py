@@ -104,6 +104,19 @@ def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch)
     assert not np.array_equal(chunks[0], chunks[1])
 
 
+@given(blocks=BLOCKS, draws_queries=st.booleans())
+def test_sums_are_those_of_the_weights_and_numbers_serve_as_names(blocks, draws_queries) -> None:
+    drawn = ClusterDraws(blocks=blocks, seed=5, draws=20, draws_queries=draws_queries)
+    table = np.random.default_rng(6).random((len(blocks), 3))
+    sums = np.vstack(list(drawn.sums(table)))
+    np.testing.assert_allclose(sums, np.vstack(list(drawn.weights())) @ table, rtol=1e-12)
+    hits = (table > 0.5).astype(float)  # whole numbers come out whole
+    assert np.array_equal(np.vstack(list(drawn.sums(hits))), np.vstack(list(drawn.weights())) @ hits)
+    numbers = np.unique(blocks, return_inverse=True)[1]
+    same = ClusterDraws(blocks=numbers, seed=5, draws=20, draws_queries=draws_queries)
+    assert np.array_equal(np.vstack(list(same.sums(table))), sums)
+
+
 @pytest.mark.parametrize("draws_queries", [True, False])
 def test_the_spread_of_means_is_what_theory_says(draws_queries) -> None:
     # B equal blocks of n: variance of block means / B, and with queries drawn the mean variance within / (B n).

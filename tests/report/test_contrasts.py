@@ -74,8 +74,8 @@ def test_kinds_choose_and_controls_and_falsifiers_do_not_count():
 def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
     table = scores(errors(0.6), blocks=60)
     is_false = ~table["is_right"].to_numpy(bool)
-    sure = table.assign(p_false=np.where(is_false, 0.9, 0.1))
-    blind = table.assign(p_false=np.random.default_rng(2).random(len(table)))
+    sure = table.assign(p_right=np.where(is_false, 0.1, 0.9))
+    blind = table.assign(p_right=np.random.default_rng(2).random(len(table)))
     contrast = Contrast(
         name="rejection",
         first="mine x logistic",

@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.evidence import Evidence
+from sasgeo_bench.metrics.cost import observation_bytes
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
@@ -26,6 +27,7 @@ from sasgeo_bench.store.taskdir import (
     read_queries,
     read_task,
     read_truths,
+    read_view_bytes,
     task_faults,
     write_task,
 )
@@ -214,6 +216,7 @@ def test_a_task_comes_back_from_disk_as_it_was(tmp_path_factory, pairs):
         check_same(back, query)
     assert list(read_truths(truth_folder)) == [truth for _, truth in pairs]
     assert sum(read_task(task_folder)["counts"].values()) == len(pairs)
+    assert read_view_bytes(task_folder) == {query.query_id: observation_bytes(query) for query, _ in pairs}
 
 
 def test_more_queries_than_fit_into_a_row_group_keep_their_order(folders):
@@ -221,6 +224,7 @@ def test_more_queries_than_fit_into_a_row_group_keep_their_order(folders):
     write_task(*folders, ((one_query(query_id=name), one_truth(query_id=name)) for name in names), ABOUT)
     assert pq.ParquetFile(folders[0] / QUERIES).num_row_groups == 3
     assert [query.query_id for query in read_queries(folders[0])] == names
+    assert read_view_bytes(folders[0]) == dict.fromkeys(names, observation_bytes(one_query()))
     assert [truth.query_id for truth in read_truths(folders[1])] == names
     assert task_faults(*folders) == []
 

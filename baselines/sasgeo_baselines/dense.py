@@ -17,6 +17,7 @@ from sasgeo_bench.pose import Pose, Prior
 
 _FEW: Final = 32  # places a side: more cost less by transforms of planes
 _TILE: Final = 256  # places a side that are searched at once; larger ones take more memory and save no time
+_NOTHING: Final = 1e-6  # known cells: less is the rounding of a transform
 _SPREAD: Final = 2.0  # standard deviations of heading and scale that are searched
 _MARGIN_M: Final = 12.0  # how far a mode may move while it is refined
 _WIDEN: Final = 0.05  # how far its scale may leave those that were searched
@@ -305,11 +306,12 @@ class Search:
                 [self.view.turned(blurred, self._turns[at], half=half, step_m=step_m) for at in some[:, 0]]
             )
             known = templates[:, -1].sum(axis=(1, 2), dtype=np.float64)
-            least = np.where(known > 0, self.plan.least_overlap * known, math.inf)[:, None, None, None]
+            least = np.where(known > 0, self.plan.least_overlap * known, math.inf).astype(np.float32)
             spectrum = how.templates(templates)
             for tile, window, best in zip(tiles, windows, votes, strict=True):
                 total, counted = how.votes(window, spectrum)
-                score = np.divide(total, counted, out=np.full_like(total, NOWHERE), where=counted >= least)
+                enough = counted >= least[:, None, None, None]
+                score = np.where(enough, total / np.maximum(counted, _NOTHING), NOWHERE)
                 for k in range(1, quarters):
                     score[:, k] = np.rot90(score[:, k], -k, (1, 2))
                 score = score.reshape(some.size, -1)

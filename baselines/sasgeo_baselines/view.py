@@ -140,8 +140,8 @@ class Patch:
         # A pose is an affine map, so three points give it, and each sample lies at a sum of two numbers.
         corners = pose.to_map(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
         middle, right, up = self.grid.to_uv(corners)
-        along, across = np.outer(up - middle, samples.up_m), np.outer(right - middle, samples.right_m)
-        along += middle[:, None]
+        along = middle[:, None] + (up - middle)[:, None] * samples.up_m
+        across = (right - middle)[:, None] * samples.right_m
         total = counted = 0.0
         for rows in _blocks(*samples.counts.shape):
             # Nothing lies left of the square or above it, so to cut off is to round down.

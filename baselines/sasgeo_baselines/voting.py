@@ -229,7 +229,7 @@ class ByPlanes:
         """Sum of gains and number of known cells, shape (T, Q, places, places) each."""
         shape = (len(templates.score), len(window), self.places, self.places)
         total, counted = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-        for at, square in np.ndindex(shape[:2]):
+        for at, square in np.ndindex(*shape[:2]):
             template = Spectrum(score=templates.score[at], counts=templates.counts[at])
             pair = vote_spectra(window[square], template, self.size)
             total[at, square], counted[at, square] = (part[: self.places, : self.places] for part in pair)

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Head, Truth
@@ -28,7 +28,7 @@ from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.boardfile import Extra, write_board
+from sasgeo_bench.store.boardfile import Extra, check_board, write_board
 from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.validate import validate
 
@@ -53,6 +53,8 @@ class ScoreRequest:
         Task folders; without any, those that the runs and files answer.
     root : Path
         Where tasks/ and truth/ are.
+    truth : Path, optional
+        Folder of the truths, where it is another one.
     split : Split, optional
         Says which blocks are one place, and which calibrate; needed for rejectors.
     contrasts : sequence of Contrast
@@ -73,6 +75,7 @@ class ScoreRequest:
     root: Path
     board: Path
     tasks: Sequence[Path] = ()
+    truth: Path | None = None
     split: Split | None = None
     contrasts: Sequence[Contrast] = ()
     rejectors: Sequence[str] = ()
@@ -199,14 +202,18 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     ConfigError
         If there is nothing to score, or rejectors are asked for without a split.
     """
+    check_board(request.board, scorer_version=SCORER_VERSION)
     judges = _judges(request)
     entries = find_entries(request.predictions)
     predictions = {entry.name: _predictions(entry) for entry in entries}
     folders = list(request.tasks) or list(_answered(entries, predictions, request.root))
     if not folders:
-        message = "there is nothing to score: no task of this folder is answered by these predictions"
+        message = (
+            f"there is nothing to score: no task in {request.root / 'tasks'} is answered "
+            "(--out names another root, --tasks the tasks themselves)"
+        )
         raise ConfigError(message)
-    tasks = [_read_task(folder, request.root) for folder in folders]
+    tasks = [_read_task(folder, request.truth or request.root / "truth") for folder in folders]
     for entry in entries:
         if entry.how == AS_SUBMITTED:
             _check_file(entry.sources[0], folders)
@@ -303,7 +310,7 @@ def _check_file(path: Path, folders: Sequence[Path]) -> None:
     """Refuse a file of predictions that is not what the tasks ask for; queries without a row are misses, no faults."""
     faults = [fault for fault in validate(path, folders) if not fault.is_missing_row]
     if faults:
-        message = f"{path} holds {len(faults)} faults, the first: {faults[0].to_text()} ('validate' lists all)"
+        message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
         raise ConfigError(message)
 
 
@@ -320,9 +327,9 @@ class _Task:
 
 
 def _read_task(folder: Path, root: Path) -> _Task:
-    """A task and its truths, after they were held against each other."""
+    """A task and its truths from their own root, after they were held against each other."""
     about = taskdir.read_task(folder)
-    truth = _truth_folder(about, root)
+    truth = root / str(about["suite"]) / str(about["region"])
     taskdir.check_truths(folder, truth)
     heads, truths = tuple(taskdir.read_heads(folder)), tuple(taskdir.read_truths(truth))
     return _Task(
@@ -345,8 +352,10 @@ def _area_km2(region: Path) -> float | None:
     return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
-def _truth_folder(about: Mapping[str, Any], root: Path) -> Path:
-    return root / "truth" / str(about["suite"]) / str(about["region"])
+def _folder_of(entry: Entry, about: Mapping[str, Any]) -> Path:
+    """Where a run holds its answers to a task."""
+    same = [(run["suite"], run["region"]) == (about["suite"], about["region"]) for run in entry.runs]
+    return entry.sources[same.index(True)]
 
 
 def _scored(
@@ -359,7 +368,10 @@ def _scored(
     for task in tasks:
         asked = ran_on.get((task.about["suite"], task.about["region"]))
         if asked is not None and asked != task.about["files"][taskdir.QUERIES]["sha256"]:
-            message = f"{entry.name} answered other queries than {task.folder} holds now: run it again"
+            message = (
+                f"{_folder_of(entry, task.about)} holds answers to other queries than {task.folder} does now: "
+                "move it away and run again, or make the old queries again"
+            )
             raise StoreError(message)
         mine = {head.query_id: predictions[head.query_id] for head in task.heads if head.query_id in predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)

@@ -2,6 +2,17 @@
 """The errors users meet: every one is a `SasgeoError` and fits on one line that names the fault and the mend."""
 
 
+def counted(count: int, one: str, many: str = "") -> str:
+    """How many of something, as a line says it; the plural is `one` with an s unless it is given.
+
+    Examples
+    --------
+    >>> counted(1, "block"), counted(2, "block"), counted(0, "query", "queries")
+    ('1 block', '2 blocks', '0 queries')
+    """
+    return f"{count} {one if count == 1 else many or one + 's'}"
+
+
 class SasgeoError(Exception):
     """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
 

@@ -190,7 +190,8 @@ class Split:
         for place in self.spec.place:
             count, part = len(self.blocks[place.name]), place.part or "test in its own fold"
             regions = ", ".join(dict.fromkeys(block.region for block in self.blocks[place.name]))
-            lines.append(f"  {part:12s} {place.name:18s} {count:4d} blocks  {regions}")
+            blocks = f"{count:4d} {'block' if count == 1 else 'blocks':6s}"
+            lines.append(f"  {part:12s} {place.name:18s} {blocks}  {regions}")
         near = nearest_pair(self)
         if near is not None:
             lines.append(f"  nearest blocks of two parts: {near.first} and {near.second}, {near.gap_m:,.0f} m")

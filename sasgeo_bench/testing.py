@@ -350,7 +350,7 @@ class _Kit:
         if not seconds:
             return Check(name=name, outcome="not applicable", found="no query to try it with")
         each_s = sum(seconds) / len(seconds)
-        found = f"{each_s:.3f} s a query, {self.worker.peak_bytes / 2**20:.0f} MiB at most"
+        found = f"{each_s:.3f} s a query, {self.worker.peak_bytes / 1e6:.0f} MB at most"
         return Check(name=name, outcome="pass" if each_s < _QUICK_S else "fail", found=found)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.errors import MatchError, PoseError, StoreError
+from sasgeo_bench.errors import MatchError, PoseError, StoreError, counted
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import STATUSES
@@ -119,7 +119,11 @@ def _row_faults(
         if item["candidates"]:
             count = len(item["candidates"])
             yield Violation(
-                file=file, row=row, column="candidates", found=f"{count} poses", expected=f"none with {item['status']}"
+                file=file,
+                row=row,
+                column="candidates",
+                found=counted(count, "pose"),
+                expected=f"none with {item['status']}",
             )
         return
     yield from _answer_faults(file, row, item, queries[name])

@@ -204,6 +204,12 @@ def break_truth(out):
     edit_json(out / "truth" / "clean" / TOWNS[0] / "truth.json", queries_sha256="0" * 64)
 
 
+def age_truth(out):
+    path = out / "truth" / "clean" / TOWNS[0] / "truth.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.replace_schema_metadata(table.schema.metadata | {b"task_version": b"0"}), path)
+
+
 def lose_truth(out):
     (out / "truth" / "clean" / TOWNS[0] / "truth.parquet").unlink()
 
@@ -223,8 +229,9 @@ def cut_part(out):
     [
         (break_task, "has task version 0, this version reads 1"),
         (break_truth, "holds the truths of other queries"),
-        (lose_truth, "holds no truths of"),
-        (break_run, "answered other queries than"),
+        (lose_truth, "holds no truths of .*: name their folder with --truth, or make the queries again"),
+        (age_truth, "holds truths of task version 0, this version reads 1: make the queries again"),
+        (break_run, r"holds answers to other queries than .* does now: move it away and run again, or make the old"),
         (cut_part, "cannot be read"),
     ],
 )
@@ -240,9 +247,17 @@ def test_a_board_of_another_scorer_version_is_not_replaced(out, monkeypatch):
     before = (out / "boards" / "mine" / "leaderboard.parquet").read_bytes()
     board_of(out)  # of the same version it is
     monkeypatch.setattr(boards, "SCORER_VERSION", 2)
+    monkeypatch.setattr(boards, "find_entries", None)  # refused before anything is read
     with pytest.raises(StoreError, match="rows of scorer version 1, this one is 2"):
         board_of(out)
     assert (out / "boards" / "mine" / "leaderboard.parquet").read_bytes() == before
+
+
+def test_truths_may_lie_in_a_folder_of_another_name(out, tmp_path):
+    shutil.move(out / "truth", tmp_path / "secret")
+    with pytest.raises(StoreError, match="name their folder with --truth"):
+        board_of(out)
+    assert primary(board_of(out, truth=tmp_path / "secret"), "oracle_pose")["value"] == 1.0
 
 
 def test_a_folder_with_other_things_is_not_replaced(out):
@@ -258,7 +273,7 @@ def test_a_file_that_validate_refuses_is_not_scored(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     table = pq.read_table(tmp_path / "mine.parquet")
     pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), tmp_path / "mine.parquet")
-    with pytest.raises(ConfigError, match=r"holds 1 faults, the first: .*each query once.*'validate' lists all"):
+    with pytest.raises(ConfigError, match=r"holds 1 fault: .*each query once.*'validate' lists all"):
         board_of(out, tmp_path / "mine.parquet")
     assert not (out / "boards").exists()
 
@@ -276,7 +291,7 @@ def test_a_rejector_that_fails_is_named(out, split):
 def test_nothing_to_score_is_told(out, tmp_path):
     rundir.write_part(tmp_path / "foreign", [Prediction(query_id="f" * 24)])
     (part,) = rundir.parts_of(tmp_path / "foreign")
-    with pytest.raises(ConfigError, match="nothing to score"):
+    with pytest.raises(ConfigError, match=r"nothing to score: no task in .*/out/tasks is answered \(--out names"):
         board_of(out, part)
     with pytest.raises(StoreError, match="holds no run"):
         board_of(out, tmp_path / "foreign")

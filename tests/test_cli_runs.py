@@ -160,7 +160,7 @@ def test_a_run_says_what_is_left_is_cut_off_goes_on_and_is_validated_and_merged(
     code, told, err = program(*GOOD, "--jobs", "2")
     assert (code, told, err) == (0, f"{folder}\n", f"good 1: {len(ids) - 2} ok\n")
     code, told, err = program("validate", "--predictions", folder, "--tasks", TASK)
-    assert (code, told, err) == (0, f"{folder}: answers every query of 1 tasks, and nothing else\n", "")
+    assert (code, told, err) == (0, f"{folder}: answers every query of 1 task, and nothing else\n", "")
     code, told, err = program("merge", "--runs", folder, "--into", "all.parquet")
     assert (code, told, err) == (0, f"all.parquet: {len(ids)} predictions\n", "")
 
@@ -221,7 +221,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
         (("--top-k", "0"), "--top-k must be at least 1, got 0"),
         (("--match-s", "nan"), "--match-s must be seconds between 0 and 604800, got nan"),
         (("--prepare-s", "0"), "--prepare-s must be seconds between 0 and 604800, got 0"),
-        (("--memory-mb", "1"), "--memory-mb must lie between 64 and 4194304, got 1"),
+        (("--memory-mb", "1"), "--memory-mb must lie between 64 and 4000000, got 1"),
         (
             ("--again", "late"),
             "--again must be one of ok, timeout, crash, invalid, refused, not applicable, got 'late'",
@@ -290,7 +290,9 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
         about.write_text(text)
         assert "run.json is damaged: remove it and run again, the parts beside it are kept" in mistake(*ORACLE)
     about.write_text('{"queries_sha256": "0"}')
-    assert "holds answers to other queries than" in mistake(*ORACLE)
+    told = mistake(*ORACLE)
+    assert "holds answers to other queries than" in told
+    assert told.endswith("move it away and run again, or make the old queries again")
     about.unlink()
     about.mkdir()
     part.unlink()
@@ -361,6 +363,16 @@ def test_missing_double_and_foreign_rows_get_a_line_each_and_exit_2(program, min
         f"mine.parquet, row {count}, query_id: found 'feedfeed', expected the id of a query of the tasks",
         f"mine.parquet, query_id: found no row for {ids[0]}, expected one for every query",
     ]
+
+
+def test_of_many_queries_without_a_row_some_are_named_and_the_rest_counted(program, mine, ids, monkeypatch) -> None:
+    monkeypatch.setattr("sasgeo_bench.cli.runs.MOST_MISSING", 2)
+    path = mine([Prediction(query_id=ids[0])])
+    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    assert (code, err) == (2, f"mine.parquet: {len(ids) - 1} violations\n")
+    *named, last = told.splitlines()
+    assert [line.split()[6].rstrip(",") for line in named] == ids[1:3]
+    assert last.startswith(f"mine.parquet, query_id: found no row for {len(ids) - 3} more quer")
 
 
 def test_a_column_that_is_missing_is_told_once_and_not_for_every_query(program, mine) -> None:

@@ -52,7 +52,7 @@ def test_a_sound_file_has_no_violation(tmp_path, task, answers):
         ({"candidates": ((POSE, float("inf")),)}, "candidates", "score is inf"),
         ({"candidates": ((POSE, 1.0), (POSE, 2.0))}, "candidates", "scores rise from 1 to 2 at place 1"),
         ({"status": "fine"}, "status", "'fine'"),
-        ({"status": "crash"}, "candidates", "1 poses"),
+        ({"status": "crash"}, "candidates", "1 pose"),
         ({"latency_s": -1.0}, "latency_s", "-1.0"),
         ({"query_id": "0" * 24}, "query_id", f"'{'0' * 24}'"),
         ({"diagnostics": {"margin": float("nan")}}, "diagnostics", "diagnostics['margin'] is nan"),

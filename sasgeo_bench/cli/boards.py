@@ -57,6 +57,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         predictions=predictions,
         tasks=tasks or (),
         root=out if truth is None else truth.resolve().parent,
+        truth=truth,
         split=_split(split, region_folders or []),
         rejectors=rejector or (),
         board=out / "boards" / name,
@@ -107,6 +108,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         board = run_pipeline(plan, tell=tell)
     show_board(board)
     typer.echo(str(board_folder(plan)))
+    tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")
     _check_controls(board)
 
 

@@ -9,13 +9,14 @@ from typing import Annotated, Final
 import typer
 
 from sasgeo_bench.cli.console import EXIT_USER, Bars, Out, tell
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store.rundir import merge_runs
 from sasgeo_bench.validate import validate
 
+MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 
@@ -32,8 +33,9 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     limit: Annotated[int | None, typer.Option(help="queries of each task at most")] = None,
     match_s: Annotated[float, typer.Option(help="seconds for one query")] = Limits().match_s,
     prepare_s: Annotated[float, typer.Option(help="seconds for one map")] = Limits().prepare_s,
-    memory_mb: Annotated[int, typer.Option(help="MiB for all processes of the matcher")] = Limits().memory_bytes
-    // 2**20,
+    memory_mb: Annotated[
+        int, typer.Option(help="MB (10^6 bytes) for all processes of the matcher")
+    ] = Limits().memory_bytes // 10**6,
     again: Annotated[list[str] | None, typer.Option(help="ask rows of this status again, as in timeout")] = None,
     trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in; run.json says so")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is left to do, and stop")] = False,
@@ -45,7 +47,7 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
         tasks=tasks,
         out=out,
         top_k=top_k,
-        limits=Limits(match_s=match_s, prepare_s=prepare_s, memory_bytes=memory_mb * 2**20),
+        limits=Limits(match_s=match_s, prepare_s=prepare_s, memory_bytes=memory_mb * 10**6),
         jobs=jobs,
         dask=dask,
         shard=_shard(shard),
@@ -85,7 +87,7 @@ def merge_command(
 ) -> None:
     """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
     count = merge_runs(runs, into)
-    typer.echo(f"{into}: {count} predictions")
+    typer.echo(f"{into}: {counted(count, 'prediction')}")
 
 
 def validate_command(
@@ -93,12 +95,17 @@ def validate_command(
     predictions: Annotated[Path, typer.Option(help="predictions file, or the folder of a run")],
     tasks: Annotated[list[Path], typer.Option(help="task folder; may be repeated")],
 ) -> None:
-    """List everything in which predictions are not what the tasks ask for."""
-    count = 0
+    """List everything in which predictions are not what the tasks ask for; many queries without a row are counted."""
+    count = missing = 0
     for violation in validate(predictions, tasks):
-        typer.echo(violation.to_text())
         count += 1
+        missing += violation.is_missing_row
+        if missing <= MOST_MISSING or not violation.is_missing_row:
+            typer.echo(violation.to_text())
+    if missing > MOST_MISSING:
+        more = counted(missing - MOST_MISSING, "more query", "more queries")
+        typer.echo(f"{predictions.name}, query_id: found no row for {more}, expected one for every query")
     if count:
-        tell(f"{predictions}: {count} violations")
+        tell(f"{predictions}: {counted(count, 'violation')}")
         raise typer.Exit(EXIT_USER)
-    typer.echo(f"{predictions}: answers every query of {len(tasks)} tasks, and nothing else")
+    typer.echo(f"{predictions}: answers every query of {counted(len(tasks), 'task')}, and nothing else")

@@ -249,10 +249,12 @@ class _Picked:
 
     def picks(self, rows: int) -> csr_array | Floats:
         """The same, as a table with one entry for each query that is taken."""
-        if self.within is None:
+        if self.within is None and self.size > 1:
             return self.weights(rows)
         first = np.arange(self.copies.shape[1], dtype=np.int32) * self.size
-        column = np.repeat(np.tile(first, rows), self.copies.ravel() * self.size) + self.within
+        column = np.repeat(np.tile(first, rows), self.copies.ravel() * self.size)
+        if self.within is not None:
+            column += self.within
         ends = np.concatenate(([0], np.cumsum(self.copies.sum(axis=1) * self.size)))
         return csr_array((np.ones(len(column)), column, ends), shape=(rows, len(self.queries)))
 

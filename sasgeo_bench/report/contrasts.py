@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.metrics.base import Floats
 from sasgeo_bench.metrics.compare import holm, mcnemar_clustered, mcnemar_exact
 from sasgeo_bench.metrics.decisions import Answers
@@ -262,7 +262,9 @@ def _with_verdict(found: Finding) -> Finding:
     if not found.n:
         return replace(found, verdict="not tested: no query")
     if found.blocks < LEAST_BLOCKS:
-        return replace(found, verdict=f"not decided: {found.blocks} blocks, at least {LEAST_BLOCKS} are needed")
+        return replace(
+            found, verdict=f"not decided: {counted(found.blocks, 'block')}, at least {LEAST_BLOCKS} are needed"
+        )
     least = found.min_effect * (1.0 if found.metric == "primary" else abs(found.second_value))
     is_better = found.difference > 0 if found.metric == "primary" else found.difference < 0
     if found.p_holm <= ALPHA and (found.lo > 0 or found.hi < 0):

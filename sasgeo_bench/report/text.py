@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import pandas as pd
 
+from sasgeo_bench.errors import counted
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
@@ -85,7 +86,7 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
                 "detectable": _number(main["detectable"]),
                 "n": str(main["n"]),
                 "missing": str(main["missing"]),
-                "blocks": f"{main['blocks']} in {main['places']} places",
+                "blocks": f"{main['blocks']} in {counted(main['places'], 'place')}",
                 "_key": -math.inf if math.isnan(main["value"]) else main["value"],
             }
         )
@@ -155,24 +156,47 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
         blocks, places = int(board["blocks"].max()), int(board["places"].max())
         if blocks < _FEW_BLOCKS or places < _FEW_PLACES:
             said.append(
-                f"{blocks} blocks in {places} places: fewer than {_FEW_BLOCKS} in {_FEW_PLACES}, so intervals speak of "
-                "these places and little of others."
+                f"{counted(blocks, 'block')} in {counted(places, 'place')}: fewer than {_FEW_BLOCKS} in {_FEW_PLACES}, "
+                "so intervals speak of these places and little of others."
             )
         # Between them these two count every query once: present places, and absent ones.
         whole = board[board["metric"].isin((ANSWERED.name, FALSE_ABSENT.name)) & (board["stratum"] == ALL)]
         for matcher, count in whole.groupby("matcher")["missing"].sum().items():
             if count:
-                said.append(f"{matcher}: {count} queries have no row and count as misses.")
+                rest = "has no row and counts as a miss" if count == 1 else "have no row and count as misses"
+                said.append(f"{matcher}: {counted(count, 'query', 'queries')} {rest}.")
     return said
 
 
 _NOTE: Final = (
     "Intervals are 95 %: a bootstrap over blocks, then queries ({draws} draws), or Wilson's where blocks say nothing. "
-    "A rank is an interval: matchers that share one cannot be told apart. `detectable` is the least difference from "
-    "the best other matcher that these queries would show, inf where none would. Nothing is ranked across prior "
-    "groups. The first figure of each table is over the stressed queries (n of them, missing without a row), `control` "
-    "over the same places without the stress; `false fixes` is the share of absent places that were answered."
+    "A rank is an interval: matchers that share one cannot be told apart. Nothing is ranked across prior groups. "
+    "What each column says is told at the end."
 )
+_TERMS: Final = {  # docs/scoring.md says the same at more length
+    "success_25m, recall_1": "share of the stressed queries whose pose is within 25 m and 5 deg; whose first candidate "
+    "is the right one, ties counted in proportion. Without an answer a query is a miss",
+    "control": "the same figure at the same places without the stress; under `rank`, a matcher that is no rival",
+    "false fixes": "share of absent places that were answered",
+    "detectable": "least difference from the best other matcher that these queries would show; inf where none would",
+    "n, missing, blocks": "queries counted; those of them without a row; pieces of ground they come from, which are "
+    "what intervals count",
+    "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
+    "discordant": "queries that only the first method got right, and only the second",
+    "rejector": "says of each answer how likely it is false; `own` is the matcher's own confidence, fitted to nothing",
+    "aurc": "mean share of false fixes among the surest 1, 2, ..., all queries; lower is better",
+    "coverage_at_risk_0.05, risk_reached_at_0.05": "share of queries accepted by the threshold that kept false fixes "
+    "at 5 % on other places, and the share of false fixes among them here",
+    "brier, ece": "how far the stated chances are from what came true: mean square; mean distance by bins of equal "
+    "mass",
+    "cost_20, cost_20_place": "mean cost of a query if a fix is accepted where its chance to be false is below "
+    "1 / (1 + 20) and a false fix costs 20: withheld right fixes cost 1 each, or every present place without an "
+    "accepted fix does. By the first compare rejectors on one matcher, by the second whole methods",
+    "latency, prepare, peak_memory, cpu_per_fix": "of `match` alone; of a map once; of all its processes; processor "
+    "seconds of all queries over answered ones",
+    "map_per_km2, observation_per_fix": "files of the maps and what the matcher added to them over the mapped area; "
+    "views of all queries, packed and not compressed, over answered ones (1 kB = 1000 bytes, 1 MB = 10^6)",
+}
 
 
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
@@ -214,6 +238,7 @@ def board_markdown(
         lines += [f"## {title}", "", *markdown_table(table), ""]
     if verdicts:
         lines += ["## Controls", "", _CONTROLS_NOTE, "", *markdown_table(control_table(verdicts)), ""]
+    lines += ["## How to read", "", *(f"- **{term}**: {meaning}." for term, meaning in _TERMS.items()), ""]
     return "\n".join(lines)
 
 
@@ -243,7 +268,7 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
             "p (Holm)": _number(item.p_holm),
             "discordant": f"{item.first_only} and {item.second_only}",
             "detectable": _number(item.detectable),
-            "n": f"{item.n} in {item.blocks} blocks",
+            "n": f"{item.n} in {counted(item.blocks, 'block')}",
             "verdict": item.verdict,
         }
         for item in findings

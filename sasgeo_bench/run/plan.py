@@ -18,7 +18,8 @@ from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
 
 _MOST_S: Final = 7 * 86_400.0
-_LEAST_BYTES, _MOST_BYTES = 64 * 2**20, 2**42
+_BYTES_PER_MB = 10**6
+_LEAST_MB, _MOST_MB = 64, 4_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,9 +135,9 @@ def _check(request: RunRequest) -> None:
         if not 0 < seconds <= _MOST_S:
             message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
             raise ConfigError(message)
-    if not _LEAST_BYTES <= limits.memory_bytes <= _MOST_BYTES:
-        allowed = f"between {_LEAST_BYTES >> 20} and {_MOST_BYTES >> 20}"
-        message = f"--memory-mb must lie {allowed}, got {limits.memory_bytes >> 20}"
+    memory_mb = limits.memory_bytes // _BYTES_PER_MB
+    if not _LEAST_MB <= memory_mb <= _MOST_MB:
+        message = f"--memory-mb must lie between {_LEAST_MB} and {_MOST_MB}, got {memory_mb}"
         raise ConfigError(message)
     strange = next((status for status in request.again if status not in STATUSES), None)
     if strange is not None:
@@ -186,7 +187,8 @@ def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about:
     now = about["files"][taskdir.QUERIES]["sha256"]
     if before is not None and before.get("queries_sha256") != now:
         message = (
-            f"{folder} holds answers to other queries than {task} does now: move it away, or make the old queries again"
+            f"{folder} holds answers to other queries than {task} does now: "
+            "move it away and run again, or make the old queries again"
         )
         raise StoreError(message)
     if before is not None and before.get("hash") != found:

@@ -48,7 +48,7 @@ class Limits:
 
     match_s: float = 30.0
     prepare_s: float = 600.0
-    memory_bytes: int = 4 * 2**30
+    memory_bytes: int = 4 * 10**9
     file_bytes: int = 2**30
 
 
@@ -254,7 +254,7 @@ class Worker:
 
 class _TooLarge(Exception):  # noqa: N818 - a limit, told as a row's message
     def __init__(self, found: int, most: int) -> None:
-        super().__init__(f"{found / 2**20:.0f} MiB of memory, at most {most / 2**20:.0f} are allowed")
+        super().__init__(f"{found / 1e6:.0f} MB of memory, at most {most / 1e6:.0f} are allowed")
 
 
 def _memory_bytes(family: Sequence[psutil.Process], *, shared: bool) -> int:

@@ -250,7 +250,7 @@ def _belongs_to(truth_folder: Path) -> str:
 
 
 def check_truths(task_folder: Path, truth_folder: Path) -> None:
-    """Refuse truths that are not there, or are those of other queries.
+    """Refuse truths that are not there, are those of other queries, or of another task version.
 
     Raises
     ------
@@ -258,10 +258,21 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
         Naming both folders.
     """
     if not (truth_folder / TRUTH).is_file():
-        message = f"{truth_folder} holds no truths of {task_folder}: score where they are, or make the queries again"
+        message = (
+            f"{truth_folder} holds no truths of {task_folder}: "
+            "name their folder with --truth, or make the queries again"
+        )
         raise StoreError(message)
     if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
         message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
+        raise StoreError(message)
+    with _named(truth_folder / TRUTH):
+        version = (pq.read_schema(truth_folder / TRUTH).metadata or {}).get(b"task_version", b"none").decode()
+    if version != str(TASK_VERSION):
+        message = (
+            f"{truth_folder} holds truths of task version {version}, this version reads {TASK_VERSION}: "
+            "make the queries again"
+        )
         raise StoreError(message)
 
 

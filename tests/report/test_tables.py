@@ -9,10 +9,13 @@ import pytest
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.metrics.intervals import wilson
+from sasgeo_bench.report.costs import cost_rows
+from sasgeo_bench.report.integrity import integrity_rows
+from sasgeo_bench.report.rejection import own_word
 from sasgeo_bench.report.rows import COLUMNS, to_frame
 from sasgeo_bench.report.strata import strata
 from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.report.text import board_latex, board_markdown, summary, warnings_of
+from sasgeo_bench.report.text import board_latex, board_markdown, summary, tables_of, warnings_of
 from sasgeo_bench.score import COLUMNS as SCORED
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
@@ -205,6 +208,41 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert title == "success_25m, localization, prior group r500-weak-s3 (rank)"
     assert short["occlusion"].tolist() == ["0.250 (1)", "0.000 (control)"]
     assert len(warnings_of(board)) == 2
+
+
+def test_the_board_says_what_each_of_its_columns_is():
+    tables = {"mine": scores([1.0, 99.0] * 20, confidence=[0.9, 0.1] * 20, is_present=[True] * 30 + [False] * 10)}
+    tables["mine"]["is_right"] &= tables["mine"]["is_present"]
+    views = dict.fromkeys(tables["mine"]["query_id"], 1)
+    rows = [*cost_rows("mine", tables["mine"], [], view_bytes=views, area_km2={})]
+    rows += integrity_rows("mine", "own", own_word(tables["mine"]))
+    board = pd.concat([leaderboard(tables, draws=200), to_frame(rows)], ignore_index=True)
+    text = board_markdown(board, ABOUT).split("## How to read")[1]
+    told = {name for line in text.splitlines() if line for name in line.split("**")[1].split(", ")}
+    shown = {str(column) for _, table in tables_of(board) for column in table.columns}
+    names = {column.split(",")[0].split(" (")[0].removesuffix("_p50").removesuffix("_p95") for column in shown}
+    assert names - told == {"matcher", "rank"}
+    assert "rejector" in shown
+    assert "false fixes" in shown
+
+
+def test_one_query_of_a_kind_and_none_of_another_are_told_as_they_are():
+    kinds = ["U1"] * 7 + ["U2"]
+    board = leaderboard({"mine": scores([1.0] * 7 + [99.0], kind=kinds, strength=[0.2, 0.4] * 4)}, draws=200)
+    row = pick(board, "mine", "success_25m", "U2")
+    assert (row["n"], row["blocks"], row["value"], row["interval"]) == (1, 1, 0.0, "wilson")
+    assert (row["lo"], row["hi"]) == (0.0, wilson(0, 1).hi)
+    assert tuple(row[["rank_best", "rank_worst"]]) == (0, 0)
+    assert math.isnan(row["detectable"])
+    assert "U3" not in set(board["stratum"])
+    assert "answered_absent" not in set(board["metric"])  # no place was absent
+
+
+def test_one_of_something_is_told_in_the_singular():
+    board = leaderboard({"mine": scores([1.0], blocks=1, place="here", status="missing")}, draws=200)
+    assert warnings_of(board)[0].startswith("1 block in 1 place: fewer than 36 in 12")
+    assert warnings_of(board)[1] == "mine: 1 query has no row and counts as a miss."
+    assert "| 1 in 1 place |" in board_markdown(board, ABOUT)
 
 
 def test_a_board_of_nothing_is_an_empty_table():

@@ -11,7 +11,7 @@ from sasgeo_bench.run import sandbox
 from sasgeo_bench.run.worker import Limits, Reach, Worker
 from sasgeo_bench.store import taskdir, taskrows
 
-QUICK = Limits(match_s=2.0, prepare_s=20.0, memory_bytes=768 * 2**20)
+QUICK = Limits(match_s=2.0, prepare_s=20.0, memory_bytes=800 * 10**6)
 HAS_LANDLOCK = sandbox.landlock_version() > 0
 shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlock to refuse files with")
 
@@ -37,7 +37,7 @@ def ask(place, task, name, *, limits=QUICK, times=1, is_shut_in=True):
         ("Exits", "crash", "ended with exit status 3: last words"),
         ("Raises", "crash", "ValueError: no idea where this is"),
         ("RaisesInPrepare", "crash", "ValueError: no index today"),
-        ("Leaks", "crash", "MiB of memory, at most 768 are allowed|out of memory"),
+        ("Leaks", "crash", "MB of memory, at most 800 are allowed|out of memory"),
         ("Forks", "ok", ""),
         ("Prints", "ok", ""),
         ("ScoresNan", "invalid", "score is nan, expected a finite number"),

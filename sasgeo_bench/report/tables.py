@@ -3,7 +3,9 @@
 
 import hashlib
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Self
@@ -34,6 +36,7 @@ GROUP: Final = ("suite", "track", "prior_group")
 UNRANKED: Final = frozenset(
     {"oracle_pose", "random", "prior_centre", "map_density_prior"}
 )  # controls: beside the ranks
+_THREADS: Final = 4  # each holds some 100 MB of draws
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -57,8 +60,14 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd
     MetricError
         If two matchers were scored on different queries.
     """
-    frames = _aligned(scored)
-    return to_frame([row for group, parts in _groups(frames) for row in _rows_of_group(group, parts, draws)])
+
+    def rows_of(item: tuple[tuple[str, str, str], dict[str, pd.DataFrame]]) -> list[Row]:
+        """All rows of one group."""
+        return list(_rows_of_group(*item, draws))
+
+    # Most of the time goes into draws and their sums, which leave the interpreter to others meanwhile.
+    with ThreadPoolExecutor(max_workers=min(_THREADS, os.cpu_count() or 1)) as pool:
+        return to_frame([row for rows in pool.map(rows_of, _groups(_aligned(scored))) for row in rows])
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -146,21 +155,25 @@ class _Cell:
         text = "/".join((*self.group.key, self.stratum))
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
-    def told(self, at: int) -> Told:
-        """What all rows of one matcher say of these queries."""
+    def told(self) -> list[Told]:
+        """What all rows of each matcher say of these queries."""
         suite, track, prior_group = self.group.key
-        return Told(
-            matcher=self.group.names[at],
-            suite=suite,
-            track=track,
-            prior_group=prior_group,
-            stratum=self.stratum,
-            n=len(self.chosen),
-            answered=int(self.group.is_answered[self.chosen, at].sum()),
-            missing=int(self.group.is_missing[self.chosen, at].sum()),
-            blocks=len(np.unique(self.group.blocks[self.chosen])),
-            places=len(np.unique(self.group.places[self.chosen])),
-        )
+        blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
+        return [
+            Told(
+                matcher=name,
+                suite=suite,
+                track=track,
+                prior_group=prior_group,
+                stratum=self.stratum,
+                n=len(self.chosen),
+                answered=int(self.group.is_answered[self.chosen, at].sum()),
+                missing=int(self.group.is_missing[self.chosen, at].sum()),
+                blocks=blocks,
+                places=places,
+            )
+            for at, name in enumerate(self.group.names)
+        ]
 
 
 def _rows_of_group(key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int) -> Iterator[Row]:
@@ -194,7 +207,7 @@ def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -
 def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
     """Means that share a denominator, by the same draws."""
     group, count = cell.group, len(cell.group.names)
-    told, sites = [cell.told(at) for at in range(count)], group.sites[cell.chosen]
+    told, sites = cell.told(), group.sites[cell.chosen]
     below = list(_thresholds(cell, measures))
     columns = [group.measured[measure.name][cell.chosen] for measure in measures]
     table = np.column_stack((*columns, *(item.is_below for item in below)))

@@ -3,9 +3,7 @@
 
 import hashlib
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Self
@@ -28,7 +26,7 @@ from sasgeo_bench.metrics.intervals import (
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
-from sasgeo_bench.report.rows import Row, Told, bare, to_frame
+from sasgeo_bench.report.rows import Row, Told, bare, side_by_side, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
 from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
@@ -36,7 +34,6 @@ GROUP: Final = ("suite", "track", "prior_group")
 UNRANKED: Final = frozenset(
     {"oracle_pose", "random", "prior_centre", "map_density_prior"}
 )  # controls: beside the ranks
-_THREADS: Final = 4  # each holds some 100 MB of draws
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -60,14 +57,8 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd
     MetricError
         If two matchers were scored on different queries.
     """
-
-    def rows_of(item: tuple[tuple[str, str, str], dict[str, pd.DataFrame]]) -> list[Row]:
-        """All rows of one group."""
-        return list(_rows_of_group(*item, draws))
-
-    # Most of the time goes into draws and their sums, which leave the interpreter to others meanwhile.
-    with ThreadPoolExecutor(max_workers=min(_THREADS, os.cpu_count() or 1)) as pool:
-        return to_frame([row for rows in pool.map(rows_of, _groups(_aligned(scored))) for row in rows])
+    groups = _groups(_aligned(scored))
+    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws), groups))
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:

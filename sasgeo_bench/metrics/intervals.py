@@ -213,7 +213,8 @@ class ClusterDraws:
     def _some(self, rng: np.random.Generator, rows: int) -> Iterator["_Picked"]:
         """Draw blocks, then queries in them."""
         blocks = self.blocks_count
-        shifted = rng.integers(0, blocks, size=(rows, blocks)) + blocks * np.arange(rows)[:, None]
+        shifted = rng.integers(0, blocks, size=(rows, blocks))
+        shifted += blocks * np.arange(rows)[:, None]
         times = np.bincount(shifted.ravel(), minlength=rows * blocks).reshape(rows, blocks)
         for size, which, queries in self._sizes:
             copies = times[:, which]

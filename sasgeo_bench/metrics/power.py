@@ -4,6 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -149,6 +150,7 @@ def pairs_needed(difference: float, discordant_share: float, *, alpha: float = A
     return math.ceil((root / difference) ** 2)
 
 
+@cache
 def _deviates(alpha: float, power: float) -> tuple[float, float]:
     if not (0 < alpha < 1 and 0.5 <= power < 1):  # noqa: PLR2004 - below, the quadratic's other root would hold
         message = f"alpha must lie in (0, 1) and power in [0.5, 1), got {alpha!r} and {power!r}"

@@ -15,7 +15,7 @@ from sasgeo_bench.metrics.decisions import COST_RATIOS, PRESENT_SHARES, Answers,
 from sasgeo_bench.metrics.integrity import augrc, aurc, drawn_areas, excess_aurc, false_fix_rate
 from sasgeo_bench.metrics.intervals import ClusterDraws, percentile_interval
 from sasgeo_bench.report.rejection import RISKS, answers_of
-from sasgeo_bench.report.rows import ALL_SUITES, Better, Row, Told, bare
+from sasgeo_bench.report.rows import ALL_SUITES, Better, Row, Told, bare, side_by_side
 
 AS_DRAWN: Final = "as drawn"
 COVERAGES: Final = (0.5, 0.8)
@@ -61,9 +61,9 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
         For each suite, track and prior group, and for all suites of a track and prior group together; there also with
         present and absent places reweighted to 0.9, 0.7 and 0.5 present.
     """
-    for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True):
-        for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]:
-            told = Told.of(
+    parts = [
+        (
+            Told.of(
                 part,
                 matcher=matcher,
                 rejector=rejector,
@@ -71,8 +71,13 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
                 track=str(track),
                 prior_group=str(prior_group),
                 stratum=AS_DRAWN,
-            )
-            yield from _rows(told, part)
+            ),
+            part,
+        )
+        for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True)
+        for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
+    ]
+    yield from side_by_side(lambda item: _rows(*item), parts)
 
 
 def _rows(told: Told, part: pd.DataFrame) -> Iterator[Row]:

@@ -26,7 +26,7 @@ from sasgeo_bench.metrics.intervals import (
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
-from sasgeo_bench.report.rows import Row, Told, bare, to_frame
+from sasgeo_bench.report.rows import Row, Told, bare, side_by_side, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
 from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
@@ -57,8 +57,8 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd
     MetricError
         If two matchers were scored on different queries.
     """
-    frames = _aligned(scored)
-    return to_frame([row for group, parts in _groups(frames) for row in _rows_of_group(group, parts, draws)])
+    groups = _groups(_aligned(scored))
+    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws), groups))
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -146,21 +146,25 @@ class _Cell:
         text = "/".join((*self.group.key, self.stratum))
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
-    def told(self, at: int) -> Told:
-        """What all rows of one matcher say of these queries."""
+    def told(self) -> list[Told]:
+        """What all rows of each matcher say of these queries."""
         suite, track, prior_group = self.group.key
-        return Told(
-            matcher=self.group.names[at],
-            suite=suite,
-            track=track,
-            prior_group=prior_group,
-            stratum=self.stratum,
-            n=len(self.chosen),
-            answered=int(self.group.is_answered[self.chosen, at].sum()),
-            missing=int(self.group.is_missing[self.chosen, at].sum()),
-            blocks=len(np.unique(self.group.blocks[self.chosen])),
-            places=len(np.unique(self.group.places[self.chosen])),
-        )
+        blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
+        return [
+            Told(
+                matcher=name,
+                suite=suite,
+                track=track,
+                prior_group=prior_group,
+                stratum=self.stratum,
+                n=len(self.chosen),
+                answered=int(self.group.is_answered[self.chosen, at].sum()),
+                missing=int(self.group.is_missing[self.chosen, at].sum()),
+                blocks=blocks,
+                places=places,
+            )
+            for at, name in enumerate(self.group.names)
+        ]
 
 
 def _rows_of_group(key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int) -> Iterator[Row]:
@@ -194,7 +198,7 @@ def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -
 def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
     """Means that share a denominator, by the same draws."""
     group, count = cell.group, len(cell.group.names)
-    told, sites = [cell.told(at) for at in range(count)], group.sites[cell.chosen]
+    told, sites = cell.told(), group.sites[cell.chosen]
     below = list(_thresholds(cell, measures))
     columns = [group.measured[measure.name][cell.chosen] for measure in measures]
     table = np.column_stack((*columns, *(item.is_below for item in below)))

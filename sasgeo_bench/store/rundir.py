@@ -15,11 +15,11 @@ from sasgeo_bench.errors import PoseError, StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.store.taskrows import POSE_FIELDS, poses_of
 
 RUN: Final = "run.json"
 SCHEMA_VERSION: Final = 1
-_POSE: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
-_CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*_POSE, "score")])
+_CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
 PREDICTION_SCHEMA: Final = pa.schema(
     [
         ("query_id", pa.string()),
@@ -58,10 +58,16 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
 
 def prediction_of(row: Mapping[str, Any]) -> Prediction:
     """Inverse of `prediction_row`; whatever else a candidate holds is passed over."""
-    poses = tuple((Pose(**{name: item[name] for name in _POSE}), item["score"]) for item in row["candidates"] or ())
+    poses = tuple(
+        (Pose(**{name: item[name] for name in POSE_FIELDS}), item["score"]) for item in row["candidates"] or ()
+    )
+    return _prediction(row, poses)
+
+
+def _prediction(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ...]) -> Prediction:
     return Prediction(
         query_id=row["query_id"],
-        candidates=poses,
+        candidates=candidates,
         confidence=row["confidence"],
         diagnostics=dict(row["diagnostics"] or ()),
         status=row["status"],
@@ -137,10 +143,37 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         if differing_columns(table):
             message = f"{part} holds no predictions: 'validate' says what is missing"
             raise StoreError(message)
-        for number, row in reversed(list(enumerate(table.to_pylist()))):
-            if row["query_id"] not in seen:
-                seen.add(row["query_id"])
-                yield _read_row(part, number, row)
+        for prediction in _sound(table) or _one_by_one(part, table, seen):
+            if prediction.query_id not in seen:
+                seen.add(prediction.query_id)
+                yield prediction
+
+
+def _sound(table: pa.Table) -> list[Prediction]:
+    """All rows, last first, by columns; none where a row may need a word of its own."""
+    column = table["candidates"].combine_chunks()
+    if not isinstance(column, pa.ListArray) or any(table[name].null_count for name in ("query_id", "status")):
+        return []
+    values = column.values
+    if values.null_count or any(values.field(name).null_count for name in (*POSE_FIELDS, "score")):
+        return []
+    try:
+        poses = poses_of(column)
+    except (PoseError, TypeError):
+        return []
+    scores, ends = values.field("score").to_pylist(), column.offsets.to_pylist()
+    rows = table.drop_columns(["candidates"]).to_pylist()
+    return [
+        _prediction(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
+        for at in reversed(range(len(rows)))
+    ]
+
+
+def _one_by_one(part: Path, table: pa.Table, seen: set[str]) -> Iterator[Prediction]:
+    """Rows of queries that were not seen yet, last first, each refused in a word of its own."""
+    for number, row in reversed(list(enumerate(table.to_pylist()))):
+        if row["query_id"] not in seen:
+            yield _read_row(part, number, row)
 
 
 def _read_row(part: Path, number: int, row: Mapping[str, Any]) -> Prediction:
@@ -203,7 +236,8 @@ def read_part(path: Path) -> pa.Table:
         If it is not there, truncated, or no parquet file.
     """
     try:
-        return pq.read_table(path)
+        with pq.ParquetFile(path) as source:
+            return source.read()
     except (OSError, pa.ArrowException) as error:
         text = " ".join(str(error).split())[:200]
         message = f"{path} cannot be read ({text}): write it again, or remove it where it is a part of a run"

@@ -16,7 +16,6 @@ import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.evidence import CELLS_PER_BYTE
-from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.regiondir import file_record, sha256_of
@@ -24,6 +23,7 @@ from sasgeo_bench.store.taskrows import (
     HEAD_SCHEMA,
     QUERY_SCHEMA,
     TRUTH_SCHEMA,
+    poses_of,
     query_of,
     query_row,
     stream_of,
@@ -338,9 +338,11 @@ def read_queries(folder: Path) -> Iterator[Query]:
 
 def read_heads(folder: Path) -> Iterator[Head]:
     """Queries of a task without their views, in the order of their ids."""
-    for row in _rows(folder / QUERIES, HEAD_SCHEMA):
-        poses = row.pop("candidates") or ()
-        yield Head(view_cells=row.pop("rows"), candidates=tuple(Pose(**pose) for pose in poses), **row)
+    with _named(folder / QUERIES):
+        for batch in _batches_of(folder / QUERIES, HEAD_SCHEMA.names):
+            rows = batch.drop_columns(["candidates"]).to_pylist()
+            for row, poses in zip(rows, poses_of(batch["candidates"]), strict=True):
+                yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
 
 
 def read_truths(folder: Path) -> Iterator[Truth]:

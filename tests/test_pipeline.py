@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline draws, runs and scores; a second time it does only what is not up to date."""
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 
@@ -70,6 +72,16 @@ def test_every_board_has_controls_and_figures_without_them(made):
     text = (folder / "leaderboard.md").read_text(encoding="utf-8")
     assert f"- Controls: all {len(board.verdicts)} held." in text
     assert "## Controls" in text
+
+
+def test_the_command_ends_with_the_board_and_what_to_do_next(made, program, monkeypatch, tmp_path):
+    _, board, _ = made
+    monkeypatch.setattr("sasgeo_bench.cli.boards.run_pipeline", lambda *_, **__: board)
+    (tmp_path / "small.toml").write_text(TEXT, encoding="utf-8")
+    code, told, err = program("leaderboard", "small.toml")
+    assert code == 0, err
+    assert told.splitlines()[-1] == str(Path("out") / "boards" / "small")
+    assert err.splitlines()[-1].startswith("next: leaderboard small.toml --matcher NAME puts one of yours beside these")
 
 
 def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):

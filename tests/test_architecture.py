@@ -42,7 +42,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "network": None,
     "graph": None,
     "region": None,
-    "search": None,
+    "search": ("field", "plan", "space", "dense", "sight", "find"),
     "camera": None,
     "imagery": None,
     "perturb": (

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All places at once: one correlation for each class, summed in the Fourier domain, one inverse transform a heading."""
+
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import Final, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.pose import Pose, inverse
+from sasgeo_bench.search.field import Level, Template, between, pooled, warped
+from sasgeo_bench.search.plan import Mode, Null
+from sasgeo_bench.search.space import Tile, Turns
+
+_SPARE: Final = 4  # times as many peaks of one heading as modes are wanted, for neighbours are dropped
+_LOW: Final = np.float32(-1e30)  # a place that is not allowed
+_BLUR: Final = 3  # squares of the view across a coarse cell, before it is turned: odd, so that nothing is shifted
+_NEXT: Final = 1.5  # steps: nearer is a neighbour
+_NOTHING: Final = 1e-9
+
+
+def dense(
+    level: Level, template: Template, tiles: Sequence[Tile], turns: Turns, *, most: int, threads: int
+) -> tuple[list[list[Mode]], Null]:
+    """Best modes of every tile, no two of them neighbours, and how places score."""
+    if not len(template.speaking) or not any(tile.allowed.any() for tile in tiles):
+        return [[] for _ in tiles], Null(best=0.0, mean=0.0, deviation=0.0, places=0)
+    votes = _Votes.of(level, template, tiles, turns)
+    highest = [np.full(tile.allowed.shape, _LOW, dtype=np.float32) for tile in tiles]
+    locks = [Lock() for _ in tiles]
+
+    def peaks_of(base: Pose) -> list[tuple[int, _Peaks]]:
+        found = []
+        for at, turn, score in votes.scores(base):
+            score[~tiles[at].allowed] = _LOW
+            with locks[at]:
+                np.maximum(highest[at], score, out=highest[at])
+            found.append((at, _Peaks.of(score, turn, most=_SPARE * most)))
+        return found
+
+    with ThreadPoolExecutor(threads) as pool:
+        parts = [part for some in pool.map(peaks_of, turns.bases) for part in some]
+    modes = []
+    for at, tile in enumerate(tiles):
+        peaks = _Peaks.joined([peaks for owner, peaks in parts if owner == at])
+        chosen = peaks.apart(most, turns)
+        cells = np.column_stack((peaks.row[chosen] + tile.row, peaks.col[chosen] + tile.col))
+        points_m = level.grid.to_centres_m(cells)
+        modes.append([peaks.mode(i, point_m) for i, point_m in zip(chosen, points_m.tolist(), strict=True)])
+    return modes, _null(np.concatenate([score[tile.allowed] for tile, score in zip(tiles, highest, strict=True)]))
+
+
+def _null(scores: NDArray[np.float32]) -> Null:
+    wide = scores.astype(np.float64)
+    return Null(best=float(wide.max()), mean=float(wide.mean()), deviation=float(wide.std()), places=len(wide))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Votes:
+    """The transforms of the map under each tile, at each right angle, and the template they wait for.
+
+    `bands` of the view on `frame` are laid on cells of the level around its middle, `half` of them to each side.
+    """
+
+    bands: NDArray[np.float32]
+    frame: Grid
+    around: Grid
+    size: int
+    shapes: tuple[tuple[int, int], ...]
+    spectra: tuple[tuple[NDArray[np.complex64], ...], ...]
+
+    @classmethod
+    def of(cls, level: Level, template: Template, tiles: Sequence[Tile], turns: Turns) -> Self:
+        """Transform what lies under each tile, once for all headings."""
+        step_m, largest = level.grid.cell_size_m, max(base.scale for base in turns.bases)
+        half = math.ceil(template.reach_m * largest / step_m) + 1
+        shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)
+        size = int(fft.next_fast_len(max(max(shape) for shape in shapes) + 2 * half, real=True))
+        spectra = []
+        for tile, (rows, cols) in zip(tiles, shapes, strict=True):
+            shape = (rows + 2 * half, cols + 2 * half)
+            under = level.window(tile.row - half, tile.col - half, shape, template.speaking)
+            turned = (np.rot90(under, quarter, (1, 2)) for quarter in range(turns.quarters))
+            spectra.append(tuple(np.conj(fft.rfft2(each, s=(size, size))) for each in turned))
+        ratio = step_m / template.cell_size_m
+        bands, frame = pooled(template, level, max(1, round(ratio / _BLUR)))
+        width = 2 * math.floor(step_m / frame.cell_size_m / 2) + 1
+        bands = np.stack([cv2.blur(band, (width, width), borderType=cv2.BORDER_CONSTANT) for band in bands])
+        reach_m, side = (half + 0.5) * step_m, 2 * half + 1
+        around = Grid(epsg=0, west_m=-reach_m, north_m=reach_m, cell_size_m=step_m, rows=side, cols=side)
+        return cls(bands=bands, frame=frame, around=around, size=size, shapes=shapes, spectra=tuple(spectra))
+
+    def scores(self, base: Pose) -> Iterator[tuple[int, Pose, NDArray[np.float32]]]:
+        """Score all places of every tile for a heading and those at right angles from it."""
+        spectrum = fft.rfft2(self._laid(base), s=(self.size, self.size))
+        for at, (windows, (rows, cols)) in enumerate(zip(self.spectra, self.shapes, strict=True)):
+            for quarter, window in enumerate(windows):
+                total = window[0] * spectrum[0]
+                for layer, band in zip(window[1:], spectrum[1:], strict=True):
+                    total += layer * band  # one by one they stay in the cache
+                score = fft.irfft2(np.conj(total, out=total), s=(self.size, self.size))
+                valid = score[:rows, :cols] if quarter % 2 == 0 else score[:cols, :rows]
+                turn = replace(base, yaw_deg=base.yaw_deg + 90 * quarter)
+                yield at, turn, np.ascontiguousarray(np.rot90(valid, -quarter))
+
+    def _laid(self, base: Pose) -> NDArray[np.float32]:
+        """Lay the view on cells of the level, turned and scaled; sums stay what they are."""
+        to_view = between(self.around, inverse(base), self.frame)
+        laid = np.stack([warped(band, to_view, self.around.shape) for band in self.bands])
+        return laid * np.float32((self.around.cell_size_m / (base.scale * self.frame.cell_size_m)) ** 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Peaks:
+    """Local maxima of scores: score, row and column of a tile, heading and scale; shape (N,) each."""
+
+    score: NDArray[np.float32]
+    row: NDArray[np.int64]
+    col: NDArray[np.int64]
+    yaw_deg: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, score: NDArray[np.float32], turn: Pose, *, most: int) -> Self:
+        """Best local maxima of a tile at one heading and scale."""
+        is_peak = (score == cv2.dilate(score, np.ones((3, 3), dtype=np.uint8))) & (score > _LOW)
+        row, col = np.nonzero(is_peak)
+        if len(row) > most:
+            best = np.sort(np.argpartition(-score[row, col], most)[:most])
+            row, col = row[best], col[best]
+        same = np.ones(len(row))
+        return cls(score=score[row, col], row=row, col=col, yaw_deg=same * turn.yaw_deg, scale=same * turn.scale)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """All of them, best first; equals by place, heading and scale, so that threads change nothing."""
+        names = ("score", "row", "col", "yaw_deg", "scale")
+        score, row, col, yaw_deg, scale = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        order = np.lexsort((scale, yaw_deg, col, row, -score))
+        return cls(score=score[order], row=row[order], col=col[order], yaw_deg=yaw_deg[order], scale=scale[order])
+
+    def apart(self, most: int, turns: Turns) -> list[int]:
+        """Which are best, none of them next to a better one in place, heading and scale at once."""
+        left = np.ones(len(self.score), dtype=bool)
+        chosen: list[int] = []
+        while len(chosen) < most and left.any():
+            at = int(left.argmax())
+            chosen.append(at)
+            near = (np.abs(self.row - self.row[at]) <= 1) & (np.abs(self.col - self.col[at]) <= 1)
+            near &= np.abs(wrap_deg(self.yaw_deg - self.yaw_deg[at])) < _NEXT * turns.yaw_step_deg + _NOTHING
+            near &= np.abs(self.scale - self.scale[at]) < _NEXT * turns.scale_step + _NOTHING
+            left &= ~near
+        return chosen
+
+    def mode(self, at: int, point_m: tuple[float, float]) -> Mode:
+        """One of them as a mode, its place given in metres."""
+        easting_m, northing_m = point_m
+        pose = Pose(
+            easting_m=easting_m, northing_m=northing_m, yaw_deg=float(self.yaw_deg[at]), scale=float(self.scale[at])
+        )
+        return Mode(pose=pose, score=float(self.score[at]))

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search itself: all that a prior leaves open on large cells, the best of it ever more finely."""
+
+import math
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Final
+
+from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.search.dense import dense
+from sasgeo_bench.search.field import Field, Template
+from sasgeo_bench.search.plan import Found, Mode, Null, Plan
+from sasgeo_bench.search.sight import Guess, Sight, Stride, climbed, polished
+from sasgeo_bench.search.space import NO_PLACE, Disc, Tile, Turns, all_around, tiles_of, turns_of
+
+_NOTHING: Final = 1e-9
+_CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner
+
+
+def search(field: Field, template: Template, prior: Prior, plan: Plan | None = None, *, count: int = 10) -> Found:
+    """Find the best modes within a prior: all of it on large cells, the best of that ever more finely.
+
+    Parameters
+    ----------
+    field : Field
+        The map.
+    template : Template
+        The view.
+    prior : Prior
+        Where it may lie and how it may be turned and scaled; anywhere on the map where it says nothing.
+    plan : Plan, optional
+        How it is done.
+    count : int
+        Most modes that are given.
+
+    Returns
+    -------
+    Found
+        Modes at least `apart_m` from each other, best first; none where the view says nothing or the prior holds no
+        place of the map. Those the beam left behind have the order of a coarser level, below all that were followed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sasgeo_bench.search.field import FULL
+    >>> rng = np.random.default_rng(0)
+    >>> town = np.where(rng.random((1, 64, 64)) < 0.1, FULL, 0).astype(np.uint8)
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)
+    >>> field = Field(grid=grid, layers=town, known=np.full((64, 64), FULL, np.uint8))
+    >>> seen = (town[:, 20:52, 10:42] / FULL).astype(np.float32)
+    >>> view = Template(weights=2 * seen - 0.5, known=-seen[0], cell_size_m=1.0)
+    >>> where = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=2.0, scale_sigma=0.0)
+    >>> best = search(field, view, where).modes[0].pose
+    >>> round(best.easting_m), round(best.northing_m)
+    (26, 28)
+    """
+    return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).places(count)
+
+
+def rank(
+    field: Field, template: Template, prior: Prior, poses: Sequence[Pose], plan: Plan | None = None
+) -> tuple[list[Mode | None], Null]:
+    """Give each of some candidates the best mode near it, by the same machinery; None where there is none.
+
+    Those that the beam leaves behind keep the order they had, below all that were followed to the end.
+    """
+    return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).candidates(poses)
+
+
+def exhaustive(field: Field, template: Template, *, yaw_step_deg: float, threads: int = 1) -> Mode:
+    """Score every cell of the map at every heading, on the map's own cells: the reference, slow.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sasgeo_bench.search.field import FULL
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=8.0, cell_size_m=1.0, rows=8, cols=8)
+    >>> dot = np.zeros((1, 8, 8), np.uint8)
+    >>> dot[0, 2, 5] = FULL
+    >>> field = Field(grid=grid, layers=dot, known=np.full((8, 8), FULL, np.uint8))
+    >>> view = Template(weights=np.ones((1, 1, 1), np.float32), known=np.zeros((1, 1), np.float32), cell_size_m=1.0)
+    >>> best = exhaustive(field, view, yaw_step_deg=90.0).pose
+    >>> best.easting_m, best.northing_m
+    (5.5, 5.5)
+    """
+    tiles = tiles_of(field.grid, field.grid, Disc(center_m=None, radius_m=0.0))
+    found, _ = dense(field.level(1), template, tiles, all_around(yaw_step_deg), most=1, threads=threads)
+    return max((mode for modes in found for mode in modes), key=lambda mode: mode.score)
+
+
+def score_at(field: Field, template: Template, pose: Pose) -> float:
+    """Score one pose on the map's own cells, as `Template` says.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sasgeo_bench.search.field import FULL
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4.0, cell_size_m=1.0, rows=4, cols=4)
+    >>> full = Field(grid=grid, layers=np.full((1, 4, 4), FULL, np.uint8), known=np.full((4, 4), FULL, np.uint8))
+    >>> seen = Template(weights=np.ones((1, 2, 2), np.float32), known=np.zeros((2, 2), np.float32), cell_size_m=1.0)
+    >>> score_at(full, seen, Pose(easting_m=2.0, northing_m=2.0, yaw_deg=0.0))
+    4.0
+    """
+    return Sight.of(field, template, 1).score(pose)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """The search for one view on one map."""
+
+    field: Field
+    template: Template
+    prior: Prior
+    plan: Plan
+
+    def places(self, count: int) -> Found:
+        """Best modes within the prior."""
+        disc = Disc(center_m=self.prior.center_m, radius_m=self.prior.radius_m or 0.0)
+        tiles = tiles_of(self._coarse_grid, self.field.grid, disc.wider(_CORNER * self._coarse_m))
+        guesses, null = self._begun(tiles, most=self.plan.width(0))
+        followed = self._followed([replace(guess, owner=0) for guess in guesses], [disc])
+        return Found(modes=tuple(_thinned((guess.mode for guess in followed), self.plan.apart_m)[:count]), null=null)
+
+    def candidates(self, poses: Sequence[Pose]) -> tuple[list[Mode | None], Null]:
+        """Best mode near each of some poses."""
+        places_m = [(pose.easting_m, pose.northing_m) for pose in poses]
+        discs = [Disc(center_m=place_m, radius_m=self.plan.around_m) for place_m in places_m]
+        wide = [disc.wider(_CORNER * self._coarse_m) for disc in discs]
+        tiles = [(tiles_of(self._coarse_grid, self.field.grid, disc) or [NO_PLACE])[0] for disc in wide]
+        guesses, null = self._begun(tiles, most=self.plan.each)
+        best: list[Mode | None] = [None] * len(poses)
+        for guess in reversed(self._followed(guesses, discs)):
+            best[guess.owner] = guess.mode
+        return best, null
+
+    @cached_property
+    def _factor(self) -> int:
+        """Cells of the map a side of the largest cell that still leaves enough of them along the view's side."""
+        most = self.template.side_m / (self.plan.cells * self.field.grid.cell_size_m)
+        return 1 << max(0, math.floor(math.log2(max(most, 1.0)) + _NOTHING))
+
+    @property
+    def _coarse_grid(self) -> Grid:
+        return self.field.grid.coarsen(self._factor)
+
+    @property
+    def _coarse_m(self) -> float:
+        return self._coarse_grid.cell_size_m
+
+    @cached_property
+    def _turns(self) -> Turns:
+        """Neighbours differ by a coarse cell at the middle of a side of the view."""
+        return turns_of(self.prior, spread=self.plan.spread, step=self._coarse_m / (self.template.side_m / 2))
+
+    def _begun(self, tiles: Sequence[Tile], *, most: int) -> tuple[list[Guess], Null]:
+        """Best modes of each tile on the coarsest level, best first."""
+        level = self.field.level(self._factor)
+        found, null = dense(level, self.template, tiles, self._turns, most=most, threads=self.plan.threads)
+        return _ranked(Guess(mode=mode, owner=owner) for owner, modes in enumerate(found) for mode in modes), null
+
+    def _followed(self, guesses: list[Guess], discs: Sequence[Disc]) -> list[Guess]:
+        """Follow the best to the map's own cells and between them; best first, then those left behind."""
+        stride = Stride(yaw_deg=self._turns.yaw_step_deg, scale=self._turns.scale_step)
+        kept, behind = guesses[: self.plan.width(0)], [guesses[self.plan.width(0) - 1 :]]
+        factor = self._factor
+        with ThreadPoolExecutor(self.plan.threads) as pool:
+            while factor > 1:
+                factor, stride = factor // 2, stride.half()
+                step = partial(climbed, Sight.of(self.field, self.template, factor), stride)
+                near = [disc.wider(_CORNER * factor * self.field.grid.cell_size_m) for disc in discs]
+                moved = _ranked(pool.map(step, kept, [near[guess.owner] for guess in kept]))
+                merged = _merged(moved, factor * self.field.grid.cell_size_m, stride.yaw_deg)
+                width = self.plan.width(len(behind))
+                kept, behind = merged[:width], [*behind, merged[width - 1 :]]
+            kept = _ranked(pool.map(partial(polished, Sight.of(self.field, self.template, 1), stride), kept))
+        for rest in reversed(behind):
+            kept = [*kept, *_below(kept, rest)]
+        return kept
+
+
+def _ranked(guesses: Iterable[Guess]) -> list[Guess]:
+    """Best first; equals keep their order. Those that left their disc are gone."""
+    return sorted((guess for guess in guesses if math.isfinite(guess.mode.score)), key=lambda guess: -guess.mode.score)
+
+
+def _merged(guesses: Sequence[Guess], apart_m: float, apart_deg: float) -> list[Guess]:
+    """Without those that came to lie beside a better one of the same candidate."""
+    kept: list[Guess] = []
+    for guess in guesses:
+        pose, owner = guess.mode.pose, guess.owner
+        others = (other.mode.pose for other in kept if other.owner == owner)
+        if not any(
+            _distance_m(pose, other) <= apart_m and abs(wrap_deg(pose.yaw_deg - other.yaw_deg)) <= apart_deg
+            for other in others
+        ):
+            kept.append(guess)
+    return kept
+
+
+def _below(kept: Sequence[Guess], rest: Sequence[Guess]) -> list[Guess]:
+    """Those left behind at one level, as far below the last of the others as they were behind the first of `rest`."""
+    if not kept or not rest:
+        return []
+    down = min(guess.mode.score for guess in kept) - rest[0].mode.score
+    return [replace(guess, mode=replace(guess.mode, score=guess.mode.score + down)) for guess in rest[1:]]
+
+
+def _thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
+    """Without those nearer to a better one than a distance."""
+    kept: list[Mode] = []
+    for mode in modes:
+        if all(_distance_m(mode.pose, other.pose) >= apart_m for other in kept):
+            kept.append(mode)
+    return kept
+
+
+def _distance_m(one: Pose, other: Pose) -> float:
+    return math.dist((one.easting_m, one.northing_m), (other.easting_m, other.northing_m))

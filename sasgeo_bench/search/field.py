@@ -205,7 +205,8 @@ def pooled(template: Template, level: Level, pool: int) -> tuple[NDArray[np.floa
     down, across = -rows % pool, -cols % pool
     around = ((0, 0), (down // 2, down - down // 2), (across // 2, across - across // 2))
     bands = np.pad(_softened(template, level), around)
-    summed = bands.reshape(len(bands), bands.shape[1] // pool, pool, -1, pool).sum(axis=(2, 4))
+    high, wide = bands.shape[1] // pool, bands.shape[2] // pool
+    summed = bands.reshape(len(bands), high, pool, wide, pool).sum(axis=(2, 4))
     frame = Grid(
         epsg=0,
         west_m=-(cols / 2 + across // 2) * cell_m,

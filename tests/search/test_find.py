@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search finds what an exhaustive one finds, and scores what Eq. 8 says."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
+from sasgeo_bench.grid import Grid
+from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.search.field import FULL, Field, Template
+from sasgeo_bench.search.find import exhaustive, rank, score_at, search
+from sasgeo_bench.search.plan import Plan, posterior
+
+ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
+AGREE, EXTRA, MISSED = 1.0, 0.6, 0.4
+
+
+def a_grid(side, cell_m=1.0):
+    return Grid(epsg=32632, west_m=1000.0, north_m=2000.0, cell_size_m=cell_m, rows=side, cols=side)
+
+
+def as_field(grid, layers):
+    """A map of PRESENT, ABSENT and, where nothing is known, 255."""
+    known = np.where((layers == FULL).any(axis=0), 0, FULL).astype(np.uint8)
+    return Field(grid=grid, layers=np.where(layers == PRESENT, FULL, 0).astype(np.uint8), known=known)
+
+
+def as_template(cells, cell_m=1.0):
+    present, absent = (cells == PRESENT).astype(np.float32), (cells == ABSENT).astype(np.float32)
+    weights = (AGREE + EXTRA) * present - MISSED * absent
+    return Template(weights=weights, known=-EXTRA * present.sum(axis=0), cell_size_m=cell_m)
+
+
+def eq_8(seen, mapped):
+    """The sum of Eq. 8 as it is written, cell by cell."""
+    gain = {(PRESENT, PRESENT): AGREE, (PRESENT, ABSENT): -EXTRA, (ABSENT, PRESENT): -MISSED}
+    return sum(gain.get((z, m), 0.0) for z, m in zip(seen.ravel().tolist(), mapped.ravel().tolist(), strict=True))
+
+
+def place_of(side, *, seed=0):
+    """A made-up place: roads that cross at odd angles, houses, a lake."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.indices((side, side))
+    layers = np.zeros((3, side, side), dtype=np.uint8)
+    for angle, at in zip(rng.uniform(0, math.pi, 9), rng.uniform(0.2, 0.8, 9), strict=True):
+        across = (rows - side * at) * math.cos(angle) + (cols - side * at) * math.sin(angle)
+        layers[0][np.abs(across) < 2.5] = 1
+    for row, col in rng.integers(0, side, (side // 2, 2)):
+        layers[1, row : row + 6, col : col + 9] = 1
+    row, col = rng.integers(side // 4, side // 2, 2)
+    layers[2, row : row + side // 6, col : col + side // 4] = 1
+    return layers
+
+
+@pytest.fixture(scope="module")
+def place():
+    grid = a_grid(320)
+    layers = place_of(320)
+    return grid, layers, as_field(grid, layers)
+
+
+def view_of(place, pose, size=96):
+    grid, layers, _ = place
+    return observe(LayerBits.of(layers), grid, pose, size_cells=size, cell_size_m=1.0)
+
+
+def some_poses(grid, count, *, seed=3, margin_m=70.0):
+    west, south, east, north = grid.bounds_m
+    rng = np.random.default_rng(seed)
+    return [
+        Pose(
+            easting_m=rng.uniform(west + margin_m, east - margin_m),
+            northing_m=rng.uniform(south + margin_m, north - margin_m),
+            yaw_deg=rng.uniform(0, 360),
+        )
+        for _ in range(count)
+    ]
+
+
+def off(one, other):
+    return (
+        math.dist((one.easting_m, one.northing_m), (other.easting_m, other.northing_m)),
+        abs(float(wrap_deg(one.yaw_deg - other.yaw_deg))),
+    )
+
+
+@given(seed=st.integers(0, 10_000), rows=st.integers(1, 6), cols=st.integers(1, 6), quarter=st.integers(0, 3))
+def test_the_linear_form_is_eq_8_cell_by_cell(seed, rows, cols, quarter):
+    rng = np.random.default_rng(seed)
+    mapped = rng.choice(np.array([ABSENT, PRESENT, FULL], dtype=np.uint8), (2, 12, 12), p=(0.6, 0.3, 0.1))
+    mapped[:, (mapped == FULL).any(axis=0)] = FULL
+    seen = rng.integers(0, 3, (2, rows, cols), dtype=np.uint8)
+    top, left = rng.integers(-2, 12, 2)
+    padded = np.pad(mapped, ((0, 0), (6, 6), (6, 6)), constant_values=FULL)
+    height, width = (rows, cols) if quarter % 2 == 0 else (cols, rows)
+    under = padded[:, top + 6 : top + 6 + height, left + 6 : left + 6 + width]
+    laid = np.rot90(seen, -quarter, (1, 2))  # a heading of 90 degrees lays the top of the view to the east
+    pose = Pose(easting_m=1000.0 + left + width / 2, northing_m=2000.0 - top - height / 2, yaw_deg=90.0 * quarter)
+    if under.shape == laid.shape:
+        assert score_at(as_field(a_grid(12), mapped), as_template(seen), pose) == pytest.approx(
+            eq_8(laid, under), abs=1e-3
+        )
+
+
+def test_turning_map_and_view_together_changes_no_score(place):
+    grid, layers, field = place
+    turned = as_field(grid, np.ascontiguousarray(np.rot90(layers, 1, (1, 2))))
+    middle_e, middle_n = grid.west_m + 160.0, grid.north_m - 160.0
+    for pose in some_poses(grid, 5):
+        template = as_template(view_of(place, pose))
+        east, north = pose.easting_m - middle_e, pose.northing_m - middle_n
+        other = Pose(easting_m=middle_e - north, northing_m=middle_n + east, yaw_deg=pose.yaw_deg - 90.0)
+        assert score_at(turned, template, other) == pytest.approx(score_at(field, template, pose), rel=1e-3)
+
+
+def test_what_is_unknown_changes_nothing(place):
+    grid, layers, field = place
+    pose = some_poses(grid, 1)[0]
+    seen = view_of(place, pose)
+    seen[:, 20:60, 30:70] = UNKNOWN
+    wild = layers.copy()
+    hidden = score_at(field, as_template(seen), pose)
+    west, north = grid.to_uv(np.array([[pose.easting_m, pose.northing_m]]))[0].astype(int)
+    wild[:, north - 8 : north + 8, west - 8 : west + 8] ^= 1  # within what the view does not know
+    assert score_at(as_field(grid, wild), as_template(seen), pose) == pytest.approx(hidden, abs=1e-3)
+    assert score_at(as_field(grid, wild), as_template(view_of(place, pose)), pose) < hidden
+
+
+@pytest.mark.parametrize("size", [48, 96, 160])
+def test_noise_free_views_are_found_between_the_cells(place, size):
+    for pose in some_poses(place[0], 6, margin_m=90.0):
+        best = search(place[2], as_template(view_of(place, pose, size)), ANYWHERE).modes[0]
+        metres, degrees = off(best.pose, pose)
+        assert metres < 0.75
+        assert degrees < 1.0
+
+
+def test_the_exhaustive_search_agrees(place):
+    for pose in some_poses(place[0], 4, seed=8):
+        seen = view_of(place, pose)
+        seen[:, :40] = UNKNOWN
+        template = as_template(seen)
+        reference = exhaustive(place[2], template, yaw_step_deg=2.0)
+        metres, degrees = off(search(place[2], template, ANYWHERE).modes[0].pose, reference.pose)
+        assert metres < math.sqrt(2)
+        assert degrees <= 2.0
+
+
+def test_scale_is_found_too(place):
+    pose = replace(some_poses(place[0], 1)[0], scale=1.12)
+    prior = replace(ANYWHERE, scale_sigma=0.1)
+    best = search(place[2], as_template(view_of(place, pose)), prior).modes[0].pose
+    assert off(best, pose)[0] < 1.5
+    assert best.scale == pytest.approx(1.12, abs=0.02)
+
+
+def test_a_prior_is_kept(place):
+    grid, _, field = place
+    truth, elsewhere = some_poses(grid, 2)
+    template = as_template(view_of(place, truth))
+    prior = Prior(
+        center_m=(elsewhere.easting_m, elsewhere.northing_m),
+        radius_m=40.0,
+        yaw_deg=truth.yaw_deg,
+        yaw_sigma_deg=5.0,
+        scale_sigma=0.0,
+    )
+    found = search(field, template, prior)
+    assert found.modes
+    for mode in found.modes:
+        assert off(mode.pose, elsewhere)[0] < 40.0 + 1.0
+        assert off(mode.pose, truth)[1] < 2.5 * 5.0 + 5.0
+    near = replace(prior, center_m=(truth.easting_m + 30.0, truth.northing_m))
+    assert off(search(field, template, near).modes[0].pose, truth)[0] < 1.0
+
+
+@pytest.mark.parametrize("radius_m", [0.01, 5.0])
+def test_a_small_disc_still_holds_its_place(place, radius_m):
+    truth = some_poses(place[0], 1)[0]
+    prior = replace(ANYWHERE, center_m=(truth.easting_m, truth.northing_m), radius_m=radius_m)
+    best = search(place[2], as_template(view_of(place, truth)), prior).modes[0]
+    assert off(best.pose, truth)[0] < 1.0
+
+
+def test_a_prior_off_the_map_or_a_blind_view_finds_nothing(place):
+    truth = some_poses(place[0], 1)[0]
+    template = as_template(view_of(place, truth))
+    far = replace(ANYWHERE, center_m=(0.0, 0.0), radius_m=50.0)
+    assert search(place[2], template, far).modes == ()
+    blind = as_template(np.full((3, 96, 96), UNKNOWN, dtype=np.uint8))
+    assert search(place[2], blind, ANYWHERE).modes == ()
+    assert rank(place[2], blind, ANYWHERE, [truth])[0] == [None]
+
+
+def test_a_view_larger_than_the_map_is_laid_on_it():
+    grid = a_grid(64)
+    layers = place_of(64)
+    field = as_field(grid, layers)
+    pose = Pose(easting_m=1035.0, northing_m=1970.0, yaw_deg=0.0)
+    seen = observe(LayerBits.of(layers), grid, pose, size_cells=128, cell_size_m=1.0)
+    assert off(search(field, as_template(seen), ANYWHERE).modes[0].pose, pose)[0] < 1.0
+
+
+def test_modes_keep_their_distance_and_their_order(place):
+    truth = some_poses(place[0], 1)[0]
+    modes = search(place[2], as_template(view_of(place, truth)), ANYWHERE, count=8).modes
+    assert len(modes) == 8
+    assert [mode.score for mode in modes] == sorted((mode.score for mode in modes), reverse=True)
+    for at, mode in enumerate(modes):
+        assert all(off(mode.pose, other.pose)[0] >= Plan().apart_m for other in modes[:at])
+
+
+def test_threads_change_nothing(place):
+    template = as_template(view_of(place, some_poses(place[0], 1)[0]))
+    one, two = (search(place[2], template, ANYWHERE, Plan(threads=threads)) for threads in (1, 2))
+    assert one == two
+
+
+def test_the_right_candidate_is_first(place):
+    grid, _, field = place
+    poses = some_poses(grid, 8)
+    template = as_template(view_of(place, poses[5]))
+    candidates = [replace(pose, easting_m=pose.easting_m + 10.0, yaw_deg=0.0) for pose in poses]
+    found, null = rank(field, template, ANYWHERE, candidates)
+    scores = [mode.score if mode else -math.inf for mode in found]
+    assert int(np.argmax(scores)) == 5
+    assert off(found[5].pose, poses[5])[0] < 1.0
+    assert null.places > len(poses)
+    beyond = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+    assert rank(field, template, ANYWHERE, [beyond, *candidates])[0][0] is None
+
+
+def test_candidates_behind_the_beam_keep_their_order_below_the_others(place):
+    poses = some_poses(place[0], 12)
+    template = as_template(view_of(place, poses[0]))
+    wide, _ = rank(place[2], template, ANYWHERE, poses)
+    narrow, _ = rank(place[2], template, ANYWHERE, poses, Plan(beam=(3, 2)))
+    assert all(narrow)
+    assert narrow[0].pose == wide[0].pose
+    assert len({mode.score for mode in narrow}) > 2
+
+
+def test_a_map_of_larger_cells_than_the_view():
+    layers = place_of(320)
+    fine = a_grid(320)
+    coarse = as_field(a_grid(160, 2.0), layers[:, ::2, ::2])
+    for pose in some_poses(fine, 3):
+        seen = observe(LayerBits.of(layers), fine, pose, size_cells=96, cell_size_m=1.0)
+        assert off(search(coarse, as_template(seen), ANYWHERE).modes[0].pose, pose)[0] < 2.0
+
+
+def test_what_does_not_fit_is_refused():
+    grid = a_grid(8)
+    with pytest.raises(ShapeError, match="known"):
+        Field(grid=grid, layers=np.zeros((1, 8, 8), np.uint8), known=np.zeros((8, 7), np.uint8))
+    with pytest.raises(ShapeError, match="uint8"):
+        Field(grid=grid, layers=np.zeros((1, 8, 8)), known=np.zeros((8, 8)))
+    with pytest.raises(ShapeError, match="finite"):
+        Template(weights=np.full((1, 2, 2), np.nan, np.float32), known=np.zeros((2, 2), np.float32), cell_size_m=1.0)
+    with pytest.raises(ShapeError, match="weights"):
+        Template(weights=np.zeros((1, 2, 2), np.float32), known=np.zeros((3, 2), np.float32), cell_size_m=1.0)
+
+
+def test_a_posterior_sums_to_one_and_grows_with_the_score():
+    mass = posterior([3.0, 1.0, -2.0], temper=0.5)
+    assert mass.sum() == pytest.approx(1.0)
+    assert mass[0] > mass[1] > mass[3] > mass[2]
+    assert posterior([1e6, 0.0], temper=1.0).tolist() == [1.0, 0.0, 0.0]

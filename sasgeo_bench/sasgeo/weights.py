@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an agreement or a contradiction is worth, by class, age of the map and season: Eqs. 5 and 7 of the SASGeo paper.
+
+Eq. 5 lets a class fade as the map ages. Here map and world disagree both ways, what vanished and what appeared, and the
+gains of Eq. 7 follow as log-likelihood ratios: as a class stops saying anything, they go to nothing by themselves.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from sasgeo_bench.evidence import ABSENT, PRESENT
+from sasgeo_bench.sasgeo.rates import ClassRates
+from sasgeo_bench.taxonomy import load_taxonomy
+
+_LEAST: Final = 1e-4  # a probability is no nearer to 0 or 1: one cell of a few thousand can always be wrong
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gains:
+    """What Eq. 7 gives for each class, shape (C,): natural logarithms of likelihood ratios, or the paper's lambdas.
+
+    `agree` for seen and mapped, `extra` for seen and not mapped, `missed` for mapped and seen to be absent, `quiet` for
+    neither (0 in the paper). The first is positive, the next two are negative where a class says anything.
+    """
+
+    agree: NDArray[np.float64]
+    extra: NDArray[np.float64]
+    missed: NDArray[np.float64]
+    quiet: NDArray[np.float64]
+
+    def scaled(self, weights: NDArray[np.float64]) -> Self:
+        """The same, each class times its weight."""
+        parts = (self.agree, self.extra, self.missed, self.quiet)
+        agree, extra, missed, quiet = (part * weights for part in parts)
+        return type(self)(agree=agree, extra=extra, missed=missed, quiet=quiet)
+
+
+def likelihood_gains(rates: Sequence[ClassRates], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
+    """Log-likelihood ratios of what is seen of each class, given the map, against not knowing the map.
+
+    With S the chance that what is mapped still stands, B that something stands where nothing is mapped, t and f hit and
+    false alarm: P(seen | mapped) = S t + (1 - S) f, P(seen | not mapped) = B t + (1 - B) f, and their mean by the share
+    of the ground that is mapped is the reference.
+
+    Parameters
+    ----------
+    rates : sequence of ClassRates
+        One for each class.
+    age_years : float
+        From the map to the view; a map younger than the view has age 0.
+    persists : sequence of float, optional
+        Seasonal factor of each class on S, 0..1; 1 unless given.
+
+    Returns
+    -------
+    Gains
+        Nats a cell.
+
+    Examples
+    --------
+    Where what is mapped is no likelier to be there than what is not, a class is silent:
+
+    >>> volatile = ClassRates(
+    ...     hit=0.9, false_alarm=0.1, missing=0.0, vanish_per_year=9.9, appear_per_year=0.0, mapped=0.2
+    ... )
+    >>> abs(float(likelihood_gains([volatile], age_years=50.0).agree[0])) < 1e-9
+    True
+    """
+    factors = list(persists) or [1.0] * len(rates)
+    rows = [_ratios(one, age_years, factor) for one, factor in zip(rates, factors, strict=True)]
+    agree, extra, missed, quiet = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return Gains(agree=agree, extra=extra, missed=missed, quiet=quiet)
+
+
+def _ratios(rates: ClassRates, age_years: float, persists: float) -> tuple[float, float, float, float]:
+    survival, unmapped = rates.survival(age_years) * persists, rates.unmapped(age_years)
+    if survival <= unmapped:  # the map says nothing, or the wrong thing: then it is not asked
+        return 0.0, 0.0, 0.0, 0.0
+    mapped, empty = (
+        float(np.clip(share * rates.hit + (1 - share) * rates.false_alarm, _LEAST, 1 - _LEAST))
+        for share in (survival, unmapped)
+    )
+    either = rates.mapped * mapped + (1 - rates.mapped) * empty
+    seen, unseen = (
+        np.log([mapped / either, empty / either]),
+        np.log([(1 - mapped) / (1 - either), (1 - empty) / (1 - either)]),
+    )
+    return float(seen[0]), float(seen[1]), float(unseen[0]), float(unseen[1])
+
+
+def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
+    """Eqs. 5 and 7 as written: lambdas of 1, times prior, decay by age and season of each class, set by hand.
+
+    Examples
+    --------
+    >>> hand_gains(["railway"], age_years=0.0).agree.tolist()
+    [0.97]
+    """
+    taxonomy = load_taxonomy()
+    hand = [taxonomy[name].persistence for name in classes]
+    decay = np.array([one.prior * np.exp(-one.vanish_per_year * max(age_years, 0.0)) for one in hand], dtype=np.float64)
+    one = np.ones(len(hand))
+    lambdas = Gains(agree=one, extra=-one, missed=-one, quiet=np.zeros(len(hand)))
+    return lambdas.scaled(decay * (np.array(persists, dtype=np.float64) if persists else one))
+
+
+def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Turn a view into the linear form of Eq. 8: what the map's classes and its knowing anything are worth.
+
+    Parameters
+    ----------
+    cells : ndarray of uint8, shape (C, rows, cols)
+        PRESENT, ABSENT or UNKNOWN.
+    gains : Gains
+        Of the same classes.
+
+    Returns
+    -------
+    weights : ndarray of float32, shape (C, rows, cols)
+    known : ndarray of float32, shape (rows, cols)
+        See `search.field.Template`. What is unknown is 0 in both.
+
+    Examples
+    --------
+    >>> weights, known = weigh(np.array([[[1, 0, 2]]], dtype=np.uint8), hand_gains(["railway"], age_years=0.0))
+    >>> weights[0, 0]
+    array([ 1.94, -0.97,  0.  ], dtype=float32)
+    """
+    weights = np.zeros(cells.shape, dtype=np.float32)
+    known = np.zeros(cells.shape[1:], dtype=np.float32)
+    parts = zip(cells, gains.agree, gains.extra, gains.missed, gains.quiet, strict=True)
+    for into, (view, agree, extra, missed, quiet) in zip(weights, parts, strict=True):
+        values = np.zeros((2, 3), dtype=np.float32)
+        values[:, PRESENT], values[:, ABSENT] = (agree - extra, extra), (missed - quiet, quiet)
+        into[:] = values[0][view]
+        known += values[1][view]
+    return weights, known
+
+
+def information(rates: ClassRates, *, age_years: float) -> float:
+    """Mutual information between the map and what is seen of a class, nats a cell: what the class is worth.
+
+    Examples
+    --------
+    >>> rail = ClassRates(
+    ...     hit=0.9, false_alarm=0.01, missing=0.0, vanish_per_year=0.1, appear_per_year=0.01, mapped=0.1
+    ... )
+    >>> information(rail, age_years=0.0) > information(rail, age_years=5.0) > information(rail, age_years=50.0)
+    True
+    """
+    agree, extra, missed, quiet = _ratios(rates, age_years, 1.0)
+    survival, unmapped = rates.survival(age_years), rates.unmapped(age_years)
+    mapped, empty = (share * rates.hit + (1 - share) * rates.false_alarm for share in (survival, unmapped))
+    where_mapped = mapped * agree + (1 - mapped) * missed
+    elsewhere = empty * extra + (1 - empty) * quiet
+    return rates.mapped * where_mapped + (1 - rates.mapped) * elsewhere
+
+
+def worth_table(rates: Mapping[str, ClassRates], *, ages_years: Sequence[float] = (0, 2, 5, 10, 20)) -> pd.DataFrame:
+    """What each class is worth as the map ages: gains and information, a row for each class and age.
+
+    Examples
+    --------
+    >>> worth_table({}).columns.tolist()[:2]
+    ['class', 'age_years']
+    """
+    columns = ("class", "age_years", "agree", "extra", "missed", "quiet", "information")
+    rows = [
+        (name, float(age), *_ratios(one, age, 1.0), information(one, age_years=age))
+        for name, one in rates.items()
+        for age in ages_years
+    ]
+    return pd.DataFrame(rows, columns=list(columns))

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains are likelihood ratios: right in sign, silent where a class tells nothing, and summed by the linear form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.sasgeo.rates import ClassRates
+from sasgeo_bench.sasgeo.weights import hand_gains, information, likelihood_gains, weigh, worth_table
+from sasgeo_bench.taxonomy import load_taxonomy
+
+HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
+shares = st.floats(0.001, 0.999)
+
+
+@given(hit=shares, ratio=shares, missing=shares, mapped=shares, age=st.floats(0, 40))
+def test_ratios_average_to_one_and_have_their_signs(hit, ratio, missing, mapped, age):
+    rates = replace(HOUSE, hit=hit, false_alarm=hit * ratio, missing=missing, mapped=mapped)
+    gains = likelihood_gains([rates], age_years=age)
+    assert gains.agree[0] >= -1e-9
+    assert gains.extra[0] <= 1e-9
+    assert gains.missed[0] <= 1e-9
+    assert gains.quiet[0] >= -1e-9
+    if gains.agree[0] > 1e-6:  # the map's share of seen cells and the rest make up all that is seen
+        assert mapped * np.exp(gains.agree[0]) + (1 - mapped) * np.exp(gains.extra[0]) == pytest.approx(1, rel=1e-6)
+        assert mapped * np.exp(gains.missed[0]) + (1 - mapped) * np.exp(gains.quiet[0]) == pytest.approx(1, rel=1e-6)
+
+
+def test_a_class_that_tells_nothing_is_silent():
+    gone = replace(HOUSE, vanish_per_year=1.0, appear_per_year=1.0)
+    useless = replace(HOUSE, hit=0.3, false_alarm=0.3)
+    for rates, age in ((gone, 60.0), (useless, 0.0)):
+        gains = likelihood_gains([rates], age_years=age)
+        parts = (gains.agree, gains.extra, gains.missed, gains.quiet)
+        assert [float(part[0]) for part in parts] == pytest.approx([0, 0, 0, 0], abs=1e-9)
+        assert information(rates, age_years=age) == pytest.approx(0, abs=1e-9)
+
+
+def test_gains_shrink_as_the_map_ages():
+    worth = worth_table({"building": HOUSE})
+    for column in ("agree", "information"):
+        assert worth[column].is_monotonic_decreasing
+    assert worth["missed"].is_monotonic_increasing
+
+
+def test_a_class_out_of_season_counts_for_less():
+    whole, half = (likelihood_gains([HOUSE], age_years=0.0, persists=[share]) for share in (1.0, 0.5))
+    assert 0 < half.agree[0] < whole.agree[0]
+    assert whole.missed[0] < half.missed[0] < 0
+
+
+def test_hand_gains_are_the_papers():
+    gains = hand_gains(["railway", "farmland"], age_years=10.0)
+    hand = [load_taxonomy()[name].persistence for name in ("railway", "farmland")]
+    assert gains.agree == pytest.approx([one.prior * np.exp(-10 * one.vanish_per_year) for one in hand])
+    assert (gains.extra == -gains.agree).all()
+    assert (gains.missed == -gains.agree).all()
+    assert not gains.quiet.any()
+
+
+@given(seed=st.integers(0, 9999))
+def test_the_linear_form_sums_the_gains_cell_by_cell(seed):
+    rng = np.random.default_rng(seed)
+    seen, mapped = rng.integers(0, 3, (2, 5, 7), dtype=np.uint8), rng.integers(0, 2, (2, 5, 7), dtype=np.uint8)
+    gains = likelihood_gains([HOUSE, replace(HOUSE, hit=0.6)], age_years=3.0)
+    weights, known = weigh(seen, gains)
+    linear = float((weights * mapped).sum() + known.sum())
+    table = {(1, 1): gains.agree, (1, 0): gains.extra, (0, 1): gains.missed, (0, 0): gains.quiet}
+    by_hand = sum(
+        float(table[int(z), int(m)][at])
+        for at in range(2)
+        for z, m in zip(seen[at].flat, mapped[at].flat, strict=True)
+        if z < 2
+    )
+    assert linear == pytest.approx(by_hand, abs=1e-3)

@@ -5,9 +5,14 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.sasgeo.rates import ClassRates, Tally, fit_rates, hand_rates, tally
+from sasgeo_bench.evidence import PRESENT
+from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, ClassRates, Tally, fit_rates, hand_rates, likeness, rings, tally
 
 TRUE = ClassRates(hit=0.88, false_alarm=0.015, missing=0.04, vanish_per_year=0.02, appear_per_year=0.006, mapped=0.12)
+
+
+def as_tally(seen, missed, *, age_years=0.0, block="a"):
+    return Tally(classes=("building",), age_years=age_years, block=block, seen=seen, missed=missed)
 
 
 def made_up(rates, *, ages_years=(0.0, 2.0, 5.0, 10.0), blocks=24, cells=36_000, seed=10):
@@ -24,11 +29,8 @@ def made_up(rates, *, ages_years=(0.0, 2.0, 5.0, 10.0), blocks=24, cells=36_000,
                 return rng.binomial(there, rates.hit) + rng.binomial(gone, rates.false_alarm)
 
             on, off = seen(standing, mapped - standing), seen(came, cells - mapped - came)
-            counts = (np.array([count]) for count in (on, mapped - on, off, cells - mapped - off))
-            names = ("seen_mapped", "missed_mapped", "seen_empty", "missed_empty")
-            made.append(
-                Tally(classes=("building",), age_years=age, block=str(block), **dict(zip(names, counts, strict=True)))
-            )
+            both = (np.array([[near, 0, 0, 0, far]]) for near, far in ((on, off), (mapped - on, cells - mapped - off)))
+            made.append(as_tally(*both, age_years=age, block=str(block)))
     return made
 
 
@@ -47,10 +49,34 @@ def test_more_blocks_make_intervals_narrower():
 
 
 def test_where_nothing_was_seen_the_hand_decides():
-    empty = {name: np.array([0]) for name in ("seen_mapped", "missed_mapped", "seen_empty", "missed_empty")}
-    fitted = fit_rates([Tally(classes=("railway",), age_years=5.0, block="a", **empty)])["railway"]
-    assert fitted.best.vanish_per_year == pytest.approx(hand_rates("railway").vanish_per_year, rel=1e-3)
+    nothing = np.zeros((1, FAR + 1), dtype=np.int64)
+    fitted = fit_rates([as_tally(nothing, nothing, age_years=5.0)])["building"]
+    assert fitted.best.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-3)
     assert fitted.views == 0
+    assert likeness([as_tally(nothing, nothing)])[0].tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_rings_are_metres_from_the_nearest_cell_of_a_class():
+    layers = np.zeros((2, 40, 40), dtype=np.uint8)
+    layers[0, 20, 20] = PRESENT
+    layers[:, :, 35:] = 255
+    found = rings(layers, cell_size_m=2.0)
+    assert found[0, 20, 20:29].tolist() == [0, 1, 1, 2, 2, 3, 3, FAR, FAR]
+    assert found[0, 24, 23] == 3  # 10 m away
+    assert (found[:, :, 35:] == NOWHERE).all()
+    assert (found[1, :, :35] == FAR).all()
+
+
+def test_a_map_that_lies_beside_the_world_makes_being_near_alike():
+    layers = np.zeros((1, 400, 400), dtype=np.uint8)
+    for row in range(20, 380, 40):
+        layers[0, row : row + 4] = PRESENT
+    under = rings(layers, cell_size_m=1.0)
+    straight, shifted = (
+        likeness([tally(("building",), np.roll(layers, by, axis=1), under, age_years=0.0, block="a")]) for by in (0, 3)
+    )
+    assert straight[0, 1] < 0.2
+    assert shifted[0, 1] > 0.8
 
 
 def test_a_map_of_one_age_tells_the_detector_and_leaves_ageing_to_the_hand():
@@ -67,7 +93,7 @@ def test_an_empty_train_part_is_refused():
 
 def test_classes_that_differ_are_refused():
     one = np.ones((1, 2, 2), dtype=np.uint8)
-    tallies = [tally((name,), one, one, age_years=0.0, block="a") for name in ("building", "railway")]
+    tallies = [tally((name,), one, 0 * one, age_years=0.0, block="a") for name in ("building", "railway")]
     with pytest.raises(ConfigError, match="different classes"):
         fit_rates(tallies)
 

@@ -75,7 +75,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "tasks": None,
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
-    "sasgeo": ("rates", "weights", "raster", "graph", "temporal", "joint", "integrity"),
+    "sasgeo": ("rates", "temper", "weights", "raster", "graph", "temporal", "joint", "integrity"),
     "plugins": None,
     "run": (
         *("sandbox", "wire", "serve", "child", "worker", "oracle"),

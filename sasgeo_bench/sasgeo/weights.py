@@ -33,6 +33,15 @@ class Gains:
     missed: NDArray[np.float64]
     quiet: NDArray[np.float64]
 
+    def only(self, at: int) -> Self:
+        """Those of one class."""
+        return type(self)(
+            agree=self.agree[at : at + 1],
+            extra=self.extra[at : at + 1],
+            missed=self.missed[at : at + 1],
+            quiet=self.quiet[at : at + 1],
+        )
+
     def scaled(self, weights: NDArray[np.float64]) -> Self:
         """The same, each class times its weight."""
         parts = (self.agree, self.extra, self.missed, self.quiet)

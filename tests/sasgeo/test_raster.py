@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map and a view in the linear form: what is read, what is left out, and the parts that make up a score."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.pose import Prior
+from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.rates import hand_rates
+from sasgeo_bench.sasgeo.weights import likelihood_gains
+from sasgeo_bench.search.field import FULL
+from sasgeo_bench.search.find import score_at, search
+
+
+@pytest.fixture(scope="module")
+def field(tiny):
+    return read_field(tiny.region, likeness_by_hand(tiny.region.classes))
+
+
+@pytest.fixture(scope="module")
+def asked(tiny):
+    """Views whose places are on the map, and these."""
+    pairs = zip(tiny.queries, tiny.truths, strict=True)
+    return [(query, truth.pose) for query, truth in pairs if truth.pose is not None and query.suite == "clean"]
+
+
+def gains_of(region):
+    shares = zip(region.classes, (region.layers == PRESENT).mean(axis=(1, 2)), strict=True)
+    return likelihood_gains([replace(hand_rates(name), mapped=share) for name, share in shares], age_years=0.0)
+
+
+def test_a_map_is_read_in_larger_cells_and_lines_fade(tiny, field):
+    assert field.grid.cell_size_m == 2.0
+    assert field.known.min() == FULL
+    road, house = (tiny.region.classes.index(name) for name in ("road_minor", "building"))
+    assert np.mean((field.layers[road] > 0) & (field.layers[road] < FULL)) > 0
+    plain = read_field(tiny.region, np.eye(1, 5).repeat(len(tiny.region.classes), axis=0))
+    assert (field.layers[house] == plain.layers[house]).all()
+    assert (field.layers[road] >= plain.layers[road]).all()
+
+
+def test_the_parts_by_class_make_up_the_score(tiny, field, asked):
+    for query, pose in asked[:4]:
+        view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
+        whole = score_at(field, view.template(), pose)
+        assert view.by_class(field, pose).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
+
+
+def test_the_true_place_scores_high_in_every_class_it_shows(tiny, field, asked):
+    for query, pose in asked[:4]:
+        view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
+        away = replace(pose, easting_m=pose.easting_m + 60.0, northing_m=pose.northing_m - 45.0)
+        here, there = view.by_class(field, pose), view.by_class(field, away)
+        assert here.sum() > there.sum()
+
+
+def test_clean_views_are_found_on_a_town(tiny, field, asked):
+    found = 0
+    anywhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
+    for query, pose in asked:
+        view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
+        modes = search(field, view.template(), anywhere).modes
+        found += np.hypot(modes[0].pose.easting_m - pose.easting_m, modes[0].pose.northing_m - pose.northing_m) < 10.0
+    assert found >= 0.7 * len(asked)
+
+
+def test_classes_that_one_side_lacks_are_left_out(tiny, asked):
+    query, _ = asked[0]
+    seen = query.evidence
+    gains = gains_of(tiny.region)
+    fewer = Evidence(classes=seen.classes[:3], cells=seen.cells[:3].copy(), cell_size_m=seen.cell_size_m)
+    view = RasterView.of(fewer, tiny.region.classes, gains)
+    assert set(np.flatnonzero(view.weights.any(axis=(1, 2)))) <= {0, 1, 2}
+    strange = Evidence(classes=("lava", *seen.classes[1:]), cells=seen.cells.copy(), cell_size_m=seen.cell_size_m)
+    assert not RasterView.of(strange, tiny.region.classes, gains).weights[0].any()
+
+
+def test_a_blind_view_says_nothing(tiny, asked):
+    seen = asked[0][0].evidence
+    blind = seen.replace(np.full_like(seen.cells, UNKNOWN))
+    view = RasterView.of(blind, tiny.region.classes, gains_of(tiny.region))
+    assert not len(view.template().speaking)
+
+
+def test_exponents_scale_each_class(tiny, field, asked):
+    query, pose = asked[0]
+    view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
+    temper = np.linspace(0.1, 1.0, len(tiny.region.classes))
+    parts = view.tempered(temper).by_class(field, pose)
+    assert parts == pytest.approx(view.by_class(field, pose) * temper, rel=1e-4, abs=1e-3)

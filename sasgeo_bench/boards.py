@@ -3,11 +3,11 @@
 
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import pandas as pd
 
@@ -39,6 +39,7 @@ FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 M2_PER_KM2: Final = 1e6
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
+MOST_NAMED: Final = 3  # runs that are left out; the others are counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,8 @@ class ScoreRequest:
     predictions : sequence of Path
         Folders of runs (any folder with runs in it), and files of predictions.
     tasks : sequence of Path
-        Task folders; without any, those that the runs and files answer.
+        Task folders; without any, those that the runs and files answer. A matcher that was asked nothing of one of them
+        has no figures on its suite.
     root : Path
         Where tasks/ and truth/ are.
     truth : Path, optional
@@ -198,33 +200,33 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     Raises
     ------
     StoreError
-        If predictions, tasks or truths are missing, damaged, or of other versions; nothing is written.
+        If predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by itself
+        answers none of the queries; nothing is written.
     ConfigError
         If there is nothing to score, or rejectors are asked for without a split.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
     judges = _judges(request)
-    entries = find_entries(request.predictions)
-    predictions = {entry.name: _predictions(entry) for entry in entries}
-    folders = list(request.tasks) or list(_answered(entries, predictions, request.root))
-    if not folders:
+    told = _read_told(request, find_entries(request.predictions), tell)
+    folders = list(dict.fromkeys(request.tasks)) or sorted({folder for item in told for folder in item.held})
+    tasks = [_read_task(folder, request.truth or request.root / "truth") for folder in folders]
+    for item in told:
+        if item.entry.how == AS_SUBMITTED:
+            _check_file(item.entry.sources[0], folders)
+    everything = {item.entry.name: _scored(item, tasks, request) for item in told}
+    predictions = {item.entry.name: item.predictions for item in told}
+    verdicts = hold_controls(everything)
+    whole = _asked_whole(told, tasks, tell)
+    scores = {name: _ranked(frame, whole[name]) for name, frame in everything.items()}
+    scores = {name: frame for name, frame in scores.items() if len(frame)}
+    entries = tuple(item.entry for item in told if item.entry.name in scores)
+    if not scores:
         message = (
-            f"there is nothing to score: no task in {request.root / 'tasks'} is answered "
-            "(--out names another root, --tasks the tasks themselves)"
+            f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
+            "its tasks (--tasks names some)"
         )
         raise ConfigError(message)
-    tasks = [_read_task(folder, request.truth or request.root / "truth") for folder in folders]
-    for entry in entries:
-        if entry.how == AS_SUBMITTED:
-            _check_file(entry.sources[0], folders)
-    everything = {entry.name: _scored(entry, predictions[entry.name], tasks, request) for entry in entries}
-    verdicts = hold_controls(everything)
-    entries = tuple(entry for entry in entries if not _is_for_controls(entry))
-    scores = {entry.name: _ranked(everything[entry.name]) for entry in entries}
-    if not any(map(len, scores.values())):
-        message = f"there is nothing to rank: only queries of the suite {CONTROLS!r} are answered"
-        raise ConfigError(message)
-    rows = [leaderboard(scores, draws=request.draws)]
+    rows = list(_leaderboards(scores, whole, request.draws))
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
     areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
@@ -242,7 +244,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
                 tell(f"{name} on {entry.name}: not applied, no other place of the board calibrates")
             if len(judged):
                 rows.append(to_frame(list(integrity_rows(entry.name, name, judged))))
-        tell(f"{entry.name}: {int(frame['is_answered'].sum())} of {len(frame)} queries answered")
+        tell(f"{entry.name}: {_in_words(frame)}")
     table = pd.concat([item for item in rows if len(item)], ignore_index=True)
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
     board = Board(
@@ -258,14 +260,41 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     return board
 
 
-def _is_for_controls(entry: Entry) -> bool:
-    """Whether a matcher was run on the controls alone, as the reference of a board is."""
-    return bool(entry.runs) and all(about["suite"] == CONTROLS for about in entry.runs)
+def _in_words(scores: pd.DataFrame) -> str:
+    """How many queries of a contestant have a fix, and what became of the others."""
+    answered = scores["is_answered"].to_numpy(bool)
+    rest = scores.loc[~answered, "status"].replace("ok", "withheld").value_counts()
+    others = "".join(f", {count} {status}" for status, count in sorted(rest.items()))
+    return f"{int(answered.sum())} of {len(scores)} queries answered{others}"
 
 
-def _ranked(scores: pd.DataFrame) -> pd.DataFrame:
-    """Scored rows that make figures."""
-    return scores[~is_control(scores)].reset_index(drop=True)
+def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
+    """Scored rows that make figures: those of some suites, and of no control."""
+    return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
+
+
+def _asked_whole(told: Sequence["_Told"], tasks: Sequence["_Task"], tell: Tell) -> dict[str, frozenset[str]]:
+    """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
+    suites = {task.about["suite"] for task in tasks}
+    found = {}
+    for item in told:
+        spared = {task.about["suite"] for task in tasks if task.folder not in item.asked}
+        found[item.entry.name] = frozenset(suites - spared)
+        lost = sorted({task.about["suite"] for task in tasks if task.folder in item.asked} & spared - {CONTROLS})
+        if lost:
+            tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
+    return found
+
+
+def _leaderboards(
+    scores: Mapping[str, pd.DataFrame], whole: Mapping[str, Collection[str]], draws: int
+) -> Iterator[pd.DataFrame]:
+    """Figures of suites by those who were asked all of them: in most cases one table of everything."""
+    asked_by: dict[tuple[str, ...], set[str]] = {}
+    for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
+        asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
+    for names, suites in asked_by.items():
+        yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws)
 
 
 def _judges(request: ScoreRequest) -> dict[str, Judge]:
@@ -283,27 +312,117 @@ def _judges(request: ScoreRequest) -> dict[str, Judge]:
     return {name: partial(judge, make=make, split=request.split) for name, make in makers.items()}
 
 
-def _predictions(entry: Entry) -> dict[str, Prediction]:
-    return {item.query_id: item for source in entry.sources for item in _rows_of(source)}
+@dataclass(frozen=True, kw_only=True)
+class _Told:
+    """One contestant and its answers to the tasks of a board.
+
+    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
+    file is asked all tasks, and brings those that it holds an answer to. `entry` has only the runs that count.
+    """
+
+    entry: Entry
+    predictions: dict[str, Prediction]
+    held: frozenset[Path]
+    asked: frozenset[Path]
 
 
-def _rows_of(source: Path) -> Iterator[Prediction]:
-    if source.is_dir() and not rundir.parts_of(source):
-        return  # a run that was cut off before its first row: all of its queries are missing
-    yield from rundir.read_predictions(source)
+def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> list[_Told]:
+    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves."""
+    files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
+    folders = list(request.tasks) or _named(entries, request.root)
+    folders = list(dict.fromkeys([*folders, *(() if request.tasks else _held(files.values(), request.root))]))
+    tasks = [_Asked.of(folder) for folder in folders]
+    told: list[_Told] = []
+    stale: list[Path] = []
+    for entry in entries:
+        if entry.runs:
+            item, others = _read_runs(entry, tasks)
+            stale += others
+        else:
+            rows = files[entry.name]
+            held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
+            item = _Told(entry=entry, predictions=rows, held=held, asked=frozenset(folders))
+        if item.asked:
+            told.append(item)
+    named = next((source for source in stale if source in request.predictions), None)
+    if named is not None or (stale and not told):
+        holder = "these tasks do" if request.tasks else "its task does"
+        message = (
+            f"{named or stale[0]} holds answers to other queries than {holder} now: "
+            "run again (what is answered already is kept), or make the old queries again"
+        )
+        raise StoreError(message)
+    if not told:
+        message = (
+            f"there is nothing to score: no task in {request.root / 'tasks'} is answered "
+            "(--out names another root, --tasks the tasks themselves)"
+        )
+        raise ConfigError(message)
+    if stale:
+        listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
+        tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
+    return told
 
 
-def _answered(
-    entries: Sequence[Entry], predictions: Mapping[str, Mapping[str, Prediction]], root: Path
-) -> Iterator[Path]:
-    """Task folders that runs were made on, and of which files hold an answer."""
-    named = {(about["suite"], about["region"]) for entry in entries for about in entry.runs}
-    held = {name for entry in entries if not entry.runs for name in predictions[entry.name]}
-    for path in sorted((root / "tasks").glob(f"*/*/{taskdir.TASK}")):
-        folder = path.parent
-        is_named = (folder.parent.name, folder.name) in named
-        if is_named or (held and not held.isdisjoint(taskdir.read_ids(folder))):
-            yield folder
+def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
+    return {item.query_id: item for source in entry.sources for item in rundir.read_predictions(source)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """A task as runs are held against it: by query, the hash of what is asked."""
+
+    folder: Path
+    about: Mapping[str, Any]
+    asked: Mapping[str, str]
+
+    @classmethod
+    def of(cls, folder: Path) -> Self:
+        """Read it from its folder."""
+        return cls(folder=folder, about=taskdir.read_task(folder), asked=taskdir.read_asked(folder))
+
+
+def _read_runs(entry: Entry, tasks: Sequence[_Asked]) -> tuple[_Told, list[Path]]:
+    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
+    by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
+    rows: dict[str, Prediction] = {}
+    runs: list[tuple[Path, Mapping[str, Any]]] = []
+    asked: set[Path] = set()
+    stale: list[Path] = []
+    for source, about in zip(entry.sources, entry.runs, strict=True):
+        task = by_name.get((about["suite"], about["region"]))
+        is_same = task is not None and about["queries_sha256"] == task.about["files"][taskdir.QUERIES]["sha256"]
+        found = rundir.Answers({}, 0) if task is None else rundir.read_answers(source, task.asked, is_tied=is_same)
+        if task is None or not (found.found or is_same):
+            stale.append(source)
+            continue
+        rows |= found.found
+        asked.add(task.folder)
+        runs.append((source, _share_of(about, found)))
+    mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
+    return _Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
+
+
+def _share_of(about: Mapping[str, Any], answers: rundir.Answers) -> Mapping[str, Any]:
+    """What a run took, of its processor seconds the share of the answers that count."""
+    if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
+        return about
+    return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
+
+
+def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
+    """Task folders that runs were made on."""
+    names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
+    folders = [root / "tasks" / suite / region for suite, region in names]
+    return [folder for folder in folders if (folder / taskdir.TASK).is_file()]
+
+
+def _held(files: Collection[Mapping[str, Prediction]], root: Path) -> Iterator[Path]:
+    """Task folders of which files hold an answer."""
+    held = {name for rows in files for name in rows}
+    for path in sorted((root / "tasks").glob(f"*/*/{taskdir.TASK}")) if held else ():
+        if not held.isdisjoint(taskdir.read_ids(path.parent)):
+            yield path.parent
 
 
 def _check_file(path: Path, folders: Sequence[Path]) -> None:
@@ -352,28 +471,15 @@ def _area_km2(region: Path) -> float | None:
     return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
-def _folder_of(entry: Entry, about: Mapping[str, Any]) -> Path:
-    """Where a run holds its answers to a task."""
-    same = [(run["suite"], run["region"]) == (about["suite"], about["region"]) for run in entry.runs]
-    return entry.sources[same.index(True)]
-
-
-def _scored(
-    entry: Entry, predictions: Mapping[str, Prediction], tasks: Sequence[_Task], request: ScoreRequest
-) -> pd.DataFrame:
-    """All tasks of one contestant, one row for each query."""
-    ran_on = {(about["suite"], about["region"]): about["queries_sha256"] for about in entry.runs}
+def _scored(told: _Told, tasks: Sequence[_Task], request: ScoreRequest) -> pd.DataFrame:
+    """All tasks that one contestant was asked, one row for each query."""
     place_of = {} if request.split is None else request.split.place_of
     frames = []
     for task in tasks:
-        asked = ran_on.get((task.about["suite"], task.about["region"]))
-        if asked is not None and asked != task.about["files"][taskdir.QUERIES]["sha256"]:
-            message = (
-                f"{_folder_of(entry, task.about)} holds answers to other queries than {task.folder} does now: "
-                "move it away and run again, or make the old queries again"
-            )
-            raise StoreError(message)
-        mine = {head.query_id: predictions[head.query_id] for head in task.heads if head.query_id in predictions}
+        if task.folder not in told.asked:
+            continue
+        names = [head.query_id for head in task.heads]
+        mine = {name: told.predictions[name] for name in names if name in told.predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)
         frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in request.by_region else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -336,7 +336,7 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
         "strength_unit": card.strength_unit,
         "region": region,
         "map_date": state.date.isoformat(),
-        "map_fingerprint": manifest.fingerprint,
+        **taskdir.map_of(manifest),
         "split": spec.id,
         "split_sha256": hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
         "sites": len(sites),
@@ -351,7 +351,7 @@ def check_task(task_folder: Path, *, out: Path) -> list[str]:
     about = taskdir.read_task(task_folder)
     faults = taskdir.task_faults(task_folder, out / "truth" / about["suite"] / about["region"])
     manifest = regiondir.read_manifest(out / "regions" / about["region"])
-    if manifest.fingerprint != about["map_fingerprint"]:
+    if not taskdir.is_of_map(about, manifest):
         faults.append(_built_anew(about["region"]))
     return faults
 
@@ -392,7 +392,7 @@ def panels(
     """
     about = taskdir.read_task(task_folder)
     region = regiondir.read_region(out / "regions" / about["region"])
-    if region.manifest.fingerprint != about["map_fingerprint"]:
+    if not taskdir.is_of_map(about, region.manifest):
         raise StoreError(_built_anew(about["region"]))
     state = State.of(region, name=about["region"])
     truths = {truth.query_id: truth for truth in taskdir.read_truths(truth_folder)}

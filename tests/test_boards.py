@@ -214,9 +214,12 @@ def lose_truth(out):
     (out / "truth" / "clean" / TOWNS[0] / "truth.parquet").unlink()
 
 
-def break_run(out):
+def age_run(out):
+    """Rows as an older program wrote them, of queries that were another file's."""
     for path in (out / "runs").rglob("run.json"):
         edit_json(path, queries_sha256="0" * 64)
+    for path in (out / "runs").rglob("part-*.parquet"):
+        pq.write_table(pq.read_table(path).drop_columns(["asked_sha256"]), path)
 
 
 def cut_part(out):
@@ -231,7 +234,7 @@ def cut_part(out):
         (break_truth, "holds the truths of other queries"),
         (lose_truth, "holds no truths of .*: name their folder with --truth, or make the queries again"),
         (age_truth, "holds truths of task version 0, this version reads 1: make the queries again"),
-        (break_run, r"holds answers to other queries than .* does now: move it away and run again, or make the old"),
+        (age_run, r"holds answers to other queries than its task does now: run again \(.*, or make the old queries"),
         (cut_part, "cannot be read"),
     ],
 )

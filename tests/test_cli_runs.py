@@ -289,11 +289,13 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     for text in ("{", "[]", "null", '"run"'):
         about.write_text(text)
         assert "run.json is damaged: remove it and run again, the parts beside it are kept" in mistake(*ORACLE)
-    about.write_text('{"queries_sha256": "0"}')
-    told = mistake(*ORACLE)
-    assert "holds answers to other queries than" in told
-    assert told.endswith("move it away and run again, or make the old queries again")
+    about.write_text("{}")
+    assert "holds answers of None, not of" in mistake(*ORACLE)
     about.unlink()
+    pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
+    told = mistake(*ORACLE)
+    assert f"{run_folder} holds answers of an older version, and not to the queries that" in told
+    assert told.endswith("move it away and run again")
     about.mkdir()
     part.unlink()
     assert f"{run_folder} cannot be written (" in mistake(*ORACLE)

@@ -9,10 +9,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from sasgeo_bench.errors import counted
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
-from sasgeo_bench.run.plan import RunPart, RunPlan, by_map
+from sasgeo_bench.run.plan import MOST_LINES, RunPart, RunPlan, by_map
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import locked
 
@@ -26,7 +27,7 @@ class Progress(Protocol):
     """Whoever shows how far a run is; is called by one thread at a time."""
 
     def begin(self, label: str, total: int) -> None:
-        """Begin a task of so many queries."""
+        """Begin something of so many queries: all that one matcher is asked."""
         ...
 
     def advance(self, label: str, count: int) -> None:
@@ -39,7 +40,7 @@ class Lines:
 
     Examples
     --------
-    >>> Lines(print, every_s=0.0).begin("clean/vaduz", 2)
+    >>> Lines(print, every_s=0.0).begin("fft_vote", 2)
     """
 
     def __init__(self, tell: Tell, *, every_s: float = TOLD_S) -> None:
@@ -49,7 +50,7 @@ class Lines:
         self._told = time.monotonic()
 
     def begin(self, label: str, total: int) -> None:
-        """Begin a task."""
+        """Begin to count."""
         self._begun[label], self._done[label] = (time.monotonic(), total), 0
 
     def advance(self, label: str, count: int) -> None:
@@ -98,10 +99,10 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
         If a cluster was named that is not there.
     """
     progress = progress or Lines(tell)
-    for part in plan.parts:
-        if not part.left:
-            tell(f"{part.folder}: nothing left, {part.done} done")
+    _tell_state(plan, tell)
     parts = [part for part in plan.parts if part.left]
+    if parts:
+        progress.begin(plan.card.name, sum(len(part.left) for part in parts))
     costs: list[Cost] = []
     if plan.request.dask is not None and parts:
         costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
@@ -110,6 +111,19 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
     pooled = pool_costs(costs)
     folders = tuple(part.folder for part in plan.parts)
     return RunReport(counts=pooled.counts, messages=pooled.messages, folders=folders)
+
+
+def _tell_state(plan: RunPlan, tell: Tell) -> None:
+    """Say what is done already: of a few tasks which, of many how many; and what of the rows is not asked for."""
+    whole = [part for part in plan.parts if not part.left]
+    if len(whole) > MOST_LINES:
+        tell(f"{plan.card.name}: nothing left in {len(whole)} of {len(plan.parts)} tasks")
+    else:
+        for part in whole:
+            tell(f"{part.folder}: nothing left, {part.done} done")
+    aside = sum(part.aside for part in plan.parts)
+    if aside:
+        tell(f"{plan.card.name}: {counted(aside, 'answer')} to queries that these tasks do not hold now, set aside")
 
 
 def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
@@ -151,12 +165,13 @@ class _Notes(Watch):
     def begin(self, part: RunPart) -> None:
         """Say that a task begins."""
         with self._lock:
-            self._before[part.folder] = _begin(self._plan, part, self._progress)
+            self._before[part.folder] = _begin(self._plan, part)
 
     def advance(self, part: RunPart) -> None:
         """Tell of a row."""
+        del part  # progress is told of the whole matcher: a task may be too short for a pace
         with self._lock:
-            self._progress.advance(str(part.folder), 1)
+            self._progress.advance(self._plan.card.name, 1)
 
     def end(self, part: RunPart, cost: Cost) -> None:
         """Write what it took."""
@@ -170,19 +185,18 @@ def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tel
     with ExitStack() as locks:
         client = locks.enter_context(connected(address))
         _lock(locks, parts, tell)
-        before = [_begin(plan, part, progress) for part in parts]
+        before = [_begin(plan, part) for part in parts]
         for number, count, cost in answer_on(client, plan, parts):
             costs[number].append(cost)
             left[number] -= count
-            progress.advance(str(parts[number].folder), count)
+            progress.advance(plan.card.name, count)
             if not left[number]:
                 _say(plan, parts[number], pool_costs(costs[number]), before[number])
     return [pool_costs(items) for items in costs]
 
 
-def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
+def _begin(plan: RunPlan, part: RunPart) -> Cost:
     """Say that a task begins; what earlier runs of it took."""
-    progress.begin(str(part.folder), len(part.left))
     said = rundir.read_run(part.folder) or {}
     before = Cost(
         prepare_s=said.get("prepare_s"),
@@ -197,7 +211,7 @@ def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
 
 def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: what the run is, and what it and the runs before it have taken."""
-    about = taskdir.read_task(part.task)
+    about = part.about
     told: dict[str, Any] = asdict(pool_costs([before, cost]))
     del told["counts"], told["messages"]
     rundir.write_run(

@@ -4,7 +4,8 @@
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from sasgeo_bench.errors import PoseError, StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.store.taskrows import POSE_FIELDS, poses_of
+from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, poses_of
 
 RUN: Final = "run.json"
 SCHEMA_VERSION: Final = 1
@@ -32,6 +33,7 @@ PREDICTION_SCHEMA: Final = pa.schema(
     ],
     metadata={"schema_version": str(SCHEMA_VERSION), "attribution": ATTRIBUTION, "licence": LICENCE},
 )
+RUN_SCHEMA: Final = PREDICTION_SCHEMA.append(pa.field(ASKED, pa.string()))  # of a run's own parts
 
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
@@ -76,8 +78,17 @@ def _prediction(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ..
     )
 
 
-def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
+def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mapping[str, str] | None = None) -> Path:
     """Add some rows to a run, in a file of their own that is there whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    predictions : sequence of Prediction
+        The rows.
+    asked : mapping of str to str, optional
+        What each of them answers, by query id (`taskdir.read_asked`); without, a file as anyone may submit it.
 
     Raises
     ------
@@ -86,7 +97,10 @@ def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
     """
     name = f"part-{time.time_ns():020d}-{os.getpid()}"
     scratch, path = folder / f".{name}.partial", folder / f"{name}.parquet"
-    table = pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=PREDICTION_SCHEMA)
+    rows = [prediction_row(item) for item in predictions]
+    if asked is not None:
+        rows = [row | {ASKED: asked[row["query_id"]]} for row in rows]
+    table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA if asked is None else RUN_SCHEMA)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, scratch, compression="zstd")
@@ -123,10 +137,73 @@ def parts_of(path: Path) -> list[Path]:
     return sorted(path.glob("part-*.parquet")) or sorted(path.rglob("part-*.parquet"), key=lambda part: part.name)
 
 
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """What a row answers: the id of a query, what came of it, and the hash of what was asked.
+
+    The hash is empty in files of predictions and in runs of an older program: their rows answer whatever has their id.
+    Whoever takes them for answers must know from elsewhere to which queries.
+    """
+
+    query_id: str
+    status: str
+    asked: str
+
+    def answers(self, asked: Mapping[str, str], *, is_tied: bool = True) -> bool:
+        """Whether the row answers one of these queries, as they are now; one without a hash does if `is_tied`.
+
+        Examples
+        --------
+        >>> [Tie("a", "ok", said).answers({"a": "ff"}) for said in ("ff", "ee", "")]
+        [True, False, True]
+        """
+        now = asked.get(self.query_id)
+        return now is not None and (self.asked == now if self.asked else is_tied)
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """Answers of a run's folder to some queries, by id, and how many rows beside them answer others."""
+
+    found: dict[str, Prediction]
+    aside: int
+
+
+def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Answers:
+    """Answers to some queries out of a run's folder; of two for one query, the one that was written last.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run; one that was cut off before its first row has none.
+    asked : mapping of str to str
+        By query id, what an answer has to say that it answers (`taskdir.read_asked`).
+    is_tied : bool
+        Whether rows that do not say so are known to answer these queries.
+
+    Raises
+    ------
+    StoreError
+        If a part cannot be read.
+    """
+    found: dict[str, Prediction] = {}
+    aside: set[Tie] = set()
+    for part in reversed(parts_of(folder)):
+        table = _checked(part)
+        ties = _ties_of(table)
+        is_mine = [tie.answers(asked, is_tied=is_tied) for tie in ties]
+        aside |= {replace(tie, status="") for tie, mine in zip(ties, is_mine, strict=True) if not mine}
+        if not all(is_mine):
+            table = table.filter(pa.array(is_mine, pa.bool_()))
+        for prediction in _rows_of(part, table, found):
+            found.setdefault(prediction.query_id, prediction)
+    return Answers(found, len(aside))
+
+
 def read_predictions(path: Path) -> Iterator[Prediction]:
     """Predictions of a run's folder or of a file, newest first; of two for one query, the one that was written last.
 
-    A folder holds two where a query was asked again.
+    A folder holds two where a query was asked again, or was drawn anew and asked: `read_answers` tells them apart.
 
     Raises
     ------
@@ -139,14 +216,24 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         raise StoreError(message)
     seen: set[str] = set()
     for part in reversed(parts):
-        table = read_part(part)
-        if differing_columns(table):
-            message = f"{part} holds no predictions: 'validate' says what is missing"
-            raise StoreError(message)
-        for prediction in _sound(table) or _one_by_one(part, table, seen):
+        for prediction in _rows_of(part, _checked(part), seen):
             if prediction.query_id not in seen:
                 seen.add(prediction.query_id)
                 yield prediction
+
+
+def _checked(part: Path) -> pa.Table:
+    """A part that holds the columns of predictions."""
+    table = read_part(part)
+    if differing_columns(table):
+        message = f"{part} holds no predictions: 'validate' says what is missing"
+        raise StoreError(message)
+    return table
+
+
+def _rows_of(part: Path, table: pa.Table, seen: Collection[str]) -> Iterable[Prediction]:
+    """Rows, last first."""
+    return _sound(table) or _one_by_one(part, table, seen)
 
 
 def _sound(table: pa.Table) -> list[Prediction]:
@@ -169,7 +256,7 @@ def _sound(table: pa.Table) -> list[Prediction]:
     ]
 
 
-def _one_by_one(part: Path, table: pa.Table, seen: set[str]) -> Iterator[Prediction]:
+def _one_by_one(part: Path, table: pa.Table, seen: Collection[str]) -> Iterator[Prediction]:
     """Rows of queries that were not seen yet, last first, each refused in a word of its own."""
     for number, row in reversed(list(enumerate(table.to_pylist()))):
         if row["query_id"] not in seen:
@@ -244,25 +331,36 @@ def read_part(path: Path) -> pa.Table:
         raise StoreError(message) from error
 
 
-def merge_runs(runs: Sequence[Path], into: Path) -> int:
+def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | None = None) -> int:
     """Write the predictions of several folders or files into one file, sorted by query; how many there are.
 
     Of two for one query the first counts, in the order of `runs`. The same predictions give the same file, whatever
     parts they came in.
 
+    Parameters
+    ----------
+    runs : sequence of Path
+        Folders and files.
+    into : Path
+        File to write.
+    asked : mapping of str to str, optional
+        Of folders only answers to these queries (`taskdir.read_asked`); without, all there are.
+
     Raises
     ------
     StoreError
-        If there are none, the folders are of different matchers, versions or settings, a file cannot be read, or the
-        new one cannot be written.
+        If there are none, the folders are of different matchers, versions or settings, two rows answer different
+        queries of one id, a file cannot be read, or the new one cannot be written.
     """
     _check_one_matcher(runs)
+    if asked is None:
+        _check_one_query(runs)
     if into.exists() and not _is_ours(into):
         message = f"{into} is no predictions file and would be lost: name another one"
         raise StoreError(message)
     found: dict[str, Prediction] = {}
     for path in runs:
-        for prediction in read_predictions(path):
+        for prediction in _to_merge(path, asked):
             found.setdefault(prediction.query_id, prediction)
     rows = [prediction_row(found[name]) for name in sorted(found)]
     scratch = into.with_name(f".{into.name}.partial")
@@ -276,6 +374,13 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
         message = f"{into} cannot be written ({error.strerror or error}): check your rights and the free space"
         raise StoreError(message) from error
     return len(rows)
+
+
+def _to_merge(path: Path, asked: Mapping[str, str] | None) -> Iterable[Prediction]:
+    """All rows of a file; of a folder those that are asked for."""
+    if asked is None or not path.is_dir() or not parts_of(path):
+        return read_predictions(path)
+    return read_answers(path, asked).found.values()
 
 
 def _check_one_matcher(runs: Sequence[Path]) -> None:
@@ -293,6 +398,19 @@ def _check_one_matcher(runs: Sequence[Path]) -> None:
             raise StoreError(message)
 
 
+def _check_one_query(runs: Sequence[Path]) -> None:
+    """Refuse answers to a query and to what it was once: a file of predictions could not tell them apart."""
+    found: dict[str, str] = {}
+    for path in runs:
+        for tie in read_ties(path) if path.is_dir() else []:
+            if tie.asked and found.setdefault(tie.query_id, tie.asked) != tie.asked:
+                message = (
+                    f"{path} holds answers to query {tie.query_id} and to what it was when it was drawn otherwise: "
+                    "name the tasks with --tasks"
+                )
+                raise StoreError(message)
+
+
 def _who(about: Mapping[str, Any]) -> str:
     card = about.get("matcher")
     name, version = (card.get("name"), card.get("version")) if isinstance(card, dict) else (None, None)
@@ -306,8 +424,36 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
-    """Ids of the queries a run has answered; those with a status in `again` do not count.
+def read_ties(folder: Path) -> list[Tie]:
+    """What the rows of a run's folder answer, in the order they were written.
+
+    Raises
+    ------
+    StoreError
+        If a part cannot be read, or is none.
+    """
+    found: list[Tie] = []
+    for part in parts_of(folder):
+        table = read_part(part)
+        if differing_columns(table):
+            message = f"{part} holds no predictions: move it out of the run's folder"
+            raise StoreError(message)
+        found += _ties_of(table)
+    return found
+
+
+def _ties_of(table: pa.Table) -> list[Tie]:
+    columns = [name for name in ("query_id", "status", ASKED) if name in table.column_names]
+    return [tie_of(row) for row in table.select(columns).to_pylist()]
+
+
+def tie_of(row: Mapping[str, Any]) -> Tie:
+    """What one row answers."""
+    return Tie(str(row["query_id"]), str(row["status"]), str(row.get(ASKED) or ""))
+
+
+def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = ()) -> set[str]:
+    """Ids of those queries that a run has answered as they are now; rows with a status in `again` do not count.
 
     Raises
     ------
@@ -315,15 +461,8 @@ def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
         If a part cannot be read, or is none.
     """
     left_out = set(again)
-    found: set[str] = set()
-    for part in parts_of(folder):
-        table = read_part(part)
-        if differing_columns(table):
-            message = f"{part} holds no predictions: move it out of the run's folder"
-            raise StoreError(message)
-        pairs = zip(table["query_id"].to_pylist(), table["status"].to_pylist(), strict=True)
-        found |= {name for name, status in pairs if status not in left_out}
-    return found
+    ties = read_ties(folder) if folder.is_dir() else []
+    return {tie.query_id for tie in ties if tie.status not in left_out and tie.answers(asked)}
 
 
 def write_run(folder: Path, about: Mapping[str, Any]) -> None:

@@ -56,8 +56,8 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     rundir.write_part(folder, [FULL])
     rundir.write_part(folder, [FAILED])
     assert sorted(everything(folder), key=lambda item: item.query_id) == [FAILED, FULL]
-    assert rundir.ids_done(folder) == {"a", "b"}
-    assert rundir.ids_done(folder, again=("crash",)) == {"b"}
+    assert rundir.ids_done(folder, {"a": "", "b": ""}) == {"a", "b"}
+    assert rundir.ids_done(folder, {"a": "", "b": ""}, again=("crash",)) == {"b"}
     assert {path.suffix for path in folder.iterdir()} == {".parquet"}
 
 
@@ -78,7 +78,7 @@ def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_ar
         path = write(table, "part-1.parquet")
         assert "holds no predictions: 'validate' says what is missing" in refusal(everything, path)
         assert "holds no predictions" in refusal(rundir.merge_runs, [path], tmp_path / "new.parquet")
-        assert "move it out of the run's folder" in refusal(rundir.ids_done, tmp_path)
+        assert "move it out of the run's folder" in refusal(rundir.ids_done, tmp_path, {})
     assert not (tmp_path / "new.parquet").exists()
 
 

@@ -26,7 +26,7 @@ from sasgeo_bench.query import TASK_VERSION, Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
-from sasgeo_bench.store import regiondir, taskdir
+from sasgeo_bench.store import regiondir, rundir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sheet import Panel
 from sasgeo_bench.suites.all_suites import find_suite
@@ -97,6 +97,34 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
         return None
     plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
     return folders if plan.is_current else None
+
+
+def why_to_draw(request: Request) -> str:
+    """In a few words, why a request has to be carried out, where `made_tasks` finds that it has."""
+    suite_folder = request.out / "truth" / request.suite
+    folders = (path for path in sorted(suite_folder.glob(f"{request.region.id}*")) if _is_of(path, request.region.id))
+    there = [said for said in map(taskdir.read_hidden, folders) if said]
+    if not there:
+        return "not there yet"
+    if any(said.get("request_sha256") == _request_sha256(request) for said in there):
+        return "task, truths or map changed since"
+    if all(said.get("seed") != request.seed for said in there):
+        return "drawn with another seed"
+    counts = [said.get("count") for said in there]
+    if not {request.count, None} & set(counts):
+        return f"drawn with sites = {counts[0]}, now {request.count}"
+    return "drawn by other settings or an older version"
+
+
+def count_rows(run: Path, suite: str, region: str) -> int:
+    """How many answers the folder of a matcher's runs holds to queries of a suite on a region, whenever drawn."""
+    folders = [path for path in sorted((run / suite).glob(f"{region}*")) if path.is_dir() and _is_of(path, region)]
+    return sum(len({(tie.query_id, tie.asked) for tie in rundir.read_ties(folder)}) for folder in folders)
+
+
+def _is_of(folder: Path, region: str) -> bool:
+    """Whether a folder is that of a region, or of an older date or an edit of it."""
+    return folder.name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0] == region
 
 
 def _request_sha256(request: Request) -> str:
@@ -259,7 +287,7 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     left = [job for job in jobs if drawer.can_draw(job)]
     if len(left) < len(jobs):
         where = f"{drawer.suite.card.name} on {request.region.id}"
-        tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} decoys")
+        tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} candidates")
     by_map: dict[str, list[Job]] = {}
     if not left:
         raise _too_small(request, drawer.suite)
@@ -267,7 +295,8 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name
     # With the seed anyone could draw the truths again, so it is kept with them.
-    hidden = {"seed": request.seed, "request_sha256": _request_sha256(request), "maps": len(by_map)}
+    hidden: dict[str, Any] = {"seed": request.seed, "count": request.count, "maps": len(by_map)}
+    hidden["request_sha256"] = _request_sha256(request)
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
         made = put_task(map(drawer.draw, own), about, hidden, out=request.out, tell=tell)

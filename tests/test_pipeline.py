@@ -44,7 +44,14 @@ def small(**changes):
 def made(tmp_path_factory, few_controls):  # noqa: ARG001
     out = tmp_path_factory.mktemp("pipeline") / "out"
     plan = plan_pipeline(small(), out=out, tell=lambda _: None)
-    assert "to be drawn" in plan.to_text()
+    told = plan.to_text().splitlines()
+    assert told[1:3] == [
+        "  queries: 0 of 1 task up to date, 1 to be drawn (1 not there yet)",
+        "    to be drawn: clean on town-suburb",
+    ]
+    assert told[3] == "  controls: 0 of 1 task up to date, 1 to be drawn (1 not there yet)"
+    assert "  run: 4 matchers, 0 answered, 0 to ask" in told
+    assert "    fft_vote (controls alone): 0 answered, 0 to ask, and what is drawn; 0 answered there before" in told
     lines = []
     return plan, run_pipeline(plan, tell=lines.append), lines
 
@@ -95,8 +102,39 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
         f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
     ]
     assert again.table.equals(board.table)
-    assert "up to date" in plan.to_text()
-    assert "to be drawn" not in plan.to_text()
+    told = plan.to_text()
+    assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in told
+    count = len(board.scores["random"]) + len(
+        taskdir.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+    )
+    assert f"    random: {count} answered, 0 to ask\n" in told
+    assert "to be drawn" not in told
+
+
+def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_coming(made):
+    plan, board, _ = made
+    changes = {'id = "small"': 'id = "other"\nseed = 1', "sites = 1": "sites = 2"}
+    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    told = other.to_text()
+    assert "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with another seed)\n" in told
+    count = len(board.scores["random"]) + len(
+        taskdir.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+    )
+    assert f"    random: 0 answered, 0 to ask, and what is drawn; {count} answered there before\n" in told
+    assert "answers where they are: those to the same queries count again, the others are set aside\n" in told
+    run_pipeline(other, tell=lambda _: None)
+    assert "1 drawn with sites = 2, now 3" in _more_sites(other).to_text()
+    lines = []
+    again = run_pipeline(plan, tell=lines.append)
+    assert [line for line in lines if "queries to ask" in line and ": 0 queries" not in line] == []
+    for name, frame in board.scores.items():
+        assert again.scores[name].equals(frame)
+
+
+def _more_sites(plan):
+    (task,) = plan.spec.task
+    spec = plan.spec.model_copy(update={"task": [task.model_copy(update={"sites": 3})]})
+    return plan_pipeline(spec, out=plan.out, tell=lambda _: None)
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,15 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import pandas as pd
 
+from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scored_task
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.query import CONTROLS, TASK_VERSION, Head, Truth
+from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
@@ -29,14 +30,12 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import Extra, check_board, write_board
-from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
 Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-M2_PER_KM2: Final = 1e6
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 MOST_NAMED: Final = 3  # runs that are left out; the others are counted
@@ -209,7 +208,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     judges = _judges(request)
     told = _read_told(request, find_entries(request.predictions), tell)
     folders = list(dict.fromkeys(request.tasks)) or sorted({folder for item in told for folder in item.held})
-    tasks = [_read_task(folder, request.truth or request.root / "truth") for folder in folders]
+    tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
     for item in told:
         if item.entry.how == AS_SUBMITTED:
             _check_file(item.entry.sources[0], folders)
@@ -273,7 +272,7 @@ def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
     return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
 
 
-def _asked_whole(told: Sequence["_Told"], tasks: Sequence["_Task"], tell: Tell) -> dict[str, frozenset[str]]:
+def _asked_whole(told: Sequence["_Told"], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
     """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
     suites = {task.about["suite"] for task in tasks}
     found = {}
@@ -330,8 +329,8 @@ def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> l
     """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves."""
     files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
     folders = list(request.tasks) or _named(entries, request.root)
-    folders = list(dict.fromkeys([*folders, *(() if request.tasks else _held(files.values(), request.root))]))
-    tasks = [_Asked.of(folder) for folder in folders]
+    folders = list(dict.fromkeys([*folders, *(() if request.tasks else held_tasks(files.values(), request.root))]))
+    tasks = [AskedTask.of(folder) for folder in folders]
     told: list[_Told] = []
     stale: list[Path] = []
     for entry in entries:
@@ -368,21 +367,7 @@ def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
     return {item.query_id: item for source in entry.sources for item in rundir.read_predictions(source)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """A task as runs are held against it: by query, the hash of what is asked."""
-
-    folder: Path
-    about: Mapping[str, Any]
-    asked: Mapping[str, str]
-
-    @classmethod
-    def of(cls, folder: Path) -> Self:
-        """Read it from its folder."""
-        return cls(folder=folder, about=taskdir.read_task(folder), asked=taskdir.read_asked(folder))
-
-
-def _read_runs(entry: Entry, tasks: Sequence[_Asked]) -> tuple[_Told, list[Path]]:
+def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[_Told, list[Path]]:
     """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
     rows: dict[str, Prediction] = {}
@@ -417,14 +402,6 @@ def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
     return [folder for folder in folders if (folder / taskdir.TASK).is_file()]
 
 
-def _held(files: Collection[Mapping[str, Prediction]], root: Path) -> Iterator[Path]:
-    """Task folders of which files hold an answer."""
-    held = {name for rows in files for name in rows}
-    for path in sorted((root / "tasks").glob(f"*/*/{taskdir.TASK}")) if held else ():
-        if not held.isdisjoint(taskdir.read_ids(path.parent)):
-            yield path.parent
-
-
 def _check_file(path: Path, folders: Sequence[Path]) -> None:
     """Refuse a file of predictions that is not what the tasks ask for; queries without a row are misses, no faults."""
     faults = [fault for fault in validate(path, folders) if not fault.is_missing_row]
@@ -433,45 +410,7 @@ def _check_file(path: Path, folders: Sequence[Path]) -> None:
         raise ConfigError(message)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Task:
-    """A task as it is scored: read once, for all contestants."""
-
-    folder: Path
-    about: dict[str, Any]
-    heads: tuple[Head, ...]
-    truths: tuple[Truth, ...]
-    view_bytes: dict[str, int]
-    area_km2: float | None
-
-
-def _read_task(folder: Path, root: Path) -> _Task:
-    """A task and its truths from their own root, after they were held against each other."""
-    about = taskdir.read_task(folder)
-    truth = root / str(about["suite"]) / str(about["region"])
-    taskdir.check_truths(folder, truth)
-    heads, truths = tuple(taskdir.read_heads(folder)), tuple(taskdir.read_truths(truth))
-    return _Task(
-        folder=folder,
-        about=about,
-        heads=heads,
-        truths=truths,
-        view_bytes=taskdir.read_view_bytes(folder),
-        area_km2=_area_km2(folder.resolve().parents[2] / "regions" / about["region"]),
-    )
-
-
-def _area_km2(region: Path) -> float | None:
-    """Mapped area of a region; None where it is not beside the tasks, for scores need no map."""
-    try:
-        manifest = read_manifest(region)
-    except StoreError:
-        return None
-    west, south, east, north = manifest.bounds_m
-    return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
-
-
-def _scored(told: _Told, tasks: Sequence[_Task], request: ScoreRequest) -> pd.DataFrame:
+def _scored(told: _Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> pd.DataFrame:
     """All tasks that one contestant was asked, one row for each query."""
     place_of = {} if request.split is None else request.split.place_of
     frames = []

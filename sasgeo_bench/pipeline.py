@@ -21,7 +21,8 @@ from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
-from sasgeo_bench.tasks import count_rows, made_tasks, make_tasks, why_to_draw
+from sasgeo_bench.store import rundir
+from sasgeo_bench.tasks import is_of_region, made_tasks, make_tasks, why_to_draw
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
@@ -145,7 +146,7 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
         left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
         lacking = [item for stage in mine for item in stage.lacking]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
-        behind = sum(count_rows(run_folder, item.suite, item.region) for item in lacking)
+        behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
         more = f", and what is drawn; {behind} answered there before" if lacking else ""
         where = " (controls alone)" if mine == [controls] and len(stages) > 1 else ""
         lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
@@ -157,6 +158,12 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
             "count again, the others are set aside"
         )
     return lines
+
+
+def _count_rows(run: Path, suite: str, region: str) -> int:
+    """How many answers the folder of a matcher's runs holds to queries of a suite on a region, whenever drawn."""
+    folders = [path for path in (run / suite).glob(f"{region}*") if path.is_dir() and is_of_region(path.name, region)]
+    return sum(len({(tie.query_id, tie.asked) for tie in rundir.read_ties(folder)}) for folder in folders)
 
 
 def board_folder(plan: PipelinePlan) -> Path:

@@ -26,7 +26,7 @@ from sasgeo_bench.query import TASK_VERSION, Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
-from sasgeo_bench.store import regiondir, rundir, taskdir
+from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sheet import Panel
 from sasgeo_bench.suites.all_suites import find_suite
@@ -102,7 +102,11 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
 def why_to_draw(request: Request) -> str:
     """In a few words, why a request has to be carried out, where `made_tasks` finds that it has."""
     suite_folder = request.out / "truth" / request.suite
-    folders = (path for path in sorted(suite_folder.glob(f"{request.region.id}*")) if _is_of(path, request.region.id))
+    folders = (
+        path
+        for path in sorted(suite_folder.glob(f"{request.region.id}*"))
+        if is_of_region(path.name, request.region.id)
+    )
     there = [said for said in map(taskdir.read_hidden, folders) if said]
     if not there:
         return "not there yet"
@@ -116,15 +120,15 @@ def why_to_draw(request: Request) -> str:
     return "drawn by other settings or an older version"
 
 
-def count_rows(run: Path, suite: str, region: str) -> int:
-    """How many answers the folder of a matcher's runs holds to queries of a suite on a region, whenever drawn."""
-    folders = [path for path in sorted((run / suite).glob(f"{region}*")) if path.is_dir() and _is_of(path, region)]
-    return sum(len({(tie.query_id, tie.asked) for tie in rundir.read_ties(folder)}) for folder in folders)
+def is_of_region(name: str, region: str) -> bool:
+    """Whether a map is that of a region, or of an older date or an edit of it.
 
-
-def _is_of(folder: Path, region: str) -> bool:
-    """Whether a folder is that of a region, or of an older date or an edit of it."""
-    return folder.name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0] == region
+    Examples
+    --------
+    >>> [is_of_region(name, "vaduz") for name in ("vaduz", "vaduz@2021-10-28", "vaduz+alias", "vaduz-north")]
+    [True, True, True, False]
+    """
+    return name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0] == region
 
 
 def _request_sha256(request: Request) -> str:

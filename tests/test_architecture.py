@@ -91,6 +91,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
         *("paper", "papertext", "plots", "site"),
     ),
+    "boardtasks": None,
     "boards": None,
     "paperboard": None,
     "pipeline": None,

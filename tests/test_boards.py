@@ -300,6 +300,74 @@ def test_nothing_to_score_is_told(out, tmp_path):
         board_of(out, tmp_path / "foreign")
 
 
+def copy_run(out, name, towns, *, asked=None):
+    """Runs of another matcher with the control's answers, to queries as they are, or as they once were."""
+    folders = []
+    for town in towns:
+        (run,) = (path for path in (out / "runs" / "oracle_pose").glob(f"*/clean/{town}"))
+        folder = out / "runs" / name / "0123456789ab" / "clean" / town
+        hashes = taskdir.read_asked(out / "tasks" / "clean" / town) if asked is None else asked
+        rows = list(rundir.read_predictions(run))
+        rundir.write_part(folder, rows, asked={row.query_id: hashes[row.query_id] for row in rows})
+        about = rundir.read_run(run)
+        sha256 = about["queries_sha256"] if asked is None else "0" * 64
+        card = about["matcher"] | {"name": name}
+        rundir.write_run(folder, about | {"matcher": card, "hash": "0123456789ab", "queries_sha256": sha256})
+        folders.append(folder)
+    return folders
+
+
+def told_by(out, *predictions, **changes):
+    lines = []
+    request = ScoreRequest(predictions=predictions, root=out, board=out / "boards" / "mine", draws=200)
+    return make_board(replace(request, **changes), tell=lines.append), lines
+
+
+class Once(dict):
+    def __missing__(self, key):
+        return "0" * 64
+
+
+def test_a_run_of_other_queries_is_left_out_among_many_and_refused_by_itself(out):
+    stale = copy_run(out, "stale", TOWNS, asked=Once())
+    board, lines = told_by(out, out / "runs")
+    assert [entry.name for entry in board.entries] == ["oracle_pose"]
+    assert lines[0] == f"left out: 2 runs without an answer to these queries ({stale[0]}, {stale[1]})"
+    for named in (stale[0], out / "runs" / "stale"):
+        with pytest.raises(StoreError, match="holds answers to other queries than its task does now: run again"):
+            told_by(out, named)
+    with pytest.raises(StoreError, match="holds answers to other queries than these tasks do now"):
+        told_by(out, out / "runs" / "stale", tasks=[out / "tasks" / "clean" / TOWNS[1]])
+
+
+def test_rows_to_other_queries_beside_the_answers_are_never_scored(out):
+    (run,) = (out / "runs" / "oracle_pose").glob(f"*/clean/{TOWNS[0]}")
+    before, _ = told_by(out, run)
+    rows = [replace(row, candidates=()) for row in rundir.read_predictions(run)]
+    strangers = [*rows, Prediction(query_id="f" * 24)]
+    rundir.write_part(run, strangers, asked=dict.fromkeys([row.query_id for row in strangers], "0" * 64))
+    after, _ = told_by(out, run)
+    pd.testing.assert_frame_equal(before.scores["oracle_pose"], after.scores["oracle_pose"])
+    (entry,) = after.entries
+    share = (len(rows)) / (len(rows) + len(strangers))
+    assert entry.runs[0]["cpu_s"] == pytest.approx(share * rundir.read_run(run)["cpu_s"])
+
+
+def test_who_was_asked_nothing_of_a_task_is_not_on_the_board_of_its_suite(out):
+    copy_run(out, "partly", TOWNS[:1])
+    board, lines = told_by(out, out / "runs")
+    assert "partly: not on the board of clean, for it was not asked all tasks there" in lines
+    assert set(board.scores) == {"oracle_pose"}
+    board, lines = told_by(out, out / "runs", tasks=[out / "tasks" / "clean" / TOWNS[0]])
+    assert set(board.scores) == set(board.table["matcher"]) == {"oracle_pose", "partly"}
+    assert not board.table["missing"].any()
+    present = board.scores["partly"]["is_present"].to_numpy(bool)
+    count = len(present)
+    assert f"partly: {present.sum()} of {count} queries answered, {count - present.sum()} withheld" in lines
+    with pytest.raises(ConfigError, match=r"nothing to rank: .* no suite has a matcher that was asked all"):
+        told_by(out, out / "runs" / "partly", tasks=[out / "tasks" / "clean" / town for town in TOWNS])
+
+
 def test_two_files_of_one_name_are_refused(out, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -204,6 +204,38 @@ def test_several_tasks_are_run_and_validated_at_once(program, out) -> None:
     assert (code, told) == (0, "all.parquet: answers every query of 2 tasks, and nothing else\n")
 
 
+def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_folder, ids, monkeypatch) -> None:
+    monkeypatch.setattr("sasgeo_bench.run.plan.MOST_LINES", 1)
+    monkeypatch.setattr("sasgeo_bench.run.runner.MOST_LINES", 0)
+    other = TASK.parent.parent / "clean" / TOWN
+    more = len(taskdir.read_ids(other))
+    code, told, _ = program(*ORACLE, "--tasks", other, "--dry-run")
+    assert (code, told.splitlines()[1:]) == (
+        0,
+        [
+            f"  {run_folder}: 0 queries left, {len(ids)} done",
+            f"  1 more tasks: {more} queries left, 0 done",
+            f"  all 2 tasks: {more} queries left, {len(ids)} done",
+        ],
+    )
+    code, _, err = program(*ORACLE, "--tasks", other)
+    assert (code, err.splitlines()[0]) == (0, "oracle_pose: nothing left in 1 of 2 tasks")
+
+
+def test_answers_to_what_a_query_was_are_set_aside_by_validate_and_merge(program, mistake, run_folder, ids) -> None:
+    rundir.write_part(run_folder, [Prediction(query_id=ids[0])], asked={ids[0]: "0" * 64})
+    code, told, err = program("validate", "--predictions", run_folder, "--tasks", TASK)
+    assert (code, err) == (0, "")
+    assert told == f"{run_folder}: answers every query of 1 task, 1 answer to other queries set aside\n"
+    code, told, _ = program(*ORACLE, "--dry-run")
+    assert f"0 queries left, {len(ids)} done, 1 answer to other queries set aside" in told
+    words = ("merge", "--runs", run_folder, "--into", "mine.parquet")
+    assert mistake(*words).endswith("name the tasks with --tasks")
+    code, told, _ = program(*words, "--tasks", TASK)
+    assert (code, told) == (0, f"mine.parquet: {len(ids)} predictions\n")
+    assert all(item.candidates or item.query_id != ids[0] for item in rundir.read_predictions(Path("mine.parquet")))
+
+
 @pytest.mark.parametrize("text", ["x", "1", "", "/", "1/", "/2", "-1/2", "1/2/3", "1/2 ", "1.0/2", "one/two", "²/2"])
 def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
     assert f"--shard must be i/n, as in 1/2, got {text!r}" in mistake(*ORACLE, f"--shard={text}")

@@ -25,6 +25,7 @@ from sasgeo_bench.cli.regions import build_region_command, list_regions_command
 from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.results import one_line
 
 EXIT_INTERRUPTED: Final = 130
 
@@ -74,7 +75,7 @@ def _warn(
 ) -> None:
     """Print a warning as one line, without where it came from."""
     del category, filename, lineno, file, line
-    errors.print(f"sasgeo-bench: warning: {message}", markup=False)
+    errors.print(f"sasgeo-bench: warning: {one_line(str(message))}", markup=False)
 
 
 def main() -> None:

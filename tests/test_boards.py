@@ -46,6 +46,10 @@ class Doubt:
         return np.full(len(predictions), self.rate)
 
 
+class DoubtToo(Doubt):
+    """Another rejector of the same name."""
+
+
 class Own(Doubt):
     card = replace(Doubt.card, name="own")
 
@@ -283,9 +287,41 @@ class Raises(Doubt):
         raise RuntimeError(len(predictions))
 
 
-def test_a_rejector_that_fails_is_named(out, split):
-    with pytest.raises(MatchError, match=r"rejector 'doubt' failed \(RuntimeError: "):
-        board_of(out, rejectors=[f"{__name__}:Raises"], split=split)
+class Leaves(Doubt):
+    def p_false(self, predictions):
+        raise SystemExit(len(predictions) * 0)
+
+
+class SaysNan(Doubt):
+    def p_false(self, predictions):
+        return np.full(len(predictions), np.nan)
+
+
+class LeavesAtOnce(Doubt):
+    def __init__(self):
+        raise SystemExit(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Raises", r"rejector 'doubt' failed \(RuntimeError: .*: mend it, or leave it out"),
+        ("SaysNan", r"rejector 'doubt' failed \(MatchError: p_false\(\) returned nan in place 0, expected 0..1\)"),
+        ("Leaves", r"rejector 'doubt' failed \(SystemExit: 0\)"),
+        ("LeavesAtOnce", r"LeavesAtOnce: cannot be made \(SystemExit: 0\)"),
+    ],
+)
+def test_a_rejector_that_fails_or_ends_the_program_is_named_and_nothing_is_written(out, split, name, words):
+    with pytest.raises(MatchError, match=words):
+        board_of(out, rejectors=[f"{__name__}:{name}"], split=split)
+    assert not (out / "boards").exists()
+
+
+def test_two_rejectors_of_one_name_are_refused_and_one_named_twice_is_one(out, split):
+    first, second = (f"{__name__}:{name}" for name in ("Doubt", "DoubtToo"))
+    with pytest.raises(ConfigError, match=r"Doubt and .*DoubtToo are both named 'doubt': rename one"):
+        board_of(out, rejectors=[first, second], split=split)
+    assert set(board_of(out, rejectors=[first, first], split=split).table["rejector"]) >= {"doubt"}
 
 
 def test_nothing_to_score_is_told(out, tmp_path):
@@ -305,6 +341,54 @@ def test_two_files_of_one_name_are_refused(out, tmp_path):
         find_entries([shutil.copy(tmp_path / "a" / "mine.parquet", tmp_path / "a|b.parquet")])
     with pytest.raises(ConfigError, match="two contestants are named 'mine'"):
         find_entries([tmp_path / "a" / "mine.parquet", tmp_path / "b" / "mine.parquet"])
+
+
+@pytest.mark.parametrize("name", ["oracle_pose", "prior_centre", "random"])
+def test_a_file_may_not_pass_for_a_control(out, tmp_path, name):
+    submission(out, tmp_path / f"{name}.parquet")
+    with pytest.raises(ConfigError, match=f"'{name}' is the name of a control of every board: rename the file"):
+        find_entries([tmp_path / f"{name}.parquet"])
+
+
+def test_what_is_named_twice_counts_once(out, tmp_path):
+    submission(out, tmp_path / "mine.parquet")
+    file, runs = tmp_path / "mine.parquet", out / "runs"
+    (tmp_path / "again").symlink_to(runs)
+    entries = find_entries([runs, file, runs / "oracle_pose", file, tmp_path / "again"])
+    assert [(entry.name, len(entry.sources)) for entry in entries] == [("mine", 1), ("oracle_pose", len(TOWNS))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"matcher": None}, "matcher.name is None"),
+        ({"matcher": {"name": "a|b", "version": "1"}}, r"name 'a\|b' may hold lower-case letters"),
+        ({"matcher": {"name": "../../x", "version": "1"}}, "may hold lower-case letters"),
+        ({"matcher": {"name": "x", "version": 1}}, "matcher.version is 1"),
+        ({"hash": ["x"]}, r"hash is \['x'\]"),
+        ({"suite": None}, "suite is None"),
+        ({"region": ""}, "region is ''"),
+        ({"queries_sha256": {}}, "queries_sha256 is {}"),
+        ({"cpu_s": "long"}, "cpu_s of a run is 'long', expected a number"),
+    ],
+)
+def test_a_run_that_does_not_say_whose_it_is_gets_one_line(out, changes, words):
+    path = next((out / "runs").rglob("run.json"))
+    edit_json(path, **changes)
+    with pytest.raises(StoreError, match=rf"run\.json is damaged \(.*{words}.*\): remove it and run again"):
+        board_of(out)
+    assert not (out / "boards").exists()
+
+
+@pytest.mark.parametrize("place", ["before", "zz"])
+def test_every_run_of_a_task_is_of_its_queries(out, tmp_path, place):
+    """Shards of two machines are two runs of one task; one of older queries is found in either order."""
+    stale = Path(shutil.copytree(out / "runs", tmp_path / place))
+    for path in stale.rglob("run.json"):
+        edit_json(path, queries_sha256="0" * 64)
+    both = [stale, out / "runs"] if place == "before" else [out / "runs", stale]
+    with pytest.raises(StoreError, match=f"{place}.* holds answers to other queries than .* does now: move it away"):
+        board_of(out, *both)
 
 
 def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):

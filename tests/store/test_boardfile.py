@@ -56,7 +56,7 @@ def board(tmp_path):
 def test_killed_in_the_middle_the_old_board_stays_and_the_next_one_takes_its_place(board):
     before = contents(board)
     root = Path(__file__).parents[2]
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(board)], cwd=root, check=False)
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(board)], cwd=root, check=False)  # noqa: S603 - our own
     assert killed.returncode == -signal.SIGKILL
     assert contents(board) == before
     assert (board.parent / ".mine.partial").is_dir()
@@ -123,5 +123,5 @@ def test_two_boards_at_once_in_one_place_are_written_one_after_the_other(board):
 def test_any_table_tells_the_scorer_version_of_a_board(board, lost):
     (board / lost).unlink()
     check_board(board, scorer_version=1)
-    with pytest.raises(StoreError, match="holds rows of scorer version 1, this one is 2: .* name another one, or move"):
+    with pytest.raises(StoreError, match=r"rows of scorer version 1, this one is 2: .* name another one, or move"):
         check_board(board, scorer_version=2)

@@ -397,6 +397,19 @@ def test_predictions_for_a_task_of_another_version_are_not_validated(mistake, mi
     assert told.endswith("make the queries again")
 
 
+def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
+    path, name = mine(), "x" * 300
+    for words in (
+        ("score", "--predictions", name),
+        ("validate", "--predictions", name, "--tasks", TASK),
+        ("validate", "--predictions", path, "--tasks", name),
+        ("leaderboard", f"{name}.toml"),
+    ):
+        told = mistake(*words)
+        assert "File name too long; check the path, your rights and the free space: xxx" in told
+    assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
+
+
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:
     path = mine()
     words = ("validate", "--predictions")

@@ -30,6 +30,14 @@ second = "prior_centre"
 suites = ["clean"]
 """
 
+MIRRORED = """
+[[contrast]]
+name = "mirrored"
+first = "prior_centre"
+second = "random"
+suites = ["clean"]
+"""
+
 
 def small(**changes):
     text = TEXT
@@ -131,6 +139,15 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
             "matcher 'random' is listed twice",
         ),
         ({"sites = 1": "sites = 0"}, "greater than or equal to 1"),
+        ({"sites = 1": "sites = -1"}, "greater than or equal to 1, got -1"),
+        ({"sites = 1": "sites = 1000000000"}, "less than or equal to 10000"),
+        ({'suites = ["clean"]\nsites': "suites = []\nsites"}, "at least 1 item"),
+        ({'suites = ["clean"]\nsites': 'suites = ["clean", "clean"]\nsites'}, "suite 'clean' is listed twice"),
+        ({'id = "small"': f'id = "{"x" * 300}"'}, "'id': String should match pattern"),
+        ({'id = "small"': 'id = "../../small"'}, "'id': String should match pattern"),
+        ({'second = "prior_centre"': 'second = "random"'}, "contrast 'nothing' holds 'random' against itself"),
+        ({"[[contrast]]": MIRRORED + "[[contrast]]"}, "contrasts 'mirrored' and 'nothing' compare the same"),
+        ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),

@@ -79,12 +79,18 @@ def _warn(
 
 
 def main() -> None:
-    """Run the program: 0 done, 2 the user's mistake on one line, 1 our bug with a traceback."""
+    """Run the program: 0 done, 2 the user's mistake or the disk's refusal on one line, 1 our bug with a traceback."""
     warnings.showwarning = _warn
     try:
         app()
     except SasgeoError as error:
         errors.print(f"sasgeo-bench: {error}", markup=False)
+        sys.exit(EXIT_USER)
+    except OSError as error:  # whatever no reader or writer has put in words of its own, as of a name that is too long
+        said = (
+            f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or 'a file'}"
+        )
+        errors.print(f"sasgeo-bench: {one_line(said)}", markup=False)
         sys.exit(EXIT_USER)
     except SystemExit as leaving:
         if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word

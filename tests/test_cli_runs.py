@@ -326,7 +326,8 @@ def test_what_cannot_be_merged_gets_one_line_and_nothing_is_written(mistake, min
     for file, words in (
         ("nowhere", "nowhere holds no predictions: run a matcher first, or name a predictions file"),
         ("notes.txt", "notes.txt cannot be read ("),
-        (TASK / taskdir.QUERIES, "holds no predictions: 'validate' says what is missing"),
+        (TASK / taskdir.QUERIES, "holds no predictions (candidates: found list"),
+        (TASK / taskdir.TASK, "cannot be read ("),
         (TASK, "holds no predictions"),
     ):
         assert words in mistake("merge", "--runs", rows, "--runs", file, "--into", "new.parquet")
@@ -408,6 +409,14 @@ def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
         told = mistake(*words)
         assert "File name too long; check the path, your rights and the free space: xxx" in told
     assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
+
+
+def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) -> None:
+    other = Path(shutil.copytree(run_folder, run_folder.parents[3] / "other" / "x" / SUITE / TOWN))
+    about = rundir.read_run(other)
+    rundir.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"name": "other"}})
+    told = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
+    assert told.endswith("two matchers, versions or settings are never mixed, name the folder of one")
 
 
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:

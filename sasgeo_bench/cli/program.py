@@ -86,10 +86,8 @@ def main() -> None:
     except SasgeoError as error:
         errors.print(f"sasgeo-bench: {error}", markup=False)
         sys.exit(EXIT_USER)
-    except OSError as error:  # whatever no reader or writer has put in words of its own, as of a name that is too long
-        said = (
-            f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or 'a file'}"
-        )
+    except OSError as error:  # whatever nobody has put in words of their own, as of a name that is too long
+        said = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
         errors.print(f"sasgeo-bench: {one_line(said)}", markup=False)
         sys.exit(EXIT_USER)
     except SystemExit as leaving:

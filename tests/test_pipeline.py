@@ -4,12 +4,13 @@
 import pandas as pd
 import pytest
 
+from sasgeo_bench import tasks
 from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.catalog import find_pipeline_file, list_pipeline_files, read_pipeline_file
-from sasgeo_bench.tasks import made_tasks
+from sasgeo_bench.tasks import ensure_tasks, made_tasks
 from sasgeo_bench.tomlfile import parse_toml
 
 TEXT = """
@@ -93,6 +94,15 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     assert again.table.equals(board.table)
     assert "up to date" in plan.to_text()
     assert "to be drawn" not in plan.to_text()
+
+
+def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
+    request = made[0].requests[0]
+    folders = made_tasks(request)
+    found = iter((None, folders))
+    monkeypatch.setattr(tasks, "made_tasks", lambda _: next(found))
+    monkeypatch.setattr(tasks, "_make_tasks", None)
+    assert ensure_tasks(request, tell=lambda _: None) == folders
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,13 @@ def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
     assert len(table(folder)) == 5
 
 
+def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
+    plans = [plan_run(request_of(task, tmp_path, limit=count)) for count in (2, 2, 3)]
+    reports = [run(plan, tell=lambda _: None) for plan in plans]
+    assert [report.counts for report in reports] == [{"ok": 2}, {}, {"ok": 1}]
+    assert sum(len(rundir.read_part(part)) for part in rundir.parts_of(plans[0].parts[0].folder)) == 3
+
+
 def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, name="Raises", limit=2))
     assert {item.status for item in table(folder)} == {"crash"}

@@ -98,15 +98,16 @@ def primary(board, matcher):
     return rows[rows["stratum"] == "all"].iloc[0]
 
 
-def submission(out, path, *, keep=lambda _: True):
-    """A file of right answers to some of the queries."""
+def submission(out, path, *, keep=lambda _: True, change=lambda row, query: row):  # noqa: ARG005
+    """A file of right answers to some of the queries, changed as is asked."""
     rows = []
     for town in TOWNS:
         truths = {truth.query_id: truth for truth in taskdir.read_truths(out / "truth" / "clean" / town)}
         for query in taskdir.read_queries(out / "tasks" / "clean" / town):
             match = right_answer(query, truths[query.query_id])
             candidates = tuple(zip(match.poses, match.scores, strict=True))
-            rows.append(Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence))
+            row = Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence)
+            rows.append(change(row, query))
     part = rundir.write_part(path.parent / "parts", [row for at, row in enumerate(rows) if keep(at)])
     shutil.move(part, path)
     return len(rows)
@@ -143,6 +144,42 @@ def test_predictions_for_half_of_the_queries_are_misses_for_the_rest(out, tmp_pa
     assert row["value"] == pytest.approx(1 - row["missing"] / row["n"])
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
     assert f"half: {count // 2} queries have no row and count as misses." in text
+
+
+def moved(row, query):
+    """An answer half a kilometre off, or another candidate; none where there was none."""
+    if not row.candidates:
+        return row
+    ((pose, score),) = row.candidates
+    away = replace(pose, easting_m=pose.easting_m + 500)
+    others = (item for item in query.candidates if abs(item.easting_m - pose.easting_m) > 1)
+    return replace(row, candidates=((next(others, away), score),))
+
+
+@pytest.mark.parametrize("confidence", [0.5, None])
+@pytest.mark.parametrize("is_right", [True, False])
+def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_else(
+    out, tmp_path, split, confidence, is_right
+):
+    def change(row, query):
+        row = replace(row, confidence=confidence if row.candidates else None)
+        return row if is_right else moved(row, query)
+
+    submission(out, tmp_path / "mine.parquet", change=change)
+    rejectors = ["margin", "isotonic_margin", "logistic_all", "entropy"]
+    board = board_of(out, tmp_path / "mine.parquet", rejectors=rejectors, split=split)
+    assert primary(board, "mine")["value"] == float(is_right)
+    rows = board.table[(board.table["stratum"] == "as drawn") & (board.table["rejector"] != "")]
+    assert set(rows["rejector"]) == {*rejectors} | ({"own"} if confidence else set())
+    # What cannot be told apart is accepted together or not at all.
+    covered = rows[rows["metric"] == "coverage_at_risk_0.05"]
+    assert len(covered) >= len(rejectors)
+    for _, row in covered.iterrows():
+        assert row["value"] == pytest.approx(row["answered"] / row["n"] if is_right else 0.0)
+    assert set(rows[(rows["rejector"] == "own") & (rows["metric"] == "brier")]["value"]) == (
+        {0.25} if confidence else set()
+    )
+    assert len(read_board(out / "boards" / "mine")[1]) == len(board.table)
 
 
 def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_path, split):

@@ -286,6 +286,7 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     assert "part-9.parquet holds no predictions: move it out of the run's folder" in mistake(*ORACLE)
     (run_folder / "part-9.parquet").unlink()
     about = run_folder / rundir.RUN
+    sound = rundir.read_run(run_folder)
     for text in ("{", "[]", "null", '"run"'):
         about.write_text(text)
         assert "run.json is damaged: remove it and run again, the parts beside it are kept" in mistake(*ORACLE)
@@ -293,6 +294,10 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     told = mistake(*ORACLE)
     assert "holds answers to other queries than" in told
     assert told.endswith("move it away and run again, or make the old queries again")
+    about.write_text(json.dumps(sound | {"cpu_s": "long"}))
+    rows = pq.read_table(part)
+    pq.write_table(rows.slice(1), part)
+    assert "run.json is damaged (cpu_s of a run is 'long', expected a number" in mistake(*ORACLE)
     about.unlink()
     about.mkdir()
     part.unlink()
@@ -408,6 +413,9 @@ def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
     ):
         told = mistake(*words)
         assert "File name too long; check the path, your rights and the free space: xxx" in told
+    assert "--truth names nowhere, where there is no folder" in mistake(
+        "score", "--predictions", path, "--truth", "nowhere"
+    )
     assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
 
 

@@ -53,6 +53,9 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     if not BOARD_NAME.fullmatch(name):
         message = f"--name must hold letters, digits, hyphens and underscores, 100 at most, got {name!r}"
         raise ConfigError(message)
+    if truth is not None and not truth.is_dir():
+        message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
+        raise ConfigError(message)
     request = ScoreRequest(
         predictions=predictions,
         tasks=tasks or (),

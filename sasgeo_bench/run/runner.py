@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from sasgeo_bench.errors import MetricError, StoreError
+from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
@@ -198,6 +200,13 @@ def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
     """Say that a task begins; what earlier runs of it took."""
     progress.begin(str(part.folder), len(part.left))
     said = rundir.read_run(part.folder) or {}
+    try:
+        run_cost(said)
+    except MetricError as error:
+        message = (
+            f"{part.folder / rundir.RUN} is damaged ({error}): remove it and run again, the parts beside it are kept"
+        )
+        raise StoreError(message) from error
     before = Cost(
         prepare_s=said.get("prepare_s"),
         index_bytes=said.get("index_bytes"),

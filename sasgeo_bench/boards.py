@@ -24,7 +24,7 @@ from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import OWN, judge, own_word
 from sasgeo_bench.report.rows import to_frame
-from sasgeo_bench.report.tables import UNRANKED, leaderboard
+from sasgeo_bench.report.tables import is_unranked, leaderboard
 from sasgeo_bench.report.text import board_latex, board_markdown
 from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
@@ -193,7 +193,7 @@ def _file_entry(path: Path) -> Entry:
     if not FILE_NAME.fullmatch(path.stem):
         message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
         raise ConfigError(message)
-    if path.stem in UNRANKED:
+    if is_unranked(path.stem):
         message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: rename the file"
         raise ConfigError(message)
     return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))

@@ -73,13 +73,11 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
 
 
 def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
-    """Hold a request all the way: a second run of it would change the map that this one draws from.
-
-    The lock lies where maps are built, so that a request that is refused leaves nothing where tasks are.
-    """
+    """Hold a request all the way: a second run of it would change the map that this one draws from."""
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
+    # Where maps are built, so that a request that is refused leaves nothing where tasks are.
     return regiondir.locked(request.out / "regions" / f"{request.region.id}+{suite.card.name}.request", tell=tell)
 
 

@@ -15,7 +15,7 @@ from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
-from sasgeo_bench.report.tables import UNRANKED
+from sasgeo_bench.report.tables import is_unranked
 
 _INTEGRITY: Final = (
     "aurc",
@@ -145,7 +145,7 @@ def _rank(row: pd.Series) -> str:
     """A rank or ranks that cannot be told apart; controls have none."""
     best, worst = int(row["rank_best"]), int(row["rank_worst"])
     if not best:
-        return "control" if row["matcher"] in UNRANKED else "-"
+        return "control" if is_unranked(row["matcher"]) else "-"
     return str(best) if best == worst else f"{best}-{worst}"
 
 

@@ -9,8 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from sasgeo_bench.errors import MetricError, StoreError
-from sasgeo_bench.metrics.cost import run_cost
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
@@ -20,6 +19,7 @@ from sasgeo_bench.store.regiondir import locked
 
 TOLD_S: Final = 10.0
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
+_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earlier runs took, as run.json says it
 
 Tell = Callable[[str], None]
 
@@ -148,7 +148,7 @@ def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
     """What nobody has answered while the locks were waited for; tasks of which nothing is left are gone."""
     found = []
     for part in parts:
-        done = rundir.ids_done(part.folder, again=plan.request.again)
+        done = rundir.ids_done(part.folder, again=plan.request.again) if part.folder.is_dir() else set()
         left = tuple(name for name in part.left if name not in done)
         if left:
             found.append(replace(part, left=left))
@@ -200,13 +200,11 @@ def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
     """Say that a task begins; what earlier runs of it took."""
     progress.begin(str(part.folder), len(part.left))
     said = rundir.read_run(part.folder) or {}
-    try:
-        run_cost(said)
-    except MetricError as error:
-        message = (
-            f"{part.folder / rundir.RUN} is damaged ({error}): remove it and run again, the parts beside it are kept"
-        )
-        raise StoreError(message) from error
+    wrong = next((name for name in _COSTS if not isinstance(said.get(name), int | float | None)), None)
+    if wrong is not None:
+        path = part.folder / rundir.RUN
+        message = f"{path} is damaged ({wrong} is no number): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
     before = Cost(
         prepare_s=said.get("prepare_s"),
         index_bytes=said.get("index_bytes"),

@@ -210,6 +210,15 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert len(warnings_of(board)) == 2
 
 
+def test_two_versions_of_a_control_are_controls_both():
+    names = ("oracle_pose 1 (aaaaaa)", "oracle_pose 1 (bbbbbb)", "mine")
+    board = leaderboard({name: scores([1.0, 99.0] * 10) for name in names}, draws=200)
+    ranks = {name: tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in names}
+    assert ranks == {names[0]: (0, 0), names[1]: (0, 0), "mine": (1, 1)}
+    ((_, short),) = summary(board)
+    assert sorted(short["occlusion"]) == ["0.500 (1)", "0.500 (control)", "0.500 (control)"]
+
+
 def test_no_name_breaks_a_table():
     name = r"mine 1|2 <b> \$ {x} ~ ^"
     board = leaderboard({name: scores([1.0, 99.0])}, draws=200)

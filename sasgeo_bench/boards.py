@@ -12,7 +12,9 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scored_task
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, counted
+from sasgeo_bench.matcher import check_name
+from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.metrics.intervals import DRAWS
 from sasgeo_bench.plugins import load_rejector
 from sasgeo_bench.query import CONTROLS, TASK_VERSION
@@ -23,9 +25,9 @@ from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import OWN, judge, own_word
 from sasgeo_bench.report.rows import to_frame
-from sasgeo_bench.report.tables import leaderboard
+from sasgeo_bench.report.tables import is_unranked, leaderboard
 from sasgeo_bench.report.text import board_latex, board_markdown
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
@@ -39,6 +41,7 @@ FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+_RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,26 +133,25 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
     Raises
     ------
     StoreError
-        If a path holds no predictions.
+        If a path holds no predictions, or a `run.json` does not say whose answers lie beside it.
     ConfigError
-        If two files have one name.
+        If two files have one name, or one has that of a control.
     """
     by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
     files: list[Entry] = []
+    seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
     for path in paths:
         if path.is_file():
-            if not FILE_NAME.fullmatch(path.stem):
-                message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
-                raise ConfigError(message)
-            files.append(Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,)))
+            if _is_new(path, seen):
+                files.append(_file_entry(path))
             continue
         found = sorted(path.rglob(rundir.RUN))
         if not found:
             message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
             raise StoreError(message)
         for run in found:
-            about = rundir.read_run(run.parent)
-            if about is not None:
+            if _is_new(run, seen):
+                about = _read_run(run)
                 card = about["matcher"]
                 by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
     names = [name for name, _, _ in by_run]
@@ -179,6 +181,42 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
         message = f"two contestants are named {twice!r}: rename the file of one"
         raise ConfigError(message)
     return tuple(sorted(entries, key=lambda entry: entry.name))
+
+
+def _is_new(path: Path, seen: set[Path]) -> bool:
+    place = path.parent.resolve() / path.name
+    is_new = place not in seen
+    seen.add(place)
+    return is_new
+
+
+def _file_entry(path: Path) -> Entry:
+    if not FILE_NAME.fullmatch(path.stem):
+        message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
+        raise ConfigError(message)
+    if is_unranked(path.stem):
+        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: rename the file"
+        raise ConfigError(message)
+    return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """What a `run.json` says, after a look at whatever a board takes from it: it may be anyone's."""
+    about = rundir.read_run(path.parent) or {}
+    card = about.get("matcher")
+    said = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
+    if isinstance(card, dict):
+        said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
+    fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
+    try:
+        check_name(str(said["matcher.name"]))
+        run_cost(about)
+    except (MatchError, MetricError) as error:
+        fault = fault or str(error)
+    if fault is not None:
+        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
+    return about
 
 
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
@@ -303,7 +341,12 @@ def _judges(request: ScoreRequest) -> dict[str, Judge]:
     if request.split is None:
         message = "rejectors are fitted on the calibration places of a split: name one with --split"
         raise ConfigError(message)
-    names = {load_rejector(spec).card.name: spec for spec in request.rejectors}
+    names: dict[str, str] = {}
+    for spec in request.rejectors:
+        name = load_rejector(spec).card.name
+        if names.setdefault(name, spec) != spec:
+            message = f"{names[name]} and {spec} are both named {name!r}: rename one, or leave it out"
+            raise ConfigError(message)
     if OWN in names:
         message = f"{names[OWN]}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
         raise ConfigError(message)

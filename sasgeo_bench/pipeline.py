@@ -22,7 +22,7 @@ from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store import rundir
-from sasgeo_bench.tasks import is_of_region, made_tasks, make_tasks, why_to_draw
+from sasgeo_bench.tasks import ensure_tasks, is_of_region, made_tasks, why_to_draw
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
@@ -320,14 +320,10 @@ def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
     tasks: list[Path] = []
     lacking: list[str] = []
     for request in requests:
-        made = made_tasks(request)
-        if made is None:
-            try:
-                made = tuple(item.folder for item in make_tasks(request, tell=tell))
-            except ConfigError as error:
-                lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
-                continue
-        tasks += made
+        try:
+            tasks += ensure_tasks(request, tell=tell)
+        except ConfigError as error:
+            lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
     for line in lacking[:MOST_LINES]:
         tell(f"left out: {line}")
     if len(lacking) > MOST_LINES:

@@ -16,7 +16,7 @@ from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.metrics.decisions import Answers, accept
 from sasgeo_bench.metrics.integrity import choose_threshold
 from sasgeo_bench.rejector import Rejector, check_p_false
-from sasgeo_bench.results import Prediction, one_line
+from sasgeo_bench.results import Prediction, told
 from sasgeo_bench.score import NOT_APPLICABLE
 from sasgeo_bench.split import Split
 
@@ -188,9 +188,8 @@ def _fit_and_say(make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictio
         rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
         if some:
             found[is_answered] = check_p_false(rejector.p_false(some), len(some))
-    except Exception as error:
-        said = one_line(f"{type(error).__name__}: {error}")
-        message = f"rejector {rejector.card.name!r} failed ({said}): mend it, or leave it out"
+    except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+        message = f"rejector {rejector.card.name!r} failed ({told(error)}): mend it, or leave it out"
         raise MatchError(message) from error
     return found
 

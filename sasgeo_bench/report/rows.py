@@ -152,6 +152,17 @@ def side_by_side(make: Callable[[Item], Iterable[Row]], items: Iterable[Item]) -
         return [row for rows in pool.map(lambda item: list(make(item)), items) for row in rows]
 
 
+def name_alone(matcher: str) -> str:
+    """Name of a contestant without the version and hash that it bears beside another of its name.
+
+    Examples
+    --------
+    >>> name_alone("random 1 (c85212)"), name_alone("random")
+    ('random', 'random')
+    """
+    return matcher.partition(" ")[0]
+
+
 def bare(value: float) -> Interval:
     """A figure without an interval."""
     return Interval(value=value, lo=math.nan, hi=math.nan)

@@ -26,7 +26,7 @@ from sasgeo_bench.metrics.intervals import (
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
-from sasgeo_bench.report.rows import Row, Told, bare, side_by_side, to_frame
+from sasgeo_bench.report.rows import Row, Told, bare, name_alone, side_by_side, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
 from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
@@ -35,6 +35,17 @@ UNRANKED: Final = frozenset(
     {"oracle_pose", "random", "prior_centre", "map_density_prior"}
 )  # controls: beside the ranks
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
+
+
+def is_unranked(matcher: str) -> bool:
+    """Whether a contestant is a control, of whatever version.
+
+    Examples
+    --------
+    >>> is_unranked("oracle_pose 1 (c85212)"), is_unranked("raster_uniform")
+    (True, False)
+    """
+    return name_alone(matcher) in UNRANKED
 
 
 def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd.DataFrame:
@@ -267,7 +278,7 @@ def _ranked(cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, 
 
 def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
     """Rank intervals of all but the controls; none where there are not two blocks to draw from."""
-    chosen = [at for at, name in enumerate(names) if name not in UNRANKED]
+    chosen = [at for at, name in enumerate(names) if not is_unranked(name)]
     if not chosen:
         return {}
     if not len(means):
@@ -278,8 +289,8 @@ def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure
 
 def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Ints) -> float:
     """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
-    others = [at for at, other in enumerate(names) if other != name and other not in UNRANKED]
-    if not others or name in UNRANKED or (blocks == blocks[0]).all():
+    others = [at for at, other in enumerate(names) if other != name and not is_unranked(other)]
+    if not others or is_unranked(name) or (blocks == blocks[0]).all():
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable

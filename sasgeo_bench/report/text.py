@@ -15,7 +15,7 @@ from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
-from sasgeo_bench.report.tables import UNRANKED
+from sasgeo_bench.report.tables import is_unranked
 
 _INTEGRITY: Final = (
     "aurc",
@@ -145,7 +145,7 @@ def _rank(row: pd.Series) -> str:
     """A rank or ranks that cannot be told apart; controls have none."""
     best, worst = int(row["rank_best"]), int(row["rank_worst"])
     if not best:
-        return "control" if row["matcher"] in UNRANKED else "-"
+        return "control" if is_unranked(row["matcher"]) else "-"
     return str(best) if best == worst else f"{best}-{worst}"
 
 
@@ -277,14 +277,28 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
 
 
 def markdown_table(table: pd.DataFrame) -> Iterator[str]:
-    """Lines of a table."""
-    yield "| " + " | ".join(map(str, table.columns)) + " |"
+    r"""Lines of a table; what a cell holds can neither end it nor begin a tag.
+
+    Examples
+    --------
+    >>> list(markdown_table(pd.DataFrame({"matcher": ["mine 1|2"]})))[-1]
+    '| mine 1\\|2 |'
+    """
+    yield "| " + " | ".join(map(_cell_text, table.columns)) + " |"
     yield "|" + "---|" * len(table.columns)
     for row in table.itertuples(index=False):
-        yield "| " + " | ".join(map(str, row)) + " |"
+        yield "| " + " | ".join(map(_cell_text, row)) + " |"
 
 
-_ESCAPED: Final = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#"}
+def _cell_text(value: object) -> str:
+    return str(value).replace("|", r"\|").replace("<", "&lt;")
+
+
+_ESCAPED: Final = {letter: f"\\{letter}" for letter in "_%&#${}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
 
 
 def board_latex(board: pd.DataFrame, about: Mapping[str, Any]) -> str:

@@ -210,6 +210,24 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert len(warnings_of(board)) == 2
 
 
+def test_two_versions_of_a_control_are_controls_both():
+    names = ("oracle_pose 1 (aaaaaa)", "oracle_pose 1 (bbbbbb)", "mine")
+    board = leaderboard({name: scores([1.0, 99.0] * 10) for name in names}, draws=200)
+    ranks = {name: tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in names}
+    assert ranks == {names[0]: (0, 0), names[1]: (0, 0), "mine": (1, 1)}
+    ((_, short),) = summary(board)
+    assert sorted(short["occlusion"]) == ["0.500 (1)", "0.500 (control)", "0.500 (control)"]
+
+
+def test_no_name_breaks_a_table():
+    name = r"mine 1|2 <b> \$ {x} ~ ^"
+    board = leaderboard({name: scores([1.0, 99.0])}, draws=200)
+    (row,) = (line for line in board_markdown(board, ABOUT).splitlines() if "mine 1" in line)
+    assert r"mine 1\|2 &lt;b>" in row
+    assert row.replace(r"\|", "").count("|") == 9
+    assert r"mine 1|2 <b> \textbackslash{}\$ \{x\} \textasciitilde{} \textasciicircum{}" in board_latex(board, ABOUT)
+
+
 def test_the_board_says_what_each_of_its_columns_is():
     tables = {"mine": scores([1.0, 99.0] * 20, confidence=[0.9, 0.1] * 20, is_present=[True] * 30 + [False] * 10)}
     tables["mine"]["is_right"] &= tables["mine"]["is_present"]

@@ -13,7 +13,7 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.metrics.base import Floats
-from sasgeo_bench.metrics.compare import holm, mcnemar_clustered, mcnemar_exact
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact
 from sasgeo_bench.metrics.decisions import Answers
 from sasgeo_bench.metrics.integrity import aurc
 from sasgeo_bench.metrics.intervals import DRAWS, ClusterDraws, mean_difference, statistic_interval
@@ -23,7 +23,6 @@ from sasgeo_bench.report.measures import primary_of
 from sasgeo_bench.report.rejection import answers_of
 
 ALPHA: Final = 0.05
-LEAST_BLOCKS: Final = 6  # with fewer no test over blocks can reach 5 %, however large the difference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,14 +66,14 @@ class Finding:
     first_value, second_value, difference, lo, hi : float
         Figures of both, first less second, and the paired 95 % interval; NaN where nothing could be drawn.
     n, blocks : int
-        Queries and blocks they are from.
+        Queries and blocks they are from; fewer than `LEAST_BLOCKS` decide nothing.
     first_only, second_only : int
         Discordant queries; 0 for "aurc".
     p_exact, p_clustered, p_holm : float
         McNemar's exact test (queries taken for independent), Obuchowski's for blocks, and that one adjusted by Holm
         over all registered contrasts; of "aurc" the share of draws on the other side of zero, twice.
     detectable : float
-        Least difference these queries would show; NaN for "aurc".
+        Least difference these queries would show; NaN for "aurc", and of too few blocks.
     verdict : str
         In words.
     """
@@ -219,7 +218,7 @@ def _means(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws:
         second_only=exact.second_only,
         p_exact=exact.p_value,
         p_clustered=clustered.p_value,
-        detectable=sensitivity(ours, theirs, blocks).detectable,
+        detectable=sensitivity(ours, theirs, blocks).detectable if len(set(blocks)) >= LEAST_BLOCKS else math.nan,
     )
 
 

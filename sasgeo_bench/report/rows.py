@@ -46,10 +46,11 @@ class Row:
     is_applicable : bool
         False where the matcher's card says it cannot; then there is no figure.
     rank_best, rank_worst : int
-        Ranks it can have among the matchers that are ranked; 0 where it is not.
+        Ranks it can have among the matchers that are ranked; 0 where it is not, and with fewer than `LEAST_BLOCKS`
+        blocks.
     detectable : float
         Least difference from the best of the others that these queries would show (alpha 5 %, power 80 %); NaN where
-        nothing can be said.
+        there is no rank.
     """
 
     matcher: str

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.metrics.base import Bools, Floats, Ints
-from sasgeo_bench.metrics.compare import RankInterval, distinguishable, rank_intervals
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
 from sasgeo_bench.metrics.intervals import (
     DRAWS,
     ClusterDraws,
@@ -248,11 +248,12 @@ def _ranked(cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, 
     """Rows of one measure; of the primary one with ranks."""
     names, blocks, sites = cell.group.names, cell.group.blocks[cell.chosen], cell.group.sites[cell.chosen]
     found = [mean_with_interval(table[:, at], sites, means[:, at]) for at in range(len(names))]
-    ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if measure.is_primary else {}
+    is_decidable = measure.is_primary and told[0].blocks >= LEAST_BLOCKS
+    ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
     for at, name in enumerate(names):
         interval, how = found[at]
         rank = ranks.get(name, RankInterval(best=0, worst=0))
-        detectable = _detectable(name, names, table, blocks) if measure.is_primary else math.nan
+        detectable = _detectable(name, names, table, blocks) if is_decidable else math.nan
         yield told[at].row(
             measure.name,
             measure.unit,
@@ -266,11 +267,9 @@ def _ranked(cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, 
 
 
 def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
-    """Rank intervals of all but the controls; none where there are not two blocks to draw from."""
+    """Rank intervals of all but the controls."""
     chosen = [at for at, name in enumerate(names) if name not in UNRANKED]
     if not chosen:
-        return {}
-    if not len(means):
         return {}
     better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
     return {names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
@@ -279,7 +278,7 @@ def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure
 def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Ints) -> float:
     """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
     others = [at for at, other in enumerate(names) if other != name and other not in UNRANKED]
-    if not others or name in UNRANKED or (blocks == blocks[0]).all():
+    if not others or name in UNRANKED:
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable

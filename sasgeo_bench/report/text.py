@@ -8,6 +8,7 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
@@ -178,7 +179,10 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "is the right one, ties counted in proportion. Without an answer a query is a miss",
     "control": "the same figure at the same places without the stress; under `rank`, a matcher that is no rival",
     "false fixes": "share of absent places that were answered",
-    "detectable": "least difference from the best other matcher that these queries would show; inf where none would",
+    "rank": "ranks a matcher can have, all pairs at once; `-` where there are fewer than "
+    f"{LEAST_BLOCKS} blocks: they rank nobody, as they decide no contrast",
+    "detectable": "least difference from the best other matcher that these queries would show; inf where none would, "
+    "`-` where nobody is ranked",
     "n, missing, blocks": "queries counted; those of them without a row; pieces of ground they come from, which are "
     "what intervals count",
     "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",

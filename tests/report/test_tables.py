@@ -8,7 +8,9 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.errors import MetricError
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS
 from sasgeo_bench.metrics.intervals import wilson
+from sasgeo_bench.report.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import own_word
@@ -132,6 +134,18 @@ def test_ranks_tell_apart_what_differs_and_nothing_else():
     assert 0 < pick(board, "good", "success_25m")["detectable"] < 0.2
 
 
+@pytest.mark.parametrize(("blocks", "ranks"), [(5, {(0, 0)}), (6, {(1, 1), (2, 2)})])
+def test_as_few_blocks_as_decide_no_contrast_rank_nobody(blocks, ranks):
+    both = {"good": scores([1.0] * 60, blocks=blocks), "bad": scores([99.0] * 60, blocks=blocks)}
+    board = leaderboard(both, draws=200)
+    rows = [pick(board, name, "success_25m") for name in both]
+    assert {tuple(row[["rank_best", "rank_worst"]]) for row in rows} == ranks
+    assert [math.isnan(row["detectable"]) for row in rows] == [blocks < LEAST_BLOCKS] * 2
+    contrast = Contrast(name="both", first="good", second="bad", suites=("occlusion",))
+    (found,) = hold_contrasts([contrast], both, {}, draws=200)
+    assert found.verdict.startswith("not decided") == (blocks < LEAST_BLOCKS)
+
+
 def test_absent_places_are_no_part_of_success_and_are_counted_apart():
     table = scores([1.0, 1.0, math.nan, math.nan], is_present=[True, True, False, False], is_answered=[1, 1, 1, 0])
     board = leaderboard({"mine": table}, draws=200)
@@ -140,7 +154,7 @@ def test_absent_places_are_no_part_of_success_and_are_counted_apart():
 
 
 def test_a_suite_a_matcher_cannot_has_a_row_without_a_figure_and_no_rank():
-    tables = {"a": scores([1.0, 99.0]), "b": scores([math.inf] * 2, status="not applicable")}
+    tables = {"a": scores([1.0, 99.0] * 3, blocks=6), "b": scores([math.inf] * 6, blocks=6, status="not applicable")}
     board = leaderboard(tables, draws=200)
     row = pick(board, "b", "success_25m")
     assert not row["is_applicable"]
@@ -206,7 +220,7 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert "success_25m" not in latex.replace(r"\_", "~")
     ((title, short),) = summary(board)
     assert title == "success_25m, localization, prior group r500-weak-s3 (rank)"
-    assert short["occlusion"].tolist() == ["0.250 (1)", "0.000 (control)"]
+    assert short["occlusion"].tolist() == ["0.250 (-)", "0.000 (control)"]
     assert len(warnings_of(board)) == 2
 
 
@@ -221,7 +235,7 @@ def test_the_board_says_what_each_of_its_columns_is():
     told = {name for line in text.splitlines() if line for name in line.split("**")[1].split(", ")}
     shown = {str(column) for _, table in tables_of(board) for column in table.columns}
     names = {column.split(",")[0].split(" (")[0].removesuffix("_p50").removesuffix("_p95") for column in shown}
-    assert names - told == {"matcher", "rank"}
+    assert names - told == {"matcher"}
     assert "rejector" in shown
     assert "false fixes" in shown
 

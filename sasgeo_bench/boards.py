@@ -12,7 +12,7 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.metrics.intervals import DRAWS
+from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.plugins import load_rejector
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Head, Truth
 from sasgeo_bench.region import DATA_VERSION

@@ -83,7 +83,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "metrics": (
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
-        *("sequence", "cost", "intervals", "compare", "power"),
+        *("sequence", "cost", "draws", "intervals", "compare", "power"),
     ),
     "validate": None,
     "score": None,

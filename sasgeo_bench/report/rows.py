@@ -41,8 +41,8 @@ class Row:
     value, lo, hi : float
         The figure and its 95 % interval; NaN where there is none.
     interval : str
-        How it was found: "blocks" (bootstrap over blocks, then queries), "wilson" (fewer than two blocks, or nothing
-        that varies: then over blocks), or "".
+        How it was found: "blocks" (bootstrap over blocks, then sites), "wilson" (Wilson's over sites lies farther out
+        at one end or both: of few sites, or where nothing varies, draws say too little), or "".
     is_applicable : bool
         False where the matcher's card says it cannot; then there is no figure.
     rank_best, rank_worst : int

@@ -41,7 +41,7 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
             "view_cells": 192,
             "cell_size_m": 1.0,
             "pool": 0,
-            "pair_id": "p",
+            "pair_id": [f"p{at:05d}" for at in range(count)],
             "role": "stress",
             "kind": "U1",
             "strength": 0.3,
@@ -111,16 +111,59 @@ def test_of_one_block_the_interval_is_wilsons_over_sites_and_nothing_is_ranked()
     sites = ["one", "one", "other", "other"]
     both = {"a": scores([1.0] * 3 + [99.0], blocks=1, pair_id=sites), "b": scores([99.0] * 4, blocks=1, pair_id=sites)}
     board = leaderboard(both, draws=200)
-    row, expected = pick(board, "a", "success_25m"), wilson(0.75 * 2, 2)
+    row, expected = pick(board, "a", "success_25m"), wilson(0.75 * 2, 2.0)
     assert (row["lo"], row["hi"], row["interval"]) == (expected.lo, expected.hi, "wilson")
     assert {tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in both} == {(0, 0)}
     assert math.isnan(row["detectable"])
 
 
 def test_where_nothing_varies_the_interval_is_as_wide_as_few_sites_make_it():
-    sites = [f"s{at % 7}" for at in range(100)]
-    row = pick(leaderboard({"mine": scores([1.0] * 100, blocks=5, pair_id=sites)}, draws=200), "mine", "success_25m")
+    sites = [f"s{at % 7}" for at in range(98)]
+    row = pick(leaderboard({"mine": scores([1.0] * 98, blocks=5, pair_id=sites)}, draws=200), "mine", "success_25m")
     assert (row["value"], row["lo"]) == (1.0, wilson(7, 7).lo)
+
+
+def test_ten_queries_of_a_site_say_no_more_of_other_sites_than_one():
+    errors = np.where(np.random.default_rng(4).random(36) < 0.6, 1.0, 99.0)
+    sites, copies = [f"s{at}" for at in range(36)], 10
+    one = scores(errors, blocks=12, pair_id=sites)
+    ten = scores(
+        np.repeat(errors, copies), pair_id=np.repeat(sites, copies), block=np.repeat(one["block"].to_numpy(), copies)
+    )
+    boards = [leaderboard({"mine": table}, draws=500) for table in (one, ten)]
+    for metric in ("success_25m", "success_auc_50m", "position_median", "position_p90"):
+        rows = [pick(board, "mine", metric)[["value", "lo", "hi"]].tolist() for board in boards]
+        assert rows[0] == pytest.approx(rows[1])
+
+
+def test_figures_of_few_sites_keep_their_order_whichever_way_their_ends_were_found():
+    sites, kinds = [f"s{at // 10}" for at in range(40)], ["U1"] * 40
+    part = np.where(np.arange(40) % 10 < 7, 1.0, 99.0)  # seven of ten at each of four sites
+    tables = {name: scores(errors, blocks=2, block=[f"b{at // 20}" for at in range(40)], pair_id=sites, kind=kinds)
+              for name, errors in (("all", np.ones(40)), ("part", part))}  # fmt: skip
+    board = leaderboard(tables, draws=200)
+    all_of_it, part_of_it = (pick(board, name, "success_25m") for name in ("all", "part"))
+    assert (part_of_it["lo"], part_of_it["hi"]) == pytest.approx((wilson(2.8, 4).lo, wilson(2.8, 4).hi))
+    assert part_of_it["lo"] < all_of_it["lo"]
+    assert {all_of_it["interval"], part_of_it["interval"]} == {"wilson"}
+
+
+def test_a_higher_quantile_has_no_lower_end():
+    # Of four sites nine in ten errors are small: p90 is the largest of these, p99 the largest of all.
+    errors = [0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 20.0, 60.0, 500.0] * 4
+    board = leaderboard({"mine": scores(errors, blocks=2, pair_id=[f"s{at // 10}" for at in range(40)])}, draws=200)
+    rows = [pick(board, "mine", f"position_{name}") for name in ("median", "p90", "p99")]
+    assert [row["value"] for row in rows] == [1.0, 60.0, 500.0]
+    assert sorted(row["lo"] for row in rows) == [row["lo"] for row in rows]
+    assert sorted(row["hi"] for row in rows) == [row["hi"] for row in rows]
+
+
+def test_an_infinite_quantile_is_as_unsure_as_any():
+    # 12 of 100 without an answer: p90 is infinite, but 0.9 is within what 0.88 may be; Wilson's of 90 in 100 is from 0.826.
+    board = leaderboard({"mine": scores([*range(88), *[math.inf] * 12], blocks=1)}, draws=200)
+    row = pick(board, "mine", "position_p90")
+    assert wilson(90, 100).lo == pytest.approx(0.8256, abs=1e-4)
+    assert (row["value"], row["lo"], row["hi"]) == (math.inf, 82.0, math.inf)
 
 
 def test_ranks_tell_apart_what_differs_and_nothing_else():

@@ -195,7 +195,8 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "mass",
     "cost_20, cost_20_place": "mean cost of a query if a fix is accepted where its chance to be false is below "
     "1 / (1 + 20) and a false fix costs 20: withheld right fixes cost 1 each, or every present place without an "
-    "accepted fix does. By the first compare rejectors on one matcher, by the second whole methods",
+    "accepted fix does. By the first compare rejectors on one matcher, by the second whole methods. "
+    "Where there is no answer the first is 0, for nothing right was withheld",
     "latency, prepare, peak_memory, cpu_per_fix": "of `match` alone; of a map once; of all its processes; processor "
     "seconds of all queries over answered ones",
     "map_per_km2, observation_per_fix": "files of the maps and what the matcher added to them over the mapped area; "

@@ -136,3 +136,15 @@ def test_withholding_all_is_no_cost_by_right_fixes_and_the_whole_one_by_places()
     for ratio in COST_RATIOS:
         assert found[f"cost_{ratio:g}"]["value"] == 0.0
         assert found[f"cost_{ratio:g}_place"]["value"] == 1.0
+
+
+def test_without_an_answer_a_query_is_false_at_full_coverage_and_no_part_of_calibration():
+    # Half of the answers are withheld or missing, the others right and sure: risk is 0 up to half of the coverage.
+    is_there = np.arange(120) % 2 == 0
+    status = np.where(is_there, "ok", np.where(np.arange(120) % 4 == 1, "ok", "missing"))
+    table = scores(np.where(is_there, 1.0, math.inf), confidence=np.where(is_there, 0.96, math.nan), status=status)
+    found = {name: row["value"] for name, row in pooled(table).items()}
+    false = np.arange(1, 61)
+    assert found["aurc"] == pytest.approx((false / (60 + false)).sum() / 120)
+    assert (found["brier"], found["ece"]) == pytest.approx((0.04**2, 0.04))
+    assert (found["cost_20"], found["cost_20_place"]) == (0.0, 0.5)

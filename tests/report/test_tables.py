@@ -159,7 +159,7 @@ def test_a_higher_quantile_has_no_lower_end():
 
 
 def test_an_infinite_quantile_is_as_unsure_as_any():
-    # 12 of 100 without an answer: p90 is infinite, but 0.9 is within what 0.88 may be; Wilson's of 90 in 100 is from 0.826.
+    # 12 of 100 without an answer: p90 is infinite, but Wilson's of 90 in 100 begins at 0.826, the 83rd error.
     board = leaderboard({"mine": scores([*range(88), *[math.inf] * 12], blocks=1)}, draws=200)
     row = pick(board, "mine", "position_p90")
     assert wilson(90, 100).lo == pytest.approx(0.8256, abs=1e-4)

@@ -24,6 +24,7 @@ _CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take 
 SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
 
 _AREAS: Final = {"aurc": 1.0, "augrc": 0.5}  # figures that have intervals, and how large they can be
+_OF_CHANCES: Final = ("brier", "ece", "cost_")  # how figures begin that take a confidence for a probability
 _NO_DRAWS: Final = np.empty(0)
 
 Figure = Callable[[Answers, Floats], float]
@@ -49,7 +50,7 @@ _FIGURES: Final[tuple[tuple[str, Figure], ...]] = (
 )
 
 
-def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterator[Row]:
+def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
     """Every integrity figure of a matcher with a rejector.
 
     Parameters
@@ -58,6 +59,8 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
         Their names.
     judged : pandas.DataFrame
         From `rejection.judge` or `rejection.own_word`.
+    is_calibrated : bool
+        Whether it gives probabilities; without, there are no figures that judge them.
 
     Yields
     ------
@@ -81,10 +84,11 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
         for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
-    yield from side_by_side(lambda item: _rows(*item), parts)
+    figures = [item for item in _FIGURES if is_calibrated or not item[0].startswith(_OF_CHANCES)]
+    yield from side_by_side(lambda item: _rows(*item, figures), parts)
 
 
-def _rows(told: Told, part: pd.DataFrame) -> Iterator[Row]:
+def _rows(told: Told, part: pd.DataFrame, figures: Sequence[tuple[str, Figure]]) -> Iterator[Row]:
     some = answers_of(part)
     # Of the queries alone, so that two rejectors are drawn alike.
     text = f"{told.suite}/{told.track}/{told.prior_group}"
@@ -98,7 +102,7 @@ def _rows(told: Told, part: pd.DataFrame) -> Iterator[Row]:
     drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
     for stratum, mass in mixtures.items():
         mine, trials = replace(told, stratum=stratum), effective_count(sites, mass)
-        for name, figure in _FIGURES:
+        for name, figure in figures:
             value, most = figure(some, mass), _AREAS.get(name)
             if is_pooled and most is not None:
                 found, how = _area_interval(value, areas.get((stratum, name), _NO_DRAWS), trials, most)

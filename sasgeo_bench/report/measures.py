@@ -117,9 +117,17 @@ FALSE_ABSENT: Final = Measure(
     values=lambda scores: scores["is_answered"].to_numpy(float),
     counts=is_absent,
 )
+WITHIN: Final = Measure(  # beside the primary figure: what a heading that is off takes away
+    name="within_25m",
+    unit="1",
+    better="higher",
+    values=lambda scores: successes(errors_of(scores), SUCCESS_M[0], 180.0).astype(float),
+    counts=is_present,
+)
 MEASURES: Final[dict[str, tuple[Measure, ...]]] = {
     "localization": (
         *map(_success, SUCCESS_M),
+        WITHIN,
         Measure(
             name="success_auc_50m",
             unit="1",

@@ -57,8 +57,9 @@ def _interval_note(summary: pd.DataFrame) -> str:
             "each, and is never narrower. One seed says nothing of others."
         )
     return (
-        f"Intervals are 95 %: {first['clusters']} seeds are resampled, then trials within each, and no "
-        "interval is narrower than Wilson's. `Wilson` takes trials for independent; they are not, for those of one seed share its tiles."
+        f"Intervals are 95 %: {first['clusters']} seeds are resampled, then trials within each, and no interval is "
+        "narrower than Wilson's. `Wilson` takes trials for independent; they are not, for those of one seed share its "
+        "tiles."
     )
 
 

@@ -97,6 +97,26 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
     return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS), "is_own_calibration"])
 
 
+def why_not(scores: pd.DataFrame) -> str:
+    """Why `judge` has no row for a matcher, in words.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Of one matcher.
+
+    Examples
+    --------
+    >>> why_not(pd.DataFrame({"is_answered": [False, False], "place": ["vaduz", "monaco"]}))
+    'it has no answers to judge'
+    """
+    if not scores["is_answered"].any():
+        return "it has no answers to judge"
+    if len(set(scores["place"])) > 1:
+        return "no place that may calibrate another one has an answer"
+    return "no other place of the board calibrates"
+
+
 def own_word(scores: pd.DataFrame, split: Split | None = None) -> pd.DataFrame:
     """What a matcher itself says of its answers: its confidence, as a rejector that learns nothing.
 

@@ -3,7 +3,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any, Final, Literal, Self, TypeVar
@@ -14,6 +14,9 @@ from sasgeo_bench.metrics.intervals import Interval
 from sasgeo_bench.score import MISSING
 
 ALL_SUITES: Final = "all suites"
+UNRANKED: Final = frozenset(
+    {"oracle_pose", "random", "prior_centre", "map_density_prior"}
+)  # controls: beside the ranks
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Better = Literal["higher", "lower"]
@@ -46,7 +49,7 @@ class Row:
     is_applicable : bool
         False where the matcher's card says it cannot; then there is no figure.
     rank_best, rank_worst : int
-        Ranks it can have among the matchers that are ranked; 0 where it is not, and with fewer than `LEAST_BLOCKS`
+        Ranks it can have among the matchers that are ranked; None where it is not, and with fewer than `LEAST_BLOCKS`
         blocks.
     detectable : float
         Least difference from the best of the others that these queries would show (alpha 5 %, power 80 %); NaN where
@@ -72,8 +75,8 @@ class Row:
     hi: float = math.nan
     interval: str = ""
     is_applicable: bool = True
-    rank_best: int = 0
-    rank_worst: int = 0
+    rank_best: int | None = None
+    rank_worst: int | None = None
     detectable: float = math.nan
 
 
@@ -166,4 +169,32 @@ def to_frame(rows: list[Row]) -> pd.DataFrame:
     >>> to_frame([]).columns[0]
     'matcher'
     """
-    return pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
+    frame = pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
+    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # whole numbers, and none where none is
+
+
+def with_contestants(board: pd.DataFrame, contestants: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
+    """Rows that also say which code they are of, and whether of a control.
+
+    Parameters
+    ----------
+    board : pandas.DataFrame
+        Columns as the fields of `Row`.
+    contestants : mapping of str to (str, str)
+        By matcher: version, and hash of its code and settings; empty for a file of predictions.
+
+    Returns
+    -------
+    pandas.DataFrame
+        With the columns version, hash (missing for a file) and is_control behind the matcher.
+
+    Examples
+    --------
+    >>> with_contestants(to_frame([]), {}).columns[:4].tolist()
+    ['matcher', 'version', 'hash', 'is_control']
+    """
+    board = board.copy()
+    for at, name in enumerate(("version", "hash")):
+        board.insert(1 + at, name, [contestants[matcher][at] or None for matcher in board["matcher"]])
+    board.insert(3, "is_control", board["matcher"].isin(UNRANKED))
+    return board

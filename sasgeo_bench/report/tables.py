@@ -20,14 +20,11 @@ from sasgeo_bench.metrics.intervals import Interval, bootstrap_means, effective_
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
-from sasgeo_bench.report.rows import Row, Told, bare, side_by_side, to_frame
+from sasgeo_bench.report.rows import UNRANKED, Row, Told, bare, side_by_side, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
 from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
 GROUP: Final = ("suite", "track", "prior_group")
-UNRANKED: Final = frozenset(
-    {"oracle_pose", "random", "prior_centre", "map_density_prior"}
-)  # controls: beside the ranks
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -254,7 +251,7 @@ def _ranked(
     ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
     for at, name in enumerate(names):
         interval, how = found[at]
-        rank = ranks.get(name, RankInterval(best=0, worst=0))
+        rank = ranks.get(name)
         detectable = _detectable(name, names, table, blocks) if is_decidable else math.nan
         yield told[at].row(
             measure.name,
@@ -262,8 +259,8 @@ def _ranked(
             measure.better,
             interval,
             how,
-            rank_best=rank.best,
-            rank_worst=rank.worst,
+            rank_best=None if rank is None else rank.best,
+            rank_worst=None if rank is None else rank.worst,
             detectable=detectable,
         )
 

@@ -8,15 +8,14 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.metrics.compare import LEAST_BLOCKS
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS, RankInterval
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.integrity import AS_DRAWN
-from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
-from sasgeo_bench.report.rows import ALL_SUITES
+from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.report.rows import ALL_SUITES, UNRANKED
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
-from sasgeo_bench.report.tables import UNRANKED
 
 _INTEGRITY: Final = (
     "aurc",
@@ -77,13 +76,15 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
         if main is None:
             continue
         control, absent = _pick(mine, primary, CONTROL), _pick(mine, FALSE_ABSENT.name, ALL)
+        near = _pick(mine, WITHIN.name, str(main["stratum"]))
         rows.append(
             {
                 "matcher": matcher,
                 primary: _figure(main) if main["is_applicable"] else "not applicable",
                 "rank": _rank(main),
-                "control": "" if control is None else _figure(control),
-                "false fixes": "" if absent is None else _figure(absent),
+                WITHIN.name: "-" if near is None else _figure(near),
+                "control": "-" if control is None else _figure(control),
+                "false fixes": "-" if absent is None else _figure(absent),
                 "detectable": _number(main["detectable"]),
                 "n": str(main["n"]),
                 "missing": str(main["missing"]),
@@ -92,7 +93,7 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
             }
         )
     table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
-    empty = [name for name in ("false fixes",) if (table[name] == "").all()]
+    empty = [name for name in (WITHIN.name, "false fixes") if (table[name] == "-").all()]
     return table.drop(columns=["_key", *empty])
 
 
@@ -106,7 +107,7 @@ def _judged_table(part: pd.DataFrame) -> pd.DataFrame:
     for (matcher, rejector), mine in part.groupby(["matcher", "rejector"], sort=True):
         by_name = {str(row["metric"]): row for _, row in mine.iterrows()}
         row = {"matcher": matcher, "rejector": rejector}
-        row |= {name: _figure(by_name[name]) if name in by_name else "" for name in _INTEGRITY}
+        row |= {name: _figure(by_name[name]) if name in by_name else "-" for name in _INTEGRITY}
         rows.append(row | {"n": str(mine["n"].iloc[0]), "_key": by_name["aurc"]["value"]})
     table = pd.DataFrame(rows).sort_values(["_key", "matcher", "rejector"], kind="stable")
     return table.drop(columns="_key")
@@ -121,7 +122,7 @@ def _cost_table(part: pd.DataFrame) -> pd.DataFrame:
                 name = one["metric"] if one["track"] == "all" else f"{one['metric']}, {one['track']}"
                 row[f"{name} ({one['unit']})"] = _number(one["value"])
         rows.append(row)
-    return pd.DataFrame(rows).fillna("")
+    return pd.DataFrame(rows).fillna("-")
 
 
 def _figure(row: pd.Series) -> str:
@@ -144,10 +145,9 @@ def _number(value: float) -> str:
 
 def _rank(row: pd.Series) -> str:
     """A rank or ranks that cannot be told apart; controls have none."""
-    best, worst = int(row["rank_best"]), int(row["rank_worst"])
-    if not best:
+    if pd.isna(row["rank_best"]):
         return "control" if row["matcher"] in UNRANKED else "-"
-    return str(best) if best == worst else f"{best}-{worst}"
+    return RankInterval(best=int(row["rank_best"]), worst=int(row["rank_worst"])).text
 
 
 def warnings_of(board: pd.DataFrame) -> list[str]:
@@ -177,6 +177,7 @@ _NOTE: Final = (
 _TERMS: Final = {  # docs/scoring.md says the same at more length
     "success_25m, recall_1": "share of the stressed queries whose pose is within 25 m and 5 deg; whose first candidate "
     "is the right one, ties counted in proportion. Without an answer a query is a miss",
+    "within_25m": "the same as success_25m whatever the heading: what counts as a fix that is not false",
     "control": "the same figure at the same places without the stress; under `rank`, a matcher that is no rival",
     "false fixes": "share of absent places that were answered",
     "rank": "ranks a matcher can have, all pairs at once; `-` where there are fewer than "
@@ -188,11 +189,12 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
     "discordant": "queries that only the first method got right, and only the second",
     "rejector": "says of each answer how likely it is false; `own` is the matcher's own confidence, fitted to nothing",
-    "aurc": "mean share of false fixes among the surest 1, 2, ..., all queries; lower is better",
+    "aurc": "mean share of false fixes (beyond 25 m, whatever the heading, or not the right candidate) among the "
+    "surest 1, 2, ..., all queries; lower is better",
     "coverage_at_risk_0.05, risk_reached_at_0.05": "share of queries accepted by the threshold that kept false fixes "
     "at 5 % on other places, and the share of false fixes among them here",
     "brier, ece": "how far the stated chances are from what came true: mean square; mean distance by bins of equal "
-    "mass",
+    "mass. `-`, as of the costs, for a rejector that keeps an order and states no chances",
     "cost_20, cost_20_place": "mean cost of a query if a fix is accepted where its chance to be false is below "
     "1 / (1 + 20) and a false fix costs 20: withheld right fixes cost 1 each, or every present place without an "
     "accepted fix does. By the first compare rejectors on one matcher, by the second whole methods. "

@@ -76,7 +76,8 @@ def write_board(
     """
     check_board(folder, scorer_version=int(about["scorer_version"]))
     with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
-        said = {"attribution": ATTRIBUTION, "licence": LICENCE, "scorer_version": str(about["scorer_version"])}
+        versions = {name: str(about[name]) for name in ("scorer_version", "task_version", "data_version", "made_by")}
+        said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
         for part in (Extra(tables=tables, texts=texts), *extras):
             _write_part(scratch, part, said)
         tables[LEADERBOARD].to_csv(scratch / f"{LEADERBOARD}.csv", index=False, lineterminator="\n")
@@ -87,7 +88,9 @@ def write_board(
 def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
     for name, frame in part.tables.items():
         table = pa.Table.from_pandas(frame, preserve_index=False)
-        pq.write_table(table.replace_schema_metadata(said), folder / f"{name}.parquet", compression="zstd")
+        # pandas gives back types by the key "pandas", and what is said as `attrs` by "PANDAS_ATTRS".
+        about = {**(table.schema.metadata or {}), **said, "PANDAS_ATTRS": json.dumps(said)}
+        pq.write_table(table.replace_schema_metadata(about), folder / f"{name}.parquet", compression="zstd")
     for name, text in part.texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     for name, draw in part.figures.items():

@@ -148,3 +148,14 @@ def test_without_an_answer_a_query_is_false_at_full_coverage_and_no_part_of_cali
     assert found["aurc"] == pytest.approx((false / (60 + false)).sum() / 120)
     assert (found["brier"], found["ece"]) == pytest.approx((0.04**2, 0.04))
     assert (found["cost_20"], found["cost_20_place"]) == (0.0, 0.5)
+
+
+def test_an_order_that_is_no_probability_has_no_figures_that_judge_one():
+    judged = own_word(scores(ERRORS, confidence=np.where(ERRORS < 25, 0.75, 0.25)))
+    told, bare = (
+        {row.metric for row in integrity_rows("mine", "margin", judged, is_calibrated=is_calibrated)}
+        for is_calibrated in (True, False)
+    )
+    costs = {f"cost_{ratio:g}{kind}" for ratio in COST_RATIOS for kind in ("", "_place")}
+    assert told - bare == {"brier", "ece", *costs}
+    assert {"aurc", "e_aurc", "augrc"} < bare

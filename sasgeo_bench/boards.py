@@ -23,10 +23,11 @@ from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hol
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
+from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.rejection import OWN, Make, judge, own_word, why_not
 from sasgeo_bench.report.rows import to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.report.text import board_latex, board_markdown
+from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
@@ -446,7 +447,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
         },
         texts={
             "leaderboard.md": board_markdown(board.table, about, board.findings, board.verdicts),
-            "leaderboard.tex": board_latex(board.table, about),
+            "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },
         about=about,
         extras=extras,

@@ -89,6 +89,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "score": None,
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
+        "latex",
         *("paper", "papertext", "plots", "site"),
     ),
     "boards": None,

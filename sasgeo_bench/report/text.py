@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A leaderboard as Markdown, LaTeX and lines for a terminal; the parquet is the master, these say a part of it."""
+"""A leaderboard as Markdown and as lines for a terminal; the parquet is the master, these say a part of it."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.integrity import AS_DRAWN
-from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES, UNRANKED
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 
@@ -30,6 +30,7 @@ _COSTS: Final = (
     *("latency_p50", "latency_p95", "prepare", "peak_memory"),
     *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
 )
+DAGGER: Final = "†"  # of an interval that Wilson's reaches beyond the draws
 _PRIOR_ALONE: Final = "prior_centre"
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
@@ -50,7 +51,7 @@ def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
     for (suite, track, prior_group), part in means.groupby(["suite", "track", "prior_group"], sort=True):
         primary = primary_of(str(track)).name
-        yield f"{suite}, {track}, prior group {prior_group}{_prior_alone(part, primary)}", _suite_table(part, primary)
+        yield f"{suite}, {track}, prior group {prior_group}{_for_nothing(part, primary)}", _suite_table(part, primary)
     judged = board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
     for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True):
         yield f"Rejection, {track}, prior group {prior_group}, all suites", _judged_table(part)
@@ -59,20 +60,27 @@ def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield "Costs", _cost_table(costs)
 
 
-def _prior_alone(part: pd.DataFrame, primary: str) -> str:
-    """What the prior alone is worth, for a title: nobody's merit, and so said beside every group."""
-    mine = part[part["matcher"] == _PRIOR_ALONE]
-    row = _pick(mine, primary, STRESS)
-    row = _pick(mine, primary, ALL) if row is None else row
-    return "" if row is None else f" (the prior alone: {_number(row['value'])})"
+def _for_nothing(part: pd.DataFrame, primary: str) -> str:
+    """What the prior alone and guessing are worth, for a title: nobody's merit, and so said beside every group."""
+    told = {
+        "the prior alone": _main(part[part["matcher"] == _PRIOR_ALONE], primary),
+        "chance": _main(part, CHANCE.name),
+    }
+    words = [f"{name}: {_number(row['value'])}" for name, row in told.items() if row is not None]
+    return f" ({', '.join(words)})" if words else ""
+
+
+def _main(rows: pd.DataFrame, metric: str) -> pd.Series | None:
+    """The row of a figure under stress, or of all where there is no stress."""
+    row = _pick(rows, metric, STRESS)
+    return _pick(rows, metric, ALL) if row is None else row
 
 
 def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
     """A matcher a line, by what it reaches under stress."""
     rows = []
     for matcher, mine in part.groupby("matcher", sort=True):
-        main = _pick(mine, primary, STRESS)
-        main = _pick(mine, primary, "all") if main is None else main
+        main = _main(mine, primary)
         if main is None:
             continue
         control, absent = _pick(mine, primary, CONTROL), _pick(mine, FALSE_ABSENT.name, ALL)
@@ -126,8 +134,9 @@ def _cost_table(part: pd.DataFrame) -> pd.DataFrame:
 
 
 def _figure(row: pd.Series) -> str:
-    """A figure with its interval, as in "0.63 [0.55, 0.70]"."""
-    return _with_interval(row["value"], row["lo"], row["hi"])
+    """A figure with its interval, as in "0.63 [0.55, 0.70]"; a dagger where that is Wilson's."""
+    mark = DAGGER if row["interval"] == "wilson" else ""
+    return _with_interval(row["value"], row["lo"], row["hi"]) + mark
 
 
 def _with_interval(value: float, lo: float, hi: float) -> str:
@@ -170,7 +179,8 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
 
 
 _NOTE: Final = (
-    "Intervals are 95 %: a bootstrap over blocks, then queries ({draws} draws), or Wilson's where blocks say nothing. "
+    "Intervals are 95 %: a bootstrap over blocks, then sites ({draws} draws), and never narrower than Wilson's of as "
+    f"many trials as there are sites; {DAGGER} marks those that Wilson's reaches farther out. "
     "A rank is an interval: matchers that share one cannot be told apart. Nothing is ranked across prior groups. "
     "What each column says is told at the end."
 )
@@ -180,6 +190,11 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "within_25m": "the same as success_25m whatever the heading: what counts as a fix that is not false",
     "control": "the same figure at the same places without the stress; under `rank`, a matcher that is no rival",
     "false fixes": "share of absent places that were answered",
+    DAGGER: "Wilson: of a few sites, or where all answers are right, draws alone would be too narrow",
+    "-": "nothing to tell: no such query, no rank, nobody to compare with",
+    "the prior alone": "in a title, what `prior_centre` reaches, which looks at nothing: it answers with the middle of "
+    "the prior's disc, or of the map without one; of candidates with the one nearest to the middle of all",
+    "chance": "in a title, what guessing among the candidates reaches",
     "rank": "ranks a matcher can have, all pairs at once; `-` where there are fewer than "
     f"{LEAST_BLOCKS} blocks: they rank nobody, as they decide no contrast",
     "detectable": "least difference from the best other matcher that these queries would show; inf where none would, "
@@ -187,7 +202,13 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "n, missing, blocks": "queries counted; those of them without a row; pieces of ground they come from, which are "
     "what intervals count",
     "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
+    "contrast, first, second, difference": "a pair that was named before anything was run; what each reaches; the "
+    "first less the second, on the same queries",
+    "p (Holm)": "chance of a difference as large if there were none, counting blocks, adjusted by Holm for how many "
+    "contrasts were registered",
     "discordant": "queries that only the first method got right, and only the second",
+    "verdict": "which is better at 5 %; `null` where neither is shown to be, with or without ruling out a difference "
+    f"that matters; `not decided` with fewer than {LEAST_BLOCKS} blocks",
     "rejector": "says of each answer how likely it is false; `own` is the matcher's own confidence, fitted to nothing",
     "aurc": "mean share of false fixes (beyond 25 m, whatever the heading, or not the right candidate) among the "
     "surest 1, 2, ..., all queries; lower is better",
@@ -291,34 +312,8 @@ def markdown_table(table: pd.DataFrame) -> Iterator[str]:
         yield "| " + " | ".join(map(str, row)) + " |"
 
 
-_ESCAPED: Final = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#"}
-
-
-def board_latex(board: pd.DataFrame, about: Mapping[str, Any]) -> str:
-    """The tables of the board for a paper; needs the package booktabs."""
-    lines = [f"% {about['made_by']}, scorer version {about['scorer_version']}; {ATTRIBUTION}"]
-    for title, table in tables_of(board):
-        lines += [
-            r"\begin{table}",
-            rf"\caption{{{_tex(title)}}}",
-            rf"\begin{{tabular}}{{{'l' * len(table.columns)}}}",
-            r"\toprule",
-            " & ".join(map(_tex, table.columns)) + r" \\",
-            r"\midrule",
-            *(" & ".join(map(_tex, row)) + r" \\" for row in table.itertuples(index=False)),
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _tex(text: object) -> str:
-    return "".join(_ESCAPED.get(letter, letter) for letter in str(text))
-
-
 def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple[str, pd.DataFrame]]:
-    """What a terminal shows: by track and prior group a matcher a line, a suite a column, primary figure and rank.
+    """What a terminal shows: by track and prior group a matcher a line, a suite a column, figure, interval and rank.
 
     Parameters
     ----------
@@ -331,24 +326,31 @@ def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple
     means = means[means["suite"].isin(names)] if names else means
     for (track, prior_group), part in means.groupby(["track", "prior_group"], sort=True):
         primary = primary_of(str(track)).name
-        main = part[part["metric"] == primary]
         rows = []
-        for matcher, mine in main.groupby("matcher", sort=True):
+        for matcher, mine in part.groupby("matcher", sort=True):
             row = {"matcher": str(matcher)}
             total = []
             for suite, one in mine.groupby("suite", sort=True):
-                shown = _pick(one, primary, STRESS)
-                shown = _pick(one, primary, "all") if shown is None else shown
+                shown = _main(one, primary)
                 if shown is not None:
-                    row[str(suite)] = _cell(shown)
+                    row[_heading(str(suite), one, shown)] = _cell(shown)
                     total.append(shown["value"])
             numbers = [value for value in total if not math.isnan(value)]
             rows.append(row | {"_key": sum(numbers) / len(numbers) if numbers else -1.0})
         table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
-        yield f"{primary}, {track}, prior group {prior_group} (rank)", table.drop(columns="_key").fillna("")
+        title = f"{primary} [95 %] (rank), {track}, prior group {prior_group}"
+        yield title, table.drop(columns="_key").fillna("-")
+
+
+def _heading(suite: str, rows: pd.DataFrame, shown: pd.Series) -> str:
+    """A suite with its queries, and what guessing among candidates is worth."""
+    chance = _main(rows, CHANCE.name)
+    return f"{suite}, n = {shown['n']}" + ("" if chance is None else f", chance {_number(chance['value'])}")
 
 
 def _cell(row: pd.Series) -> str:
+    """As in "0.750 [0.30, 0.95] (2-3)"."""
     if not row["is_applicable"]:
         return "n/a"
-    return f"{_number(row['value'])} ({_rank(row)})"
+    ends = "" if math.isnan(row["lo"]) else f" [{row['lo']:.2f}, {row['hi']:.2f}]"
+    return f"{_number(row['value'])}{ends} ({_rank(row)})"

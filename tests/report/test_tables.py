@@ -2,6 +2,7 @@
 """The leaderboard: figures worked out by hand, denominators that never move, ranks that say how sure they are."""
 
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -11,13 +12,15 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.metrics.compare import LEAST_BLOCKS
 from sasgeo_bench.metrics.intervals import wilson
 from sasgeo_bench.report.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.report.controls import Verdict
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
+from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.rejection import own_word
 from sasgeo_bench.report.rows import COLUMNS, to_frame
 from sasgeo_bench.report.strata import strata
 from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.report.text import board_latex, board_markdown, summary, tables_of, warnings_of
+from sasgeo_bench.report.text import board_markdown, summary, tables_of, warnings_of
 from sasgeo_bench.score import COLUMNS as SCORED
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
@@ -278,8 +281,13 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
     ((title, short),) = summary(board)
-    assert title == "success_25m, localization, prior group r500-weak-s3 (rank)"
-    assert short["occlusion"].tolist() == ["0.250 (-)", "0.000 (control)"]
+    assert title == "success_25m [95 %] (rank), localization, prior group r500-weak-s3"
+    one, none = wilson(1, 4), wilson(0, 4)
+    expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
+    shown = short["occlusion, n = 4"].tolist()
+    assert shown[1] == expected[1]
+    assert shown[0].endswith("] (-)")
+    assert f"| {none.value:.3f} [0.000, {none.hi:.3f}]† |" in text
     assert len(warnings_of(board)) == 2
 
 
@@ -322,3 +330,29 @@ def test_a_board_of_nothing_is_an_empty_table():
     assert to_frame([]).empty
     assert leaderboard({}).empty
     assert warnings_of(leaderboard({})) == []
+
+
+def test_of_candidates_a_board_says_what_guessing_is_worth():
+    found = {"above": [0, 1, 0, 0], "tied": 1, "right": 1}
+    board = leaderboard({"mine": scores([math.nan] * 4, track="retrieval", pool=[10, 10, 50, 50], **found)}, draws=200)
+    assert pick(board, "mine", "chance_1")["value"] == pytest.approx((0.1 + 0.02) / 2)
+    ((title, _),) = tables_of(board)
+    assert title.endswith(" (chance: 0.060)")
+    ((_, short),) = summary(board)
+    assert short.columns[1] == "occlusion, n = 4, chance 0.060"
+
+
+def test_a_paper_gets_contrasts_controls_labels_and_where_data_are_from():
+    tables = {"mine": scores([1.0, 99.0] * 4), "other": scores([99.0] * 8)}
+    contrast = Contrast(name="first_one", first="mine", second="other", suites=("occlusion",))
+    findings = hold_contrasts([contrast], tables, {}, draws=200)
+    verdict = Verdict(control="twins", matcher="mine", n=4, found=2.0, expected=2.0, p=math.nan, holds=True)
+    latex = board_latex(leaderboard(tables, draws=200), ABOUT, findings, [verdict])
+    labels = re.findall(r"label{tab:(.*)}", latex)
+    assert labels == ["contrasts", "occlusion-localization-prior-group-r500-weak-s3", "controls"]
+    captions = [line for line in latex.splitlines() if line.startswith(r"\caption")]
+    assert all("(c) OpenStreetMap contributors, ODbL" in line for line in captions)
+    assert [r"$^\dagger$ Wilson" in line for line in captions] == [False, True, False]
+    assert r"first\_one" in latex
+    assert "booktabs" in latex.split(r"\begin{table}")[0]
+    assert "resizebox" in latex.split(r"\begin{table}")[0]

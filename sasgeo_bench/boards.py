@@ -6,16 +6,16 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, counted
+from sasgeo_bench.matcher import check_name
+from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.plugins import load_rejector
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Head, Truth
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.rejector import RejectorCard
@@ -24,11 +24,11 @@ from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, ver
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
-from sasgeo_bench.report.rejection import OWN, Make, judge, own_word, why_not
-from sasgeo_bench.report.rows import to_frame, with_contestants
+from sasgeo_bench.report.rejection import OWN, judge, own_word, rules_of, why_not
+from sasgeo_bench.report.rows import is_unranked, to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
@@ -44,6 +44,7 @@ REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
 _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
+_RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,26 +138,25 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
     Raises
     ------
     StoreError
-        If a path holds no predictions.
+        If a path holds no predictions, or a `run.json` does not say whose answers lie beside it.
     ConfigError
-        If two files have one name.
+        If two files have one name, or one has that of a control.
     """
     by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
     files: list[Entry] = []
+    seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
     for path in paths:
         if path.is_file():
-            if not FILE_NAME.fullmatch(path.stem):
-                message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
-                raise ConfigError(message)
-            files.append(Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,)))
+            if _is_new(path, seen):
+                files.append(_file_entry(path))
             continue
         found = sorted(path.rglob(rundir.RUN))
         if not found:
             message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
             raise StoreError(message)
         for run in found:
-            about = rundir.read_run(run.parent)
-            if about is not None:
+            if _is_new(run, seen):
+                about = _read_run(run)
                 card = about["matcher"]
                 by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
     names = [name for name, _, _ in by_run]
@@ -188,6 +188,42 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
     return tuple(sorted(entries, key=lambda entry: entry.name))
 
 
+def _is_new(path: Path, seen: set[Path]) -> bool:
+    place = path.parent.resolve() / path.name
+    is_new = place not in seen
+    seen.add(place)
+    return is_new
+
+
+def _file_entry(path: Path) -> Entry:
+    if not FILE_NAME.fullmatch(path.stem):
+        message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
+        raise ConfigError(message)
+    if is_unranked(path.stem):
+        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: rename the file"
+        raise ConfigError(message)
+    return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """What a `run.json` says, after a look at whatever a board takes from it: it may be anyone's."""
+    about = rundir.read_run(path.parent) or {}
+    card = about.get("matcher")
+    said = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
+    if isinstance(card, dict):
+        said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
+    fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
+    try:
+        check_name(str(said["matcher.name"]))
+        run_cost(about)
+    except (MatchError, MetricError) as error:
+        fault = fault or str(error)
+    if fault is not None:
+        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
+    return about
+
+
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     """Score everything and write the board.
 
@@ -211,7 +247,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         If there is nothing to score, or rejectors are asked for without a split.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
-    rules = _rules(request)
+    rules = rules_of(request.rejectors, request.split)
     entries = find_entries(request.predictions)
     predictions = {entry.name: _predictions(entry) for entry in entries}
     folders = list(request.tasks) or list(_answered(entries, predictions, request.root))
@@ -276,33 +312,6 @@ def _is_for_controls(entry: Entry) -> bool:
 def _ranked(scores: pd.DataFrame) -> pd.DataFrame:
     """Scored rows that make figures."""
     return scores[~is_control(scores)].reset_index(drop=True)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Rule:
-    """A rejector that is to be fitted: what it says of itself, what makes a new one, and on which places."""
-
-    card: RejectorCard
-    make: Make
-    split: Split
-
-
-def _rules(request: ScoreRequest) -> dict[str, _Rule]:
-    """The rejectors by name, each tried once before anything is read."""
-    if not request.rejectors:
-        return {}
-    if request.split is None:
-        message = "rejectors are fitted on the calibration places of a split: name one with --split"
-        raise ConfigError(message)
-    cards = {spec: load_rejector(spec).card for spec in request.rejectors}
-    own = next((spec for spec, card in cards.items() if card.name == OWN), None)
-    if own is not None:
-        message = f"{own}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
-        raise ConfigError(message)
-    return {
-        card.name: _Rule(card=card, make=partial(load_rejector, spec), split=request.split)
-        for spec, card in cards.items()
-    }
 
 
 def _predictions(entry: Entry) -> dict[str, Prediction]:
@@ -374,27 +383,27 @@ def _area_km2(region: Path) -> float | None:
     return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
-def _folder_of(entry: Entry, about: Mapping[str, Any]) -> Path:
-    """Where a run holds its answers to a task."""
-    same = [(run["suite"], run["region"]) == (about["suite"], about["region"]) for run in entry.runs]
-    return entry.sources[same.index(True)]
+def _check_asked(entry: Entry, task: _Task) -> None:
+    """Refuse a run of other queries than the task holds now; a task may have several runs, of one shard each."""
+    here = (task.about["suite"], task.about["region"])
+    for folder, about in zip(entry.sources, entry.runs, strict=False):  # a file has no run
+        is_same = about["queries_sha256"] == task.about["files"][taskdir.QUERIES]["sha256"]
+        if (about["suite"], about["region"]) == here and not is_same:
+            message = (
+                f"{folder} holds answers to other queries than {task.folder} does now: "
+                "move it away and run again, or make the old queries again"
+            )
+            raise StoreError(message)
 
 
 def _scored(
     entry: Entry, predictions: Mapping[str, Prediction], tasks: Sequence[_Task], request: ScoreRequest
 ) -> pd.DataFrame:
     """All tasks of one contestant, one row for each query."""
-    ran_on = {(about["suite"], about["region"]): about["queries_sha256"] for about in entry.runs}
     place_of = {} if request.split is None else request.split.place_of
     frames = []
     for task in tasks:
-        asked = ran_on.get((task.about["suite"], task.about["region"]))
-        if asked is not None and asked != task.about["files"][taskdir.QUERIES]["sha256"]:
-            message = (
-                f"{_folder_of(entry, task.about)} holds answers to other queries than {task.folder} does now: "
-                "move it away and run again, or make the old queries again"
-            )
-            raise StoreError(message)
+        _check_asked(entry, task)
         mine = {head.query_id: predictions[head.query_id] for head in task.heads if head.query_id in predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)
         frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in request.by_region else frame)

@@ -20,7 +20,7 @@ from sasgeo_bench.report.paper import (
     trials_frame,
 )
 from sasgeo_bench.report.papertext import paper_markdown
-from sasgeo_bench.report.rows import UNRANKED
+from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import Extra
 from sasgeo_bench.store.paperplot import draw_ablation, draw_example, draw_risk, draw_robustness
@@ -89,7 +89,7 @@ def _example(region: str, truths: list[Truth], root: Path) -> Panel:
 
 def _ablation(summary: pd.DataFrame) -> pd.DataFrame:
     """Rows of the ablation: over seeds where there are several, else as if trials were independent."""
-    rows = summary[(summary["metric"] == "recall_1") & ~summary["matcher"].isin(UNRANKED) & summary["value"].notna()]
+    rows = summary[(summary["metric"] == "recall_1") & ~summary["matcher"].map(is_unranked) & summary["value"].notna()]
     if (rows["cluster"] == "tile").all():
         return rows.assign(how="Wilson's 95 % intervals, trials taken for independent")
     how = f"95 % intervals by resampling {rows['clusters'].max()} seeds, then trials within each"

@@ -19,7 +19,7 @@ from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
-from sasgeo_bench.tasks import made_tasks, make_tasks
+from sasgeo_bench.tasks import ensure_tasks, made_tasks
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
@@ -228,14 +228,10 @@ def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
     tasks: list[Path] = []
     lacking: list[str] = []
     for request in requests:
-        made = made_tasks(request)
-        if made is None:
-            try:
-                made = tuple(item.folder for item in make_tasks(request, tell=tell))
-            except ConfigError as error:
-                lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
-                continue
-        tasks += made
+        try:
+            tasks += ensure_tasks(request, tell=tell)
+        except ConfigError as error:
+            lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
     for line in lacking[:MOST_LINES]:
         tell(f"left out: {line}")
     if len(lacking) > MOST_LINES:

@@ -11,7 +11,7 @@ from sasgeo_bench.tomlfile import Document
 
 PAPER_SUITE: Final = "paper-poc"
 
-Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
 
 
 class ContrastSpec(Document):
@@ -112,6 +112,7 @@ class PipelineFile(Document):
         if CONTROLS in suites:
             message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
             raise ValueError(message)
+        _check_apart(self.contrast)
         for item in self.contrast:
             lost = next((name for name in item.suites if name not in suites), None)
             if lost is not None:
@@ -125,6 +126,20 @@ class PipelineFile(Document):
             if task.prior is not None:
                 PriorGroup.parse(task.prior)
         return self
+
+
+def _check_apart(contrasts: list[ContrastSpec]) -> None:
+    """Refuse a method against itself, and two contrasts of the same: Holm's adjustment would count both."""
+    seen: dict[object, str] = {}
+    for item in contrasts:
+        if item.first == item.second:
+            message = f"contrast {item.name!r} holds {item.first!r} against itself: name two methods"
+            raise ValueError(message)
+        what = (frozenset((item.first, item.second)), frozenset(item.suites), frozenset(item.kinds))
+        before = seen.setdefault((*what, item.metric, item.track), item.name)
+        if before != item.name:
+            message = f"contrasts {before!r} and {item.name!r} compare the same: leave one out"
+            raise ValueError(message)
 
 
 def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:

@@ -5,6 +5,7 @@ import datetime as dt
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -67,14 +68,32 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
         If there is no such suite, the count is not positive, the region cannot carry the suite or does not hold so many
         sites; nothing is written.
     """
+    with _locked(request, tell):
+        return _make_tasks(request, tell)
+
+
+def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
+    """Hold a request all the way: a second run of it would change the map that this one draws from."""
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
-    # Held all the way: a second run of the same request would change the map that this one draws from. The lock lies
-    # where maps are built, so that a request that is refused leaves nothing where tasks are.
-    name = f"{request.region.id}+{suite.card.name}.request"
-    with regiondir.locked(request.out / "regions" / name, tell=tell):
-        return _make_tasks(request, suite, tell)
+    # Where maps are built, so that a request that is refused leaves nothing where tasks are.
+    return regiondir.locked(request.out / "regions" / f"{request.region.id}+{suite.card.name}.request", tell=tell)
+
+
+def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
+    """Task folders of a request, drawn unless it has made them before; another run that draws them is waited for.
+
+    Raises
+    ------
+    ConfigError
+        As `make_tasks` does.
+    """
+    made = made_tasks(request)
+    if made is None:
+        with _locked(request, tell):
+            made = made_tasks(request) or tuple(item.folder for item in _make_tasks(request, tell))
+    return made
 
 
 def made_tasks(request: Request) -> tuple[Path, ...] | None:
@@ -115,7 +134,8 @@ def _request_sha256(request: Request) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
-def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
+def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
+    suite = find_suite(request.suite)
     if request.group is not None and suite.card.has_own_priors:
         message = f"suite {suite.card.name!r} is about what is known before: leave --prior out"
         raise ConfigError(message)

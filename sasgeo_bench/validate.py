@@ -61,8 +61,9 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     Raises
     ------
     StoreError
-        If a file cannot be read at all, or a task is of another version.
+        If a file cannot be read at all, a task is of another version, or the folder holds runs of two matchers.
     """
+    rundir.check_one_matcher([path])
     queries = {query.query_id: query for task in tasks for query in _queries(task)}
     seen: dict[str, str] = {}
     files = rundir.parts_of(path)

@@ -53,6 +53,10 @@ class Order(Doubt):
     card = replace(Doubt.card, name="order", is_calibrated=False)
 
 
+class DoubtToo(Doubt):
+    """Another rejector of the same name."""
+
+
 class Own(Doubt):
     card = replace(Doubt.card, name="own")
 
@@ -101,15 +105,16 @@ def primary(board, matcher):
     return rows[rows["stratum"] == "all"].iloc[0]
 
 
-def submission(out, path, *, keep=lambda _: True):
-    """A file of right answers to some of the queries."""
+def submission(out, path, *, keep=lambda _: True, change=lambda row, query: row):  # noqa: ARG005
+    """A file of right answers to some of the queries, changed as is asked."""
     rows = []
     for town in TOWNS:
         truths = {truth.query_id: truth for truth in taskdir.read_truths(out / "truth" / "clean" / town)}
         for query in taskdir.read_queries(out / "tasks" / "clean" / town):
             match = right_answer(query, truths[query.query_id])
             candidates = tuple(zip(match.poses, match.scores, strict=True))
-            rows.append(Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence))
+            row = Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence)
+            rows.append(change(row, query))
     part = rundir.write_part(path.parent / "parts", [row for at, row in enumerate(rows) if keep(at)])
     shutil.move(part, path)
     return len(rows)
@@ -160,6 +165,42 @@ def test_predictions_for_half_of_the_queries_are_misses_for_the_rest(out, tmp_pa
     assert row["value"] == pytest.approx(1 - row["missing"] / row["n"])
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
     assert f"half: {count // 2} queries have no row and count as misses." in text
+
+
+def moved(row, query):
+    """An answer half a kilometre off, or another candidate; none where there was none."""
+    if not row.candidates:
+        return row
+    ((pose, score),) = row.candidates
+    away = replace(pose, easting_m=pose.easting_m + 500)
+    others = (item for item in query.candidates if abs(item.easting_m - pose.easting_m) > 1)
+    return replace(row, candidates=((next(others, away), score),))
+
+
+@pytest.mark.parametrize("confidence", [0.5, None])
+@pytest.mark.parametrize("is_right", [True, False])
+def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_else(
+    out, tmp_path, split, confidence, is_right
+):
+    def change(row, query):
+        row = replace(row, confidence=confidence if row.candidates else None)
+        return row if is_right else moved(row, query)
+
+    submission(out, tmp_path / "mine.parquet", change=change)
+    rejectors = ["margin", "isotonic_margin", "logistic_all", "entropy"]
+    board = board_of(out, tmp_path / "mine.parquet", rejectors=rejectors, split=split)
+    assert primary(board, "mine")["value"] == float(is_right)
+    rows = board.table[(board.table["stratum"] == "as drawn") & (board.table["rejector"] != "")]
+    assert set(rows["rejector"]) == {*rejectors} | ({"own"} if confidence else set())
+    # What cannot be told apart is accepted together or not at all.
+    covered = rows[rows["metric"] == "coverage_at_risk_0.05"]
+    assert len(covered) >= len(rejectors)
+    for _, row in covered.iterrows():
+        assert row["value"] == pytest.approx(row["answered"] / row["n"] if is_right else 0.0)
+    assert set(rows[(rows["rejector"] == "own") & (rows["metric"] == "brier")]["value"]) == (
+        {0.25} if confidence else set()
+    )
+    assert len(read_board(out / "boards" / "mine")[1]) == len(board.table)
 
 
 def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_path, split):
@@ -325,9 +366,41 @@ class Raises(Doubt):
         raise RuntimeError(len(predictions))
 
 
-def test_a_rejector_that_fails_is_named(out, split):
-    with pytest.raises(MatchError, match=r"rejector 'doubt' failed \(RuntimeError: "):
-        board_of(out, rejectors=[f"{__name__}:Raises"], split=split)
+class Leaves(Doubt):
+    def p_false(self, predictions):
+        raise SystemExit(len(predictions) * 0)
+
+
+class SaysNan(Doubt):
+    def p_false(self, predictions):
+        return np.full(len(predictions), np.nan)
+
+
+class LeavesAtOnce(Doubt):
+    def __init__(self):
+        raise SystemExit(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Raises", r"rejector 'doubt' failed \(RuntimeError: .*: mend it, or leave it out"),
+        ("SaysNan", r"rejector 'doubt' failed \(MatchError: p_false\(\) returned nan in place 0, expected 0..1\)"),
+        ("Leaves", r"rejector 'doubt' failed \(SystemExit: 0\)"),
+        ("LeavesAtOnce", r"LeavesAtOnce: cannot be made \(SystemExit: 0\)"),
+    ],
+)
+def test_a_rejector_that_fails_or_ends_the_program_is_named_and_nothing_is_written(out, split, name, words):
+    with pytest.raises(MatchError, match=words):
+        board_of(out, rejectors=[f"{__name__}:{name}"], split=split)
+    assert not (out / "boards").exists()
+
+
+def test_two_rejectors_of_one_name_are_refused_and_one_named_twice_is_one(out, split):
+    first, second = (f"{__name__}:{name}" for name in ("Doubt", "DoubtToo"))
+    with pytest.raises(ConfigError, match=r"Doubt and .*DoubtToo are both named 'doubt': rename one"):
+        board_of(out, rejectors=[first, second], split=split)
+    assert set(board_of(out, rejectors=[first, first], split=split).table["rejector"]) >= {"doubt"}
 
 
 def test_nothing_to_score_is_told(out, tmp_path):
@@ -347,6 +420,54 @@ def test_two_files_of_one_name_are_refused(out, tmp_path):
         find_entries([shutil.copy(tmp_path / "a" / "mine.parquet", tmp_path / "a|b.parquet")])
     with pytest.raises(ConfigError, match="two contestants are named 'mine'"):
         find_entries([tmp_path / "a" / "mine.parquet", tmp_path / "b" / "mine.parquet"])
+
+
+@pytest.mark.parametrize("name", ["oracle_pose", "prior_centre", "random"])
+def test_a_file_may_not_pass_for_a_control(out, tmp_path, name):
+    submission(out, tmp_path / f"{name}.parquet")
+    with pytest.raises(ConfigError, match=f"'{name}' is the name of a control of every board: rename the file"):
+        find_entries([tmp_path / f"{name}.parquet"])
+
+
+def test_what_is_named_twice_counts_once(out, tmp_path):
+    submission(out, tmp_path / "mine.parquet")
+    file, runs = tmp_path / "mine.parquet", out / "runs"
+    (tmp_path / "again").symlink_to(runs)
+    entries = find_entries([runs, file, runs / "oracle_pose", file, tmp_path / "again"])
+    assert [(entry.name, len(entry.sources)) for entry in entries] == [("mine", 1), ("oracle_pose", len(TOWNS))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"matcher": None}, "matcher.name is None"),
+        ({"matcher": {"name": "a|b", "version": "1"}}, r"name 'a\|b' may hold lower-case letters"),
+        ({"matcher": {"name": "../../x", "version": "1"}}, "may hold lower-case letters"),
+        ({"matcher": {"name": "x", "version": 1}}, "matcher.version is 1"),
+        ({"hash": ["x"]}, r"hash is \['x'\]"),
+        ({"suite": None}, "suite is None"),
+        ({"region": ""}, "region is ''"),
+        ({"queries_sha256": {}}, "queries_sha256 is {}"),
+        ({"cpu_s": "long"}, "cpu_s of a run is 'long', expected a number"),
+    ],
+)
+def test_a_run_that_does_not_say_whose_it_is_gets_one_line(out, changes, words):
+    path = next((out / "runs").rglob("run.json"))
+    edit_json(path, **changes)
+    with pytest.raises(StoreError, match=rf"run\.json is damaged \(.*{words}.*\): remove it and run again"):
+        board_of(out)
+    assert not (out / "boards").exists()
+
+
+@pytest.mark.parametrize("place", ["before", "zz"])
+def test_every_run_of_a_task_is_of_its_queries(out, tmp_path, place):
+    """Shards of two machines are two runs of one task; one of older queries is found in either order."""
+    stale = Path(shutil.copytree(out / "runs", tmp_path / place))
+    for path in stale.rglob("run.json"):
+        edit_json(path, queries_sha256="0" * 64)
+    both = [stale, out / "runs"] if place == "before" else [out / "runs", stale]
+    with pytest.raises(StoreError, match=f"{place}.* holds answers to other queries than .* does now: move it away"):
+        board_of(out, *both)
 
 
 def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):

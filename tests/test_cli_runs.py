@@ -286,6 +286,7 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     assert "part-9.parquet holds no predictions: move it out of the run's folder" in mistake(*ORACLE)
     (run_folder / "part-9.parquet").unlink()
     about = run_folder / rundir.RUN
+    sound = rundir.read_run(run_folder)
     for text in ("{", "[]", "null", '"run"'):
         about.write_text(text)
         assert "run.json is damaged: remove it and run again, the parts beside it are kept" in mistake(*ORACLE)
@@ -293,6 +294,10 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     told = mistake(*ORACLE)
     assert "holds answers to other queries than" in told
     assert told.endswith("move it away and run again, or make the old queries again")
+    about.write_text(json.dumps(sound | {"cpu_s": "long"}))
+    rows = pq.read_table(part)
+    pq.write_table(rows.slice(1), part)
+    assert "run.json is damaged (cpu_s is no number)" in mistake(*ORACLE)
     about.unlink()
     about.mkdir()
     part.unlink()
@@ -326,7 +331,8 @@ def test_what_cannot_be_merged_gets_one_line_and_nothing_is_written(mistake, min
     for file, words in (
         ("nowhere", "nowhere holds no predictions: run a matcher first, or name a predictions file"),
         ("notes.txt", "notes.txt cannot be read ("),
-        (TASK / taskdir.QUERIES, "holds no predictions: 'validate' says what is missing"),
+        (TASK / taskdir.QUERIES, "holds no predictions (candidates: found list"),
+        (TASK / taskdir.TASK, "cannot be read ("),
         (TASK, "holds no predictions"),
     ):
         assert words in mistake("merge", "--runs", rows, "--runs", file, "--into", "new.parquet")
@@ -395,6 +401,30 @@ def test_predictions_for_a_task_of_another_version_are_not_validated(mistake, mi
     told = mistake("validate", "--predictions", path, "--tasks", TASK)
     assert words in told
     assert told.endswith("make the queries again")
+
+
+def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
+    path, name = mine(), "x" * 300
+    for words in (
+        ("score", "--predictions", name),
+        ("validate", "--predictions", name, "--tasks", TASK),
+        ("validate", "--predictions", path, "--tasks", name),
+        ("leaderboard", f"{name}.toml"),
+    ):
+        told = mistake(*words)
+        assert "File name too long; check the path, your rights and the free space: xxx" in told
+    assert "--truth names nowhere, where there is no folder" in mistake(
+        "score", "--predictions", path, "--truth", "nowhere"
+    )
+    assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
+
+
+def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) -> None:
+    other = Path(shutil.copytree(run_folder, run_folder.parents[3] / "other" / "x" / SUITE / TOWN))
+    about = rundir.read_run(other)
+    rundir.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"name": "other"}})
+    told = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
+    assert told.endswith("two matchers, versions or settings are never mixed, name the folder of one")
 
 
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:

@@ -6,12 +6,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from sasgeo_bench import tasks
 from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.catalog import find_pipeline_file, list_pipeline_files, read_pipeline_file
-from sasgeo_bench.tasks import made_tasks
+from sasgeo_bench.tasks import ensure_tasks, made_tasks
 from sasgeo_bench.tomlfile import parse_toml
 
 TEXT = """
@@ -29,6 +30,14 @@ sites = 1
 name = "nothing"
 first = "random"
 second = "prior_centre"
+suites = ["clean"]
+"""
+
+MIRRORED = """
+[[contrast]]
+name = "mirrored"
+first = "prior_centre"
+second = "random"
 suites = ["clean"]
 """
 
@@ -99,6 +108,15 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     assert "to be drawn" not in plan.to_text()
 
 
+def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
+    request = made[0].requests[0]
+    folders = made_tasks(request)
+    found = iter((None, folders))
+    monkeypatch.setattr(tasks, "made_tasks", lambda _: next(found))
+    monkeypatch.setattr(tasks, "_make_tasks", None)
+    assert ensure_tasks(request, tell=lambda _: None) == folders
+
+
 @pytest.mark.parametrize(
     "changes",
     [{"sites = 1": "sites = 2"}, {"crossfit": "holdout"}, {"title": "seed = 1\ntitle"}],
@@ -143,6 +161,15 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
             "matcher 'random' is listed twice",
         ),
         ({"sites = 1": "sites = 0"}, "greater than or equal to 1"),
+        ({"sites = 1": "sites = -1"}, "greater than or equal to 1, got -1"),
+        ({"sites = 1": "sites = 1000000000"}, "less than or equal to 10000"),
+        ({'suites = ["clean"]\nsites': "suites = []\nsites"}, "at least 1 item"),
+        ({'suites = ["clean"]\nsites': 'suites = ["clean", "clean"]\nsites'}, "suite 'clean' is listed twice"),
+        ({'id = "small"': f'id = "{"x" * 300}"'}, "'id': String should match pattern"),
+        ({'id = "small"': 'id = "../../small"'}, "'id': String should match pattern"),
+        ({'second = "prior_centre"': 'second = "random"'}, "contrast 'nothing' holds 'random' against itself"),
+        ({"[[contrast]]": MIRRORED + "[[contrast]]"}, "contrasts 'mirrored' and 'nothing' compare the same"),
+        ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),

@@ -16,6 +16,7 @@ _ESCAPED: Final = {
     **{letter: rf"\{letter}" for letter in "_%&#${}"},
     "<": "$<$",
     ">": "$>$",
+    "|": "$|$",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "\\": r"\textbackslash{}",

@@ -156,6 +156,28 @@ def side_by_side(make: Callable[[Item], Iterable[Row]], items: Iterable[Item]) -
         return [row for rows in pool.map(lambda item: list(make(item)), items) for row in rows]
 
 
+def name_alone(matcher: str) -> str:
+    """Name of a contestant without the version and hash that it bears beside another of its name.
+
+    Examples
+    --------
+    >>> name_alone("random 1 (c85212)"), name_alone("random")
+    ('random', 'random')
+    """
+    return matcher.partition(" ")[0]
+
+
+def is_unranked(matcher: str) -> bool:
+    """Whether a contestant is a control, of whatever version.
+
+    Examples
+    --------
+    >>> is_unranked("oracle_pose 1 (c85212)"), is_unranked("raster_uniform")
+    (True, False)
+    """
+    return name_alone(matcher) in UNRANKED
+
+
 def bare(value: float) -> Interval:
     """A figure without an interval."""
     return Interval(value=value, lo=math.nan, hi=math.nan)
@@ -196,5 +218,5 @@ def with_contestants(board: pd.DataFrame, contestants: Mapping[str, tuple[str, s
     board = board.copy()
     for at, name in enumerate(("version", "hash")):
         board.insert(1 + at, name, [contestants[matcher][at] or None for matcher in board["matcher"]])
-    board.insert(3, "is_control", board["matcher"].isin(UNRANKED))
+    board.insert(3, "is_control", board["matcher"].map(is_unranked).astype(bool))
     return board

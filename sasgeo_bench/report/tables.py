@@ -20,7 +20,7 @@ from sasgeo_bench.metrics.intervals import Interval, bootstrap_means, effective_
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
-from sasgeo_bench.report.rows import UNRANKED, Row, Told, bare, side_by_side, to_frame
+from sasgeo_bench.report.rows import Row, Told, bare, is_unranked, side_by_side, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
 from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
@@ -267,7 +267,7 @@ def _ranked(
 
 def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
     """Rank intervals of all but the controls."""
-    chosen = [at for at, name in enumerate(names) if name not in UNRANKED]
+    chosen = [at for at, name in enumerate(names) if not is_unranked(name)]
     if not chosen:
         return {}
     better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
@@ -276,8 +276,8 @@ def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure
 
 def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Ints) -> float:
     """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
-    others = [at for at, other in enumerate(names) if other != name and other not in UNRANKED]
-    if not others or name in UNRANKED:
+    others = [at for at, other in enumerate(names) if other != name and not is_unranked(other)]
+    if not others or is_unranked(name):
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable

@@ -14,7 +14,7 @@ from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
-from sasgeo_bench.report.rows import ALL_SUITES, UNRANKED
+from sasgeo_bench.report.rows import ALL_SUITES, is_unranked
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 
 _INTEGRITY: Final = (
@@ -155,7 +155,7 @@ def _number(value: float) -> str:
 def _rank(row: pd.Series) -> str:
     """A rank or ranks that cannot be told apart; controls have none."""
     if pd.isna(row["rank_best"]):
-        return "control" if row["matcher"] in UNRANKED else "-"
+        return "control" if is_unranked(row["matcher"]) else "-"
     return RankInterval(best=int(row["rank_best"]), worst=int(row["rank_worst"])).text
 
 
@@ -305,11 +305,21 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
 
 
 def markdown_table(table: pd.DataFrame) -> Iterator[str]:
-    """Lines of a table."""
-    yield "| " + " | ".join(map(str, table.columns)) + " |"
+    r"""Lines of a table; what a cell holds can neither end it nor begin a tag.
+
+    Examples
+    --------
+    >>> list(markdown_table(pd.DataFrame({"matcher": ["mine 1|2"]})))[-1]
+    '| mine 1\\|2 |'
+    """
+    yield "| " + " | ".join(map(_cell_text, table.columns)) + " |"
     yield "|" + "---|" * len(table.columns)
     for row in table.itertuples(index=False):
-        yield "| " + " | ".join(map(str, row)) + " |"
+        yield "| " + " | ".join(map(_cell_text, row)) + " |"
+
+
+def _cell_text(value: object) -> str:
+    return str(value).replace("|", r"\|").replace("<", "&lt;")
 
 
 def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple[str, pd.DataFrame]]:

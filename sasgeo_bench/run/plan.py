@@ -155,7 +155,11 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str]:
     with Worker(spec=request.spec, reach=reach_of(request, None), limits=request.limits) as worker:
         reply = worker.load()
     if reply.status != "ok" or reply.card is None:
-        raise MatchError(reply.message or f"{request.spec}: the plugin says nothing of itself")
+        said = reply.message or "the plugin says nothing of itself"
+        raise MatchError(said if request.spec in said else f"{request.spec}: cannot be made ({said})")
+    if reply.card.name == ORACLE:
+        message = f"{request.spec}: card: {ORACLE!r} is the name of a control of the runner, choose another one"
+        raise MatchError(message)
     return reply.card, reply.code
 
 

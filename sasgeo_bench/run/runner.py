@@ -5,10 +5,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
@@ -18,6 +19,7 @@ from sasgeo_bench.store.regiondir import locked
 
 TOLD_S: Final = 10.0
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
+_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earlier runs took, as run.json says it
 
 Tell = Callable[[str], None]
 
@@ -118,7 +120,9 @@ def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progres
     for batch in _batches(by_map(plan.request.spec, parts)):
         with ExitStack() as locks:
             _lock(locks, batch, tell)
-            costs.append(answer(plan, batch, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
+            left = _still_left(plan, batch)
+            if left:
+                costs.append(answer(plan, left, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
     return costs
 
 
@@ -138,6 +142,17 @@ def _lock(locks: ExitStack, parts: Sequence[RunPart], tell: Tell) -> None:
     """Hold the folders of some tasks; all runs lock them in one order, so that no two wait for each other."""
     for folder in sorted({part.folder for part in parts}):
         locks.enter_context(locked(folder, tell=tell))
+
+
+def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
+    """What nobody has answered while the locks were waited for; tasks of which nothing is left are gone."""
+    found = []
+    for part in parts:
+        done = rundir.ids_done(part.folder, again=plan.request.again) if part.folder.is_dir() else set()
+        left = tuple(name for name in part.left if name not in done)
+        if left:
+            found.append(replace(part, left=left))
+    return found
 
 
 class _Notes(Watch):
@@ -165,11 +180,12 @@ class _Notes(Watch):
 
 def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
     """Ask the queries of all tasks on a cluster at once."""
-    costs: list[list[Cost]] = [[] for _ in parts]
-    left = [len(part.left) for part in parts]
+    costs: list[list[Cost]] = []
     with ExitStack() as locks:
         client = locks.enter_context(connected(address))
         _lock(locks, parts, tell)
+        parts = _still_left(plan, parts)
+        costs, left = [[] for _ in parts], [len(part.left) for part in parts]
         before = [_begin(plan, part, progress) for part in parts]
         for number, count, cost in answer_on(client, plan, parts):
             costs[number].append(cost)
@@ -184,6 +200,11 @@ def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
     """Say that a task begins; what earlier runs of it took."""
     progress.begin(str(part.folder), len(part.left))
     said = rundir.read_run(part.folder) or {}
+    wrong = next((name for name in _COSTS if not isinstance(said.get(name), int | float | None)), None)
+    if wrong is not None:
+        path = part.folder / rundir.RUN
+        message = f"{path} is damaged ({wrong} is no number): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
     before = Cost(
         prepare_s=said.get("prepare_s"),
         index_bytes=said.get("index_bytes"),

@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from sasgeo_bench.store.taskrows import POSE_FIELDS, poses_of
 
 RUN: Final = "run.json"
 SCHEMA_VERSION: Final = 1
+_PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 _CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
 PREDICTION_SCHEMA: Final = pa.schema(
     [
@@ -84,7 +86,7 @@ def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
     StoreError
         If the disk is full or the folder cannot be written; what was there before is as it was.
     """
-    name = f"part-{time.time_ns():020d}-{os.getpid()}"
+    name = f"part-{_stamp_ns(folder):020d}-{os.getpid()}"
     scratch, path = folder / f".{name}.partial", folder / f"{name}.parquet"
     table = pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=PREDICTION_SCHEMA)
     try:
@@ -99,6 +101,12 @@ def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
         )
         raise StoreError(message) from error
     return path
+
+
+def _stamp_ns(folder: Path) -> int:
+    """Now, or just after the last part where a clock was set back: the later name is the newer row."""
+    before = (_PART.fullmatch(path.name) for path in folder.glob("part-*.parquet"))
+    return max(time.time_ns(), 1 + max((int(found[1]) for found in before if found), default=0))
 
 
 def _remove(path: Path) -> None:
@@ -140,8 +148,9 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
     seen: set[str] = set()
     for part in reversed(parts):
         table = read_part(part)
-        if differing_columns(table):
-            message = f"{part} holds no predictions: 'validate' says what is missing"
+        for name, found, expected in differing_columns(table):
+            fault = f"{name}: found {found}, expected {expected}"[:200]
+            message = f"{part} holds no predictions ({fault}): 'validate' lists all that is missing"
             raise StoreError(message)
         for prediction in _sound(table) or _one_by_one(part, table, seen):
             if prediction.query_id not in seen:
@@ -201,7 +210,9 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
     [('message', 'nothing', 'string')]
     """
     found = {field.name: field.type for field in table.schema}
-    return [
+    counts = {field: table.schema.names.count(field.name) for field in PREDICTION_SCHEMA}
+    twice = [(field.name, f"{count} columns", str(field.type)) for field, count in counts.items() if count > 1]
+    return twice or [
         (field.name, str(found.get(field.name, "nothing")), str(field.type))
         for field in PREDICTION_SCHEMA
         if field.name not in found or not _is_like(found[field.name], field.type)
@@ -223,8 +234,8 @@ def _is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
 
 
 def _has_fields(found: pa.StructType, wanted: pa.StructType) -> bool:
-    names = {field.name for field in found}
-    return all(field.name in names and _is_like(found.field(field.name).type, field.type) for field in wanted)
+    names = [field.name for field in found]
+    return all(names.count(field.name) == 1 and _is_like(found.field(field.name).type, field.type) for field in wanted)
 
 
 def read_part(path: Path) -> pa.Table:
@@ -256,7 +267,7 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
         If there are none, the folders are of different matchers, versions or settings, a file cannot be read, or the
         new one cannot be written.
     """
-    _check_one_matcher(runs)
+    check_one_matcher(runs)
     if into.exists() and not _is_ours(into):
         message = f"{into} is no predictions file and would be lost: name another one"
         raise StoreError(message)
@@ -278,8 +289,18 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
     return len(rows)
 
 
-def _check_one_matcher(runs: Sequence[Path]) -> None:
-    """Refuse folders whose `run.json` say different things of who answered; files say nothing of it."""
+def check_one_matcher(runs: Sequence[Path]) -> None:
+    """Refuse folders whose `run.json` say different things of who answered; files say nothing of it.
+
+    Raises
+    ------
+    StoreError
+        If two folders are of different matchers, versions or settings, or a `run.json` is damaged.
+
+    Examples
+    --------
+    >>> check_one_matcher([Path("mine.parquet")])
+    """
     folders = [run.parent for path in runs if path.is_dir() for run in sorted(path.rglob(RUN))]
     said = [(path, read_run(path)) for path in folders]
     known = [(path, about) for path, about in said if about is not None]
@@ -288,7 +309,7 @@ def _check_one_matcher(runs: Sequence[Path]) -> None:
         if about.get("hash") != other.get("hash"):
             message = (
                 f"{path} holds answers of {_who(about)}, {first} those of {_who(other)}: "
-                "two matchers, versions or settings are never mixed"
+                "two matchers, versions or settings are never mixed, name the folder of one"
             )
             raise StoreError(message)
 

@@ -291,6 +291,25 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert len(warnings_of(board)) == 2
 
 
+def test_two_versions_of_a_control_are_controls_both():
+    names = ("oracle_pose 1 (aaaaaa)", "oracle_pose 1 (bbbbbb)", "mine")
+    board = leaderboard({name: scores([1.0, 99.0] * 10, blocks=6) for name in names}, draws=200)
+    found = {name: ranks(pick(board, name, "success_25m")) for name in names}
+    assert found == {names[0]: (None, None), names[1]: (None, None), "mine": (1, 1)}
+    ((_, short),) = summary(board)
+    assert sorted(cell.partition("] ")[2] for cell in short["occlusion, n = 20"]) == ["(1)", "(control)", "(control)"]
+
+
+def test_no_name_breaks_a_table():
+    name = r"mine 1|2 <b> \$ {x} ~ ^"
+    board = leaderboard({name: scores([1.0, 99.0])}, draws=200)
+    (row,) = (line for line in board_markdown(board, ABOUT).splitlines() if "mine 1" in line)
+    assert r"mine 1\|2 &lt;b>" in row
+    assert row.replace(r"\|", "").count("|") == 10
+    expected = r"mine 1$|$2 $<$b$>$ \textbackslash{}\$ \{x\} \textasciitilde{} \textasciicircum{}"
+    assert expected in board_latex(board, ABOUT)
+
+
 def test_the_board_says_what_each_of_its_columns_is():
     tables = {"mine": scores([1.0, 99.0] * 20, confidence=[0.9, 0.1] * 20, is_present=[True] * 30 + [False] * 10)}
     tables["mine"]["is_right"] &= tables["mine"]["is_present"]

@@ -85,6 +85,13 @@ def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
     assert len(table(folder)) == 5
 
 
+def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
+    plans = [plan_run(request_of(task, tmp_path, limit=count)) for count in (2, 2, 3)]
+    reports = [run(plan, tell=lambda _: None) for plan in plans]
+    assert [report.counts for report in reports] == [{"ok": 2}, {}, {"ok": 1}]
+    assert sum(len(rundir.read_part(part)) for part in rundir.parts_of(plans[0].parts[0].folder)) == 3
+
+
 def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, name="Raises", limit=2))
     assert {item.status for item in table(folder)} == {"crash"}
@@ -196,6 +203,7 @@ def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path):
         ({"jobs": 0}, ConfigError, "--jobs must be at least 1"),
         ({"top_k": 0}, ConfigError, "--top-k must be at least 1"),
         ({"spec": "hostile:NoCard"}, MatchError, "card is a NoneType"),
+        ({"spec": "hostile:ClaimsToBeTheOracle"}, MatchError, "'oracle_pose' is the name of a control of the runner"),
         ({"spec": "no_such_matcher"}, MatchError, "there is no matcher"),
         ({"spec": "no_such_module:Class"}, MatchError, "cannot be imported"),
     ],

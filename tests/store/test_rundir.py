@@ -2,6 +2,7 @@
 """A run on disk: rows that are read as they were written, whoever wrote them; what is wrong with a file, in a line."""
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -76,10 +77,30 @@ def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_ar
         (column, _, _) = rundir.differing_columns(table)[0]
         assert column == name
         path = write(table, "part-1.parquet")
-        assert "holds no predictions: 'validate' says what is missing" in refusal(everything, path)
+        assert f"part-1.parquet holds no predictions ({name}: found " in refusal(everything, path)
         assert "holds no predictions" in refusal(rundir.merge_runs, [path], tmp_path / "new.parquet")
         assert "move it out of the run's folder" in refusal(rundir.ids_done, tmp_path)
     assert not (tmp_path / "new.parquet").exists()
+
+
+@pytest.mark.parametrize("name", ["query_id", "confidence"])
+def test_a_column_that_is_there_twice_is_refused(rows, write, name):
+    path = write(rows.append_column(name, rows[name]))
+    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'validate'" in refusal(
+        everything, path
+    )
+    same = pa.array([[]] * 2, type=pa.list_(pa.struct([*rows.schema.field("candidates").type.value_type] * 2)))
+    assert "(candidates: found list<" in refusal(everything, write(with_column(rows, "candidates", same)))
+
+
+def test_where_a_clock_was_set_back_the_row_that_was_written_last_still_counts(tmp_path, monkeypatch):
+    late = replace(FAILED, status="timeout", message="too late")
+    for now_ns, row in ((2_000, late), (1_000, FAILED), (1_500, replace(FAILED, status="ok", message=""))):
+        monkeypatch.setattr(rundir.time, "time_ns", lambda now_ns=now_ns: now_ns)
+        rundir.write_part(tmp_path / "run", [row])
+    assert [item.status for item in everything(tmp_path / "run")] == ["ok"]
+    assert len(rundir.parts_of(tmp_path / "run")) == 3
+    assert rundir.ids_done(tmp_path / "run") == {"a"}
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
+import platform
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,18 +16,19 @@ from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scor
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, counted
 from sasgeo_bench.matcher import check_name
 from sasgeo_bench.metrics.cost import run_cost
-from sasgeo_bench.metrics.intervals import DRAWS
-from sasgeo_bench.plugins import load_rejector
+from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import DATA_VERSION
+from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
-from sasgeo_bench.report.rejection import OWN, judge, own_word
-from sasgeo_bench.report.rows import to_frame
-from sasgeo_bench.report.tables import is_unranked, leaderboard
-from sasgeo_bench.report.text import board_latex, board_markdown
+from sasgeo_bench.report.latex import board_latex
+from sasgeo_bench.report.rejection import OWN, judge, own_word, rules_of, why_not
+from sasgeo_bench.report.rows import is_unranked, to_frame, with_contestants
+from sasgeo_bench.report.tables import leaderboard
+from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
@@ -35,12 +37,13 @@ from sasgeo_bench.store.boardfile import Extra, check_board, write_board
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
-Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 REPRODUCED: Final = "reproduced"
 AS_SUBMITTED: Final = "as submitted"
 MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+_LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+_CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
 _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
 
@@ -71,6 +74,8 @@ class ScoreRequest:
         Of the bootstrap.
     by_region : collection of str
         Suites whose regions are resampled, not their blocks: those of which each region is a draw of its own.
+    pipeline : mapping of str to str
+        Name and hash of the pipeline that asks for it; none for a board of `score`.
     extras : sequence of callable
         Each makes, of the finished board, files that are written with it.
     """
@@ -85,6 +90,7 @@ class ScoreRequest:
     rejectors: Sequence[str] = ()
     draws: int = DRAWS
     by_region: Collection[str] = ()
+    pipeline: Mapping[str, str] = field(default_factory=dict)
     extras: Sequence[Callable[["Board"], Extra]] = ()
 
 
@@ -243,7 +249,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         If there is nothing to score, or rejectors are asked for without a split.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
-    judges = _judges(request)
+    rules = rules_of(request.rejectors, request.split)
     told = _read_told(request, find_entries(request.predictions), tell)
     folders = list(dict.fromkeys(request.tasks)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
@@ -274,15 +280,17 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         if len(own):
             all_judged[entry.name, OWN] = own
             rows.append(to_frame(list(integrity_rows(entry.name, OWN, own))))
-        for name, judged_by in judges.items():
-            judged = judged_by(frame, predictions[entry.name])
+        for name, rule in rules.items():
+            judged = judge(frame, predictions[entry.name], rule.make, rule.split)
             all_judged[entry.name, name] = judged
             if not len(judged):
-                tell(f"{name} on {entry.name}: not applied, no other place of the board calibrates")
+                tell(f"{name} on {entry.name}: not applied, {why_not(frame)}")
             if len(judged):
-                rows.append(to_frame(list(integrity_rows(entry.name, name, judged))))
+                is_calibrated = rule.card.is_calibrated
+                rows.append(to_frame(list(integrity_rows(entry.name, name, judged, is_calibrated=is_calibrated))))
         tell(f"{entry.name}: {_in_words(frame)}")
-    table = pd.concat([item for item in rows if len(item)], ignore_index=True)
+    figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
+    table = with_contestants(figures, {entry.name: (entry.version, entry.hash) for entry in entries})
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
     board = Board(
         entries=entries,
@@ -293,7 +301,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         verdicts=verdicts,
         tasks=tuple(task.about for task in tasks),
     )
-    _write(request, board, [make(board) for make in request.extras])
+    _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
 
 
@@ -332,26 +340,6 @@ def _leaderboards(
         asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
     for names, suites in asked_by.items():
         yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws)
-
-
-def _judges(request: ScoreRequest) -> dict[str, Judge]:
-    """The rejectors by name, each tried once before anything is read."""
-    if not request.rejectors:
-        return {}
-    if request.split is None:
-        message = "rejectors are fitted on the calibration places of a split: name one with --split"
-        raise ConfigError(message)
-    names: dict[str, str] = {}
-    for spec in request.rejectors:
-        name = load_rejector(spec).card.name
-        if names.setdefault(name, spec) != spec:
-            message = f"{names[name]} and {spec} are both named {name!r}: rename one, or leave it out"
-            raise ConfigError(message)
-    if OWN in names:
-        message = f"{names[OWN]}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
-        raise ConfigError(message)
-    makers = {name: partial(load_rejector, spec) for name, spec in names.items()}
-    return {name: partial(judge, make=make, split=request.split) for name, make in makers.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -467,15 +455,18 @@ def _scored(told: _Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> 
     return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 
-def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra]) -> None:
+def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
     about = {
         "scorer_version": SCORER_VERSION,
         "task_version": TASK_VERSION,
         "data_version": DATA_VERSION,
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
+        "libraries": _libraries(),
+        "pipeline": dict(request.pipeline) or None,
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
         "by_region": sorted(request.by_region),
+        "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "entries": [
             {
                 "name": entry.name,
@@ -510,8 +501,17 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra]) -> None
         },
         texts={
             "leaderboard.md": board_markdown(board.table, about, board.findings, board.verdicts),
-            "leaderboard.tex": board_latex(board.table, about),
+            "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },
         about=about,
         extras=extras,
     )
+
+
+def _libraries() -> dict[str, str]:
+    """Versions of what figures and fits hang on, Python's among them; of those that are installed."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -20,7 +20,7 @@ from sasgeo_bench.report.paper import (
     trials_frame,
 )
 from sasgeo_bench.report.papertext import paper_markdown
-from sasgeo_bench.report.tables import is_unranked
+from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import Extra
 from sasgeo_bench.store.paperplot import draw_ablation, draw_example, draw_risk, draw_robustness

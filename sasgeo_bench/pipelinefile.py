@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a file in `pipelines/` says: an experiment as data, read before anything is run."""
 
+import hashlib
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
@@ -71,6 +72,11 @@ class PipelineFile(Document):
     top_k: Annotated[int, Field(ge=1, le=1000)] = 25
     match_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     draws: Annotated[int, Field(ge=100, le=100_000)] = 10_000
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all that it says, defaults among it, as `board.json` names it."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:

@@ -83,12 +83,13 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "metrics": (
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
-        *("sequence", "cost", "intervals", "compare", "power"),
+        *("sequence", "cost", "draws", "intervals", "compare", "power"),
     ),
     "validate": None,
     "score": None,
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
+        "latex",
         *("paper", "papertext", "plots", "site"),
     ),
     "boardtasks": None,

@@ -3,6 +3,7 @@
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +20,13 @@ from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.controls import Verdict
+from sasgeo_bench.report.rejection import why_not
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.run.oracle import right_answer
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
+from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.split import SplitFile, make_split
 from sasgeo_bench.store import rundir, taskdir, taskrows
 from sasgeo_bench.store.boardfile import read_board
@@ -44,6 +47,10 @@ class Doubt:
 
     def p_false(self, predictions):
         return np.full(len(predictions), self.rate)
+
+
+class Order(Doubt):
+    card = replace(Doubt.card, name="order", is_calibrated=False)
 
 
 class DoubtToo(Doubt):
@@ -129,9 +136,23 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
     ]
     assert about["attribution"] == "(c) OpenStreetMap contributors, ODbL"
     assert len(table) == len(board.table)
+    assert about["libraries"]["numpy"] == np.__version__
+    assert about["pipeline"] is None
+    assert about["rejectors"] == []
     said = pq.read_schema(out / "boards" / "mine" / "leaderboard.parquet").metadata
-    assert said[b"scorer_version"] == b"1"
+    assert said[b"scorer_version"] == str(SCORER_VERSION).encode()
     assert b"OpenStreetMap" in said[b"attribution"]
+    read = pd.read_parquet(out / "boards" / "mine" / "leaderboard.parquet")
+    assert read.attrs["attribution"] == about["attribution"]
+    assert read.attrs["scorer_version"] == str(SCORER_VERSION)
+    assert set(read.attrs) > {"licence", "task_version", "data_version", "made_by"}
+    assert str(read["rank_best"].dtype) == "Int64"
+    assert read["rank_best"].isna().all()  # of two blocks nobody has a rank
+    facts = read.drop_duplicates("matcher").set_index("matcher")[["version", "hash", "is_control"]]
+    (entry,) = (entry for entry in board.entries if entry.name == "oracle_pose")
+    assert facts.loc["oracle_pose"].tolist() == [entry.version, entry.hash, True]
+    assert facts.loc["mine", ["version", "hash"]].isna().all()
+    assert not facts.loc["mine", "is_control"]
 
 
 def test_predictions_for_half_of_the_queries_are_misses_for_the_rest(out, tmp_path):
@@ -185,6 +206,12 @@ def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_els
 def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_path, split):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, tmp_path / "mine.parquet", rejectors=[f"{__name__}:Doubt"], split=split)
+    asked = {"pipeline": {"id": "mine", "sha256": "0" * 64}, "rejectors": [f"{__name__}:Order"], "split": split}
+    order = board_of(out, tmp_path / "mine.parquet", **asked).table
+    about, _ = read_board(out / "boards" / "mine")
+    assert about["pipeline"] == asked["pipeline"]
+    assert [(card["name"], card["is_calibrated"]) for card in about["rejectors"]] == [("order", False)]
+    assert not {"brier", "cost_20"} & set(order[order["rejector"] == "order"]["metric"])
     rows = board.table[board.table["rejector"] == "doubt"]
     by_name = {row["metric"]: row for _, row in rows[rows["stratum"] == "as drawn"].iterrows()}
     assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was doubted
@@ -194,6 +221,21 @@ def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_
     assert set(board.scores["mine"]["place"]) == {f"place-{town}" for town in TOWNS}
     pooled = rows[rows["suite"] == "all suites"]
     assert {"present 0.9", "present 0.7", "present 0.5"} < set(pooled["stratum"])
+
+
+def test_a_rejector_that_is_not_applied_says_why(out, split):
+    lines = []
+    run(plan_run(RunRequest(spec="random", tasks=[out / "tasks" / "clean" / TOWNS[0]], out=out)), tell=lambda _: None)
+    request = ScoreRequest(
+        predictions=[out / "runs" / "random"], root=out, board=out / "boards" / "mine", draws=200, split=split,
+        rejectors=[f"{__name__}:Doubt"],
+    )  # fmt: skip
+    make_board(request, tell=lines.append)
+    assert "doubt on random: not applied, no other place of the board calibrates" in lines
+    silent = pd.DataFrame({"is_answered": [False] * 2, "place": ["a", "b"]})
+    assert why_not(silent) == "it has no answers to judge"
+    half = pd.DataFrame({"is_answered": [False, True], "place": ["a", "b"]})
+    assert why_not(half) == "no place that may calibrate another one has an answer"
 
 
 def test_the_own_word_of_a_matcher_stands_beside_its_rejectors_and_needs_no_split(out, tmp_path, split):
@@ -290,9 +332,9 @@ def test_a_board_of_another_scorer_version_is_not_replaced(out, monkeypatch):
     board_of(out)
     before = (out / "boards" / "mine" / "leaderboard.parquet").read_bytes()
     board_of(out)  # of the same version it is
-    monkeypatch.setattr(boards, "SCORER_VERSION", 2)
+    monkeypatch.setattr(boards, "SCORER_VERSION", SCORER_VERSION + 1)
     monkeypatch.setattr(boards, "find_entries", None)  # refused before anything is read
-    with pytest.raises(StoreError, match="rows of scorer version 1, this one is 2"):
+    with pytest.raises(StoreError, match=f"rows of scorer version {SCORER_VERSION}, this one is {SCORER_VERSION + 1}"):
         board_of(out)
     assert (out / "boards" / "mine" / "leaderboard.parquet").read_bytes() == before
 
@@ -513,7 +555,7 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
     assert left.value.code == 0
     told = capsys.readouterr()
     assert told.out.splitlines()[-1] == str(out / "boards" / "mine")
-    assert "oracle_pose  1.000 (control)" in told.out
+    assert re.search(r"oracle_pose  1\.000 \[0\.\d\d, 1\.00\] \(control\)", told.out)
     assert "fewer than 36 in 12" in told.err
     assert sorted(path.name for path in Path(told.out.splitlines()[-1]).iterdir()) == [
         "board.json",

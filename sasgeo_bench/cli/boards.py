@@ -12,7 +12,7 @@ from rich.table import Table
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.metrics.intervals import DRAWS
+from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.split import Split, make_split

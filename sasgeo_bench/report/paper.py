@@ -17,8 +17,8 @@ from sasgeo_bench.metrics.intervals import Interval, wilson_mean
 from sasgeo_bench.metrics.ranking import hits, reciprocal_ranks
 from sasgeo_bench.query import Truth
 from sasgeo_bench.report.measures import ranks_of
+from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.report.strata import ALL
-from sasgeo_bench.report.tables import is_unranked
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import NOT_APPLICABLE
 

@@ -19,6 +19,7 @@ LEADERBOARD: Final = "leaderboard"
 SCORES: Final = "scores"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
+_VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
 _KNOWN: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
     *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
@@ -76,7 +77,8 @@ def write_board(
         written; an older board is then as it was.
     """
     check_board(folder, scorer_version=int(about["scorer_version"]))
-    said = {"attribution": ATTRIBUTION, "licence": LICENCE, "scorer_version": str(about["scorer_version"])}
+    versions = {name: str(about[name]) for name in _VERSIONS if name in about}
+    said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
     content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
@@ -97,7 +99,9 @@ def write_board(
 def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
     for name, frame in part.tables.items():
         table = pa.Table.from_pandas(frame, preserve_index=False)
-        pq.write_table(table.replace_schema_metadata(said), folder / f"{name}.parquet", compression="zstd")
+        # pandas gives back types by the key "pandas", and what is said as `attrs` by "PANDAS_ATTRS".
+        about = {**(table.schema.metadata or {}), **said, "PANDAS_ATTRS": json.dumps(said)}
+        pq.write_table(table.replace_schema_metadata(about), folder / f"{name}.parquet", compression="zstd")
     for name, text in part.texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     for name, draw in part.figures.items():

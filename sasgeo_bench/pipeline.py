@@ -287,6 +287,7 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
         rejectors=plan.spec.rejectors,
         contrasts=_contrasts(plan.spec),
         draws=plan.spec.draws,
+        pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
         extras=() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
     )

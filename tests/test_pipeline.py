@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline draws, runs and scores; a second time it does only what is not up to date."""
 
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -84,6 +85,8 @@ def test_every_board_has_controls_and_figures_without_them(made):
     assert set(board.table["suite"]) == {"clean", "all suites"}
     assert "fft_vote" not in set(board.table["matcher"])
     folder = plan.out / "boards" / "small"
+    about = json.loads((folder / "board.json").read_text(encoding="utf-8"))
+    assert about["pipeline"] == {"id": "small", "sha256": plan.spec.sha256}
     assert len(pd.read_parquet(folder / "controls.parquet")) == len(board.verdicts)
     text = (folder / "leaderboard.md").read_text(encoding="utf-8")
     assert f"- Controls: all {len(board.verdicts)} held." in text

@@ -9,6 +9,7 @@ from typing import Final
 import pandas as pd
 
 from sasgeo_bench.boards import Board
+from sasgeo_bench.panels import panels
 from sasgeo_bench.paper.task import DATA, SUITE
 from sasgeo_bench.paper.windows import CANDIDATES
 from sasgeo_bench.query import Truth
@@ -25,7 +26,6 @@ from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import Extra
 from sasgeo_bench.store.paperplot import draw_ablation, draw_example, draw_risk, draw_robustness
 from sasgeo_bench.store.sheet import Panel
-from sasgeo_bench.tasks import panels
 
 KINDS: Final = ("png", "svg")
 CAPTIONS: Final = {

@@ -11,6 +11,7 @@ from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.runrows import differing_columns, prediction_of
 
 _ANSWERED: Final = "ok"
 _NO_ROW: Final = "no row for "
@@ -77,7 +78,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     for file in reversed(files):
         before = frozenset(seen) if path.is_dir() else frozenset()
         table = rundir.read_part(file)
-        differing = rundir.differing_columns(table)
+        differing = differing_columns(table)
         for column, found, expected in differing:
             yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
         unread += bool(differing)
@@ -158,7 +159,7 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Query) -
         yield Violation(file=file, row=row, column="candidates", found=f"null in place {empty}", expected="numbers")
         return
     try:
-        prediction = rundir.prediction_of(item)
+        prediction = prediction_of(item)
         match = Match(
             poses=[pose for pose, _ in prediction.candidates],
             scores=[score for _, score in prediction.candidates],

@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench import boards, cli
-from sasgeo_bench.boards import ScoreRequest, find_entries, make_board
+from sasgeo_bench.boards import ScoreRequest, make_board
+from sasgeo_bench.entries import find_entries
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast

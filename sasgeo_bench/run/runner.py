@@ -14,7 +14,7 @@ from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
 from sasgeo_bench.run.plan import MOST_LINES, RunPart, RunPlan, by_map
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store import rundir, runrows, taskdir
 from sasgeo_bench.store.regiondir import locked
 
 TOLD_S: Final = 10.0
@@ -237,7 +237,7 @@ def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     rundir.write_run(
         part.folder,
         {
-            "schema_version": rundir.SCHEMA_VERSION,
+            "schema_version": runrows.SCHEMA_VERSION,
             "matcher": asdict(plan.card),
             "spec": plan.request.spec,
             "hash": plan.hash,

@@ -12,7 +12,7 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.store import rundir
+from sasgeo_bench.store import rundir, runrows
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
 FULL = Prediction(
@@ -71,10 +71,10 @@ def test_more_columns_other_orders_and_like_types_are_read_too(rows, write):
     assert {item.latency_s for item in everything(write(nothing))} == {None}
 
 
-@pytest.mark.parametrize("name", rundir.PREDICTION_SCHEMA.names)
+@pytest.mark.parametrize("name", runrows.PREDICTION_SCHEMA.names)
 def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_are_read(tmp_path, rows, write, name):
     for table in (rows.drop_columns([name]), with_column(rows, name, pa.array([[True], [False]]))):
-        (column, _, _) = rundir.differing_columns(table)[0]
+        (column, _, _) = runrows.differing_columns(table)[0]
         assert column == name
         path = write(table, "part-1.parquet")
         assert f"part-1.parquet holds no predictions ({name}: found " in refusal(everything, path)
@@ -118,7 +118,7 @@ def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words
     row = rows.to_pylist()[0]
     if name == "candidates":
         value = [item and row["candidates"][0] | item for item in value]
-    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=rundir.PREDICTION_SCHEMA)
+    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=runrows.PREDICTION_SCHEMA)
     pq.write_table(table, tmp_path / "mine.parquet")
     told = refusal(everything, tmp_path / "mine.parquet")
     assert "mine.parquet, row 1, is no prediction (" in told

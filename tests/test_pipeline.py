@@ -304,3 +304,19 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
     plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
     assert plan.requests or plan.spec.paper is not None
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "may_differ"),
+    [
+        ("towns", "leaderboard", {"id", "title", "regions"}),
+        ("paper-poc", "paper-poc-20", {"id", "title", "paper"}),
+    ],
+)
+def test_a_rehearsal_asks_what_the_experiment_asks(small, large, may_differ):
+    one, other = (read_pipeline_file(find_pipeline_file(name)).model_dump() for name in (small, large))
+    for said in (one, other):
+        for item in said["task"]:
+            item.pop("sites")
+    assert {name for name in one if one[name] != other[name]} <= may_differ
+    assert one["contrast"]

@@ -23,7 +23,7 @@ import numpy as np
 from sasgeo_bench.boards import ScoreRequest, make_board
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.grid import Grid
-from sasgeo_bench.metrics.intervals import DRAWS
+from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import Head, Query, Truth
 from sasgeo_bench.report.contrasts import Contrast

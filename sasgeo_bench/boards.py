@@ -1,44 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
-import re
+import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from importlib.metadata import version
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 
+from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scored_task
+from sasgeo_bench.entries import AS_SUBMITTED, Entry, find_entries
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.metrics.intervals import DRAWS
-from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.query import CONTROLS, TASK_VERSION, Head, Truth
+from sasgeo_bench.metrics.draws import DRAWS
+from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import DATA_VERSION
+from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
-from sasgeo_bench.report.rejection import OWN, judge, own_word
-from sasgeo_bench.report.rows import to_frame
+from sasgeo_bench.report.latex import board_latex
+from sasgeo_bench.report.rejection import OWN, judge, own_word, rules_of, why_not
+from sasgeo_bench.report.rows import to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.report.text import board_latex, board_markdown
+from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import Extra, check_board, write_board
-from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
-Judge = Callable[[pd.DataFrame, Mapping[str, Prediction]], pd.DataFrame]
 
-FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-M2_PER_KM2: Final = 1e6
-REPRODUCED: Final = "reproduced"
-AS_SUBMITTED: Final = "as submitted"
+MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+_LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+_CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,8 @@ class ScoreRequest:
     predictions : sequence of Path
         Folders of runs (any folder with runs in it), and files of predictions.
     tasks : sequence of Path
-        Task folders; without any, those that the runs and files answer.
+        Task folders; without any, those that the runs and files answer. A matcher that was asked nothing of one of them
+        has no figures on its suite.
     root : Path
         Where tasks/ and truth/ are.
     truth : Path, optional
@@ -67,6 +68,8 @@ class ScoreRequest:
         Of the bootstrap.
     by_region : collection of str
         Suites whose regions are resampled, not their blocks: those of which each region is a draw of its own.
+    pipeline : mapping of str to str
+        Name and hash of the pipeline that asks for it; none for a board of `score`.
     extras : sequence of callable
         Each makes, of the finished board, files that are written with it.
     """
@@ -81,22 +84,8 @@ class ScoreRequest:
     rejectors: Sequence[str] = ()
     draws: int = DRAWS
     by_region: Collection[str] = ()
+    pipeline: Mapping[str, str] = field(default_factory=dict)
     extras: Sequence[Callable[["Board"], Extra]] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One contestant: a matcher as it was run, or a file of predictions.
-
-    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them.
-    """
-
-    name: str
-    version: str
-    hash: str
-    how: str
-    sources: tuple[Path, ...]
-    runs: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,74 +99,6 @@ class Board:
     findings: tuple[Finding, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     tasks: tuple[dict[str, Any], ...] = field(default=())
-
-
-def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
-    """Who is to be scored.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Folders with runs somewhere in them, and files of predictions.
-
-    Returns
-    -------
-    tuple of Entry
-        By name; two versions of one matcher are two entries, with the version in their names, and with the hash where
-        that is the same.
-
-    Raises
-    ------
-    StoreError
-        If a path holds no predictions.
-    ConfigError
-        If two files have one name.
-    """
-    by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
-    files: list[Entry] = []
-    for path in paths:
-        if path.is_file():
-            if not FILE_NAME.fullmatch(path.stem):
-                message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
-                raise ConfigError(message)
-            files.append(Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,)))
-            continue
-        found = sorted(path.rglob(rundir.RUN))
-        if not found:
-            message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
-            raise StoreError(message)
-        for run in found:
-            about = rundir.read_run(run.parent)
-            if about is not None:
-                card = about["matcher"]
-                by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
-    names = [name for name, _, _ in by_run]
-    versions = [(name, number) for name, number, _ in by_run]
-
-    def shown(name: str, number: str, digest: str) -> str:
-        """As short as it can be and still be one contestant's alone."""
-        if names.count(name) == 1:
-            return name
-        return f"{name} {number}" if versions.count((name, number)) == 1 else f"{name} {number} ({digest[:6]})"
-
-    entries = [
-        Entry(
-            name=shown(name, number, digest),
-            version=number,
-            hash=digest,
-            how=REPRODUCED,
-            sources=tuple(folder for folder, _ in found),
-            runs=tuple(about for _, about in found),
-        )
-        for (name, number, digest), found in by_run.items()
-    ]
-    entries += files
-    listed = [entry.name for entry in entries]
-    twice = next((name for name in listed if listed.count(name) > 1), None)
-    if twice is not None:
-        message = f"two contestants are named {twice!r}: rename the file of one"
-        raise ConfigError(message)
-    return tuple(sorted(entries, key=lambda entry: entry.name))
 
 
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
@@ -198,33 +119,33 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     Raises
     ------
     StoreError
-        If predictions, tasks or truths are missing, damaged, or of other versions; nothing is written.
+        If predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by itself
+        answers none of the queries; nothing is written.
     ConfigError
         If there is nothing to score, or rejectors are asked for without a split.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
-    judges = _judges(request)
-    entries = find_entries(request.predictions)
-    predictions = {entry.name: _predictions(entry) for entry in entries}
-    folders = list(request.tasks) or list(_answered(entries, predictions, request.root))
-    if not folders:
+    rules = rules_of(request.rejectors, request.split)
+    told = _read_told(request, find_entries(request.predictions), tell)
+    folders = list(dict.fromkeys(request.tasks)) or sorted({folder for item in told for folder in item.held})
+    tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
+    for item in told:
+        if item.entry.how == AS_SUBMITTED:
+            _check_file(item.entry.sources[0], folders)
+    everything = {item.entry.name: _scored(item, tasks, request) for item in told}
+    predictions = {item.entry.name: item.predictions for item in told}
+    verdicts = hold_controls(everything)
+    whole = _asked_whole(told, tasks, tell)
+    scores = {name: _ranked(frame, whole[name]) for name, frame in everything.items()}
+    scores = {name: frame for name, frame in scores.items() if len(frame)}
+    entries = tuple(item.entry for item in told if item.entry.name in scores)
+    if not scores:
         message = (
-            f"there is nothing to score: no task in {request.root / 'tasks'} is answered "
-            "(--out names another root, --tasks the tasks themselves)"
+            f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
+            "its tasks (--tasks names some)"
         )
         raise ConfigError(message)
-    tasks = [_read_task(folder, request.truth or request.root / "truth") for folder in folders]
-    for entry in entries:
-        if entry.how == AS_SUBMITTED:
-            _check_file(entry.sources[0], folders)
-    everything = {entry.name: _scored(entry, predictions[entry.name], tasks, request) for entry in entries}
-    verdicts = hold_controls(everything)
-    entries = tuple(entry for entry in entries if not _is_for_controls(entry))
-    scores = {entry.name: _ranked(everything[entry.name]) for entry in entries}
-    if not any(map(len, scores.values())):
-        message = f"there is nothing to rank: only queries of the suite {CONTROLS!r} are answered"
-        raise ConfigError(message)
-    rows = [leaderboard(scores, draws=request.draws)]
+    rows = list(_leaderboards(scores, whole, request.draws))
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
     areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
@@ -235,15 +156,17 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         if len(own):
             all_judged[entry.name, OWN] = own
             rows.append(to_frame(list(integrity_rows(entry.name, OWN, own))))
-        for name, judged_by in judges.items():
-            judged = judged_by(frame, predictions[entry.name])
+        for name, rule in rules.items():
+            judged = judge(frame, predictions[entry.name], rule.make, rule.split)
             all_judged[entry.name, name] = judged
             if not len(judged):
-                tell(f"{name} on {entry.name}: not applied, no other place of the board calibrates")
+                tell(f"{name} on {entry.name}: not applied, {why_not(frame)}")
             if len(judged):
-                rows.append(to_frame(list(integrity_rows(entry.name, name, judged))))
-        tell(f"{entry.name}: {int(frame['is_answered'].sum())} of {len(frame)} queries answered")
-    table = pd.concat([item for item in rows if len(item)], ignore_index=True)
+                is_calibrated = rule.card.is_calibrated
+                rows.append(to_frame(list(integrity_rows(entry.name, name, judged, is_calibrated=is_calibrated))))
+        tell(f"{entry.name}: {_in_words(frame)}")
+    figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
+    table = with_contestants(figures, {entry.name: (entry.version, entry.hash) for entry in entries})
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
     board = Board(
         entries=entries,
@@ -254,56 +177,136 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         verdicts=verdicts,
         tasks=tuple(task.about for task in tasks),
     )
-    _write(request, board, [make(board) for make in request.extras])
+    _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
 
 
-def _is_for_controls(entry: Entry) -> bool:
-    """Whether a matcher was run on the controls alone, as the reference of a board is."""
-    return bool(entry.runs) and all(about["suite"] == CONTROLS for about in entry.runs)
+def _in_words(scores: pd.DataFrame) -> str:
+    """How many queries of a contestant have a fix, and what became of the others."""
+    answered = scores["is_answered"].to_numpy(bool)
+    rest = scores.loc[~answered, "status"].replace("ok", "withheld").value_counts()
+    others = "".join(f", {count} {status}" for status, count in sorted(rest.items()))
+    return f"{int(answered.sum())} of {len(scores)} queries answered{others}"
 
 
-def _ranked(scores: pd.DataFrame) -> pd.DataFrame:
-    """Scored rows that make figures."""
-    return scores[~is_control(scores)].reset_index(drop=True)
+def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
+    """Scored rows that make figures: those of some suites, and of no control."""
+    return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
 
 
-def _judges(request: ScoreRequest) -> dict[str, Judge]:
-    """The rejectors by name, each tried once before anything is read."""
-    if not request.rejectors:
-        return {}
-    if request.split is None:
-        message = "rejectors are fitted on the calibration places of a split: name one with --split"
+def _asked_whole(told: Sequence["_Told"], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
+    """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
+    suites = {task.about["suite"] for task in tasks}
+    found = {}
+    for item in told:
+        spared = {task.about["suite"] for task in tasks if task.folder not in item.asked}
+        found[item.entry.name] = frozenset(suites - spared)
+        lost = sorted({task.about["suite"] for task in tasks if task.folder in item.asked} & spared - {CONTROLS})
+        if lost:
+            tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
+    return found
+
+
+def _leaderboards(
+    scores: Mapping[str, pd.DataFrame], whole: Mapping[str, Collection[str]], draws: int
+) -> Iterator[pd.DataFrame]:
+    """Figures of suites by those who were asked all of them: in most cases one table of everything."""
+    asked_by: dict[tuple[str, ...], set[str]] = {}
+    for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
+        asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
+    for names, suites in asked_by.items():
+        yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Told:
+    """One contestant and its answers to the tasks of a board.
+
+    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
+    file is asked all tasks, and brings those that it holds an answer to. `entry` has only the runs that count.
+    """
+
+    entry: Entry
+    predictions: dict[str, Prediction]
+    held: frozenset[Path]
+    asked: frozenset[Path]
+
+
+def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> list[_Told]:
+    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves."""
+    files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
+    folders = list(request.tasks) or _named(entries, request.root)
+    folders = list(dict.fromkeys([*folders, *(() if request.tasks else held_tasks(files.values(), request.root))]))
+    tasks = [AskedTask.of(folder) for folder in folders]
+    told: list[_Told] = []
+    stale: list[Path] = []
+    for entry in entries:
+        if entry.runs:
+            item, others = _read_runs(entry, tasks)
+            stale += others
+        else:
+            rows = files[entry.name]
+            held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
+            item = _Told(entry=entry, predictions=rows, held=held, asked=frozenset(folders))
+        if item.asked:
+            told.append(item)
+    named = next((source for source in stale if source in request.predictions), None)
+    if named is not None or (stale and not told):
+        holder = "these tasks do" if request.tasks else "its task does"
+        message = (
+            f"{named or stale[0]} holds answers to other queries than {holder} now: "
+            "run again (what is answered already is kept), or make the old queries again"
+        )
+        raise StoreError(message)
+    if not told:
+        message = (
+            f"there is nothing to score: no task in {request.root / 'tasks'} is answered "
+            "(--out names another root, --tasks the tasks themselves)"
+        )
         raise ConfigError(message)
-    names = {load_rejector(spec).card.name: spec for spec in request.rejectors}
-    if OWN in names:
-        message = f"{names[OWN]}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
-        raise ConfigError(message)
-    makers = {name: partial(load_rejector, spec) for name, spec in names.items()}
-    return {name: partial(judge, make=make, split=request.split) for name, make in makers.items()}
+    if stale:
+        listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
+        tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
+    return told
 
 
-def _predictions(entry: Entry) -> dict[str, Prediction]:
-    return {item.query_id: item for source in entry.sources for item in _rows_of(source)}
+def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
+    return {item.query_id: item for source in entry.sources for item in rundir.read_predictions(source)}
 
 
-def _rows_of(source: Path) -> Iterator[Prediction]:
-    if source.is_dir() and not rundir.parts_of(source):
-        return  # a run that was cut off before its first row: all of its queries are missing
-    yield from rundir.read_predictions(source)
+def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[_Told, list[Path]]:
+    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
+    by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
+    rows: dict[str, Prediction] = {}
+    runs: list[tuple[Path, Mapping[str, Any]]] = []
+    asked: set[Path] = set()
+    stale: list[Path] = []
+    for source, about in zip(entry.sources, entry.runs, strict=True):
+        task = by_name.get((about["suite"], about["region"]))
+        is_same = task is not None and about["queries_sha256"] == task.about["files"][taskdir.QUERIES]["sha256"]
+        found = rundir.Answers({}, 0) if task is None else rundir.read_answers(source, task.asked, is_tied=is_same)
+        if task is None or not (found.found or is_same):
+            stale.append(source)
+            continue
+        rows |= found.found
+        asked.add(task.folder)
+        runs.append((source, _share_of(about, found)))
+    mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
+    return _Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
 
 
-def _answered(
-    entries: Sequence[Entry], predictions: Mapping[str, Mapping[str, Prediction]], root: Path
-) -> Iterator[Path]:
-    """Task folders that runs were made on, and of which files hold an answer."""
-    named = {(about["suite"], about["region"]) for entry in entries for about in entry.runs}
-    held = {name for entry in entries if not entry.runs for name in predictions[entry.name]}
-    for path in sorted((root / "tasks").glob(f"*/*/{taskdir.TASK}")):
-        folder = path.parent
-        is_named = (folder.parent.name, folder.name) in named
-        if is_named or (held and not held.isdisjoint(taskdir.read_ids(folder))):
-            yield folder
+def _share_of(about: Mapping[str, Any], answers: rundir.Answers) -> Mapping[str, Any]:
+    """What a run took, of its processor seconds the share of the answers that count."""
+    if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
+        return about
+    return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
+
+
+def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
+    """Task folders that runs were made on."""
+    names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
+    folders = [root / "tasks" / suite / region for suite, region in names]
+    return [folder for folder in folders if (folder / taskdir.TASK).is_file()]
 
 
 def _check_file(path: Path, folders: Sequence[Path]) -> None:
@@ -314,80 +317,32 @@ def _check_file(path: Path, folders: Sequence[Path]) -> None:
         raise ConfigError(message)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Task:
-    """A task as it is scored: read once, for all contestants."""
-
-    folder: Path
-    about: dict[str, Any]
-    heads: tuple[Head, ...]
-    truths: tuple[Truth, ...]
-    view_bytes: dict[str, int]
-    area_km2: float | None
-
-
-def _read_task(folder: Path, root: Path) -> _Task:
-    """A task and its truths from their own root, after they were held against each other."""
-    about = taskdir.read_task(folder)
-    truth = root / str(about["suite"]) / str(about["region"])
-    taskdir.check_truths(folder, truth)
-    heads, truths = tuple(taskdir.read_heads(folder)), tuple(taskdir.read_truths(truth))
-    return _Task(
-        folder=folder,
-        about=about,
-        heads=heads,
-        truths=truths,
-        view_bytes=taskdir.read_view_bytes(folder),
-        area_km2=_area_km2(folder.resolve().parents[2] / "regions" / about["region"]),
-    )
-
-
-def _area_km2(region: Path) -> float | None:
-    """Mapped area of a region; None where it is not beside the tasks, for scores need no map."""
-    try:
-        manifest = read_manifest(region)
-    except StoreError:
-        return None
-    west, south, east, north = manifest.bounds_m
-    return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
-
-
-def _folder_of(entry: Entry, about: Mapping[str, Any]) -> Path:
-    """Where a run holds its answers to a task."""
-    same = [(run["suite"], run["region"]) == (about["suite"], about["region"]) for run in entry.runs]
-    return entry.sources[same.index(True)]
-
-
-def _scored(
-    entry: Entry, predictions: Mapping[str, Prediction], tasks: Sequence[_Task], request: ScoreRequest
-) -> pd.DataFrame:
-    """All tasks of one contestant, one row for each query."""
-    ran_on = {(about["suite"], about["region"]): about["queries_sha256"] for about in entry.runs}
+def _scored(told: _Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> pd.DataFrame:
+    """All tasks that one contestant was asked, one row for each query."""
     place_of = {} if request.split is None else request.split.place_of
     frames = []
     for task in tasks:
-        asked = ran_on.get((task.about["suite"], task.about["region"]))
-        if asked is not None and asked != task.about["files"][taskdir.QUERIES]["sha256"]:
-            message = (
-                f"{_folder_of(entry, task.about)} holds answers to other queries than {task.folder} does now: "
-                "move it away and run again, or make the old queries again"
-            )
-            raise StoreError(message)
-        mine = {head.query_id: predictions[head.query_id] for head in task.heads if head.query_id in predictions}
+        if task.folder not in told.asked:
+            continue
+        names = [head.query_id for head in task.heads]
+        mine = {name: told.predictions[name] for name in names if name in told.predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)
         frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in request.by_region else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 
-def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra]) -> None:
+def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
     about = {
         "scorer_version": SCORER_VERSION,
         "task_version": TASK_VERSION,
         "data_version": DATA_VERSION,
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
+        "libraries": _libraries(),
+        "pipeline": dict(request.pipeline) or None,
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
         "by_region": sorted(request.by_region),
+        "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "entries": [
             {
                 "name": entry.name,
@@ -422,8 +377,17 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra]) -> None
         },
         texts={
             "leaderboard.md": board_markdown(board.table, about, board.findings, board.verdicts),
-            "leaderboard.tex": board_latex(board.table, about),
+            "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },
         about=about,
         extras=extras,
     )
+
+
+def _libraries() -> dict[str, str]:
+    """Versions of what figures and fits hang on, Python's among them; of those that are installed."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -17,7 +17,7 @@ from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, Va
 from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, least_apart_m, mine
 
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
-LEAST_CANDIDATES: Final = 4  # where a map holds fewer that keep their distance there is no retrieval
+LEAST_CANDIDATES: Final = 4  # the truth among them: where fewer places keep their distance there is no retrieval
 _SAMPLES: Final = 256
 _GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # a turn that never comes back to itself: evenly spread points
 _TURNS: Final = 72
@@ -69,7 +69,7 @@ class Drawer:
         return self.seeds.under("site", site.index)
 
     def can_draw(self, job: Job) -> bool:
-        """Whether there are enough decoys: with a handful of candidates a retrieval query decides nothing."""
+        """Whether there are enough candidates: with a handful of candidates a retrieval query decides nothing."""
         if job.track != "retrieval":
             return True
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))

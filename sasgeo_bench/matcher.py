@@ -204,8 +204,10 @@ def check_match(match: object, query: Query, *, top_k: int) -> Match:
 
 def _number(value: object, name: str) -> float:
     try:
+        if isinstance(value, str | bytes):
+            raise TypeError(value)  # noqa: TRY301 - Python reads "0.5" as a number, the door does not
         number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         message = f"{name} is a {type(value).__name__}, expected a number"
         raise MatchError(message) from error
     if not math.isfinite(number):

@@ -9,6 +9,7 @@ from typing import Final
 import pandas as pd
 
 from sasgeo_bench.boards import Board
+from sasgeo_bench.panels import panels
 from sasgeo_bench.paper.task import DATA, SUITE
 from sasgeo_bench.paper.windows import CANDIDATES
 from sasgeo_bench.query import Truth
@@ -20,12 +21,11 @@ from sasgeo_bench.report.paper import (
     trials_frame,
 )
 from sasgeo_bench.report.papertext import paper_markdown
-from sasgeo_bench.report.tables import UNRANKED
+from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import Extra
 from sasgeo_bench.store.paperplot import draw_ablation, draw_example, draw_risk, draw_robustness
 from sasgeo_bench.store.sheet import Panel
-from sasgeo_bench.tasks import panels
 
 KINDS: Final = ("png", "svg")
 CAPTIONS: Final = {
@@ -89,7 +89,7 @@ def _example(region: str, truths: list[Truth], root: Path) -> Panel:
 
 def _ablation(summary: pd.DataFrame) -> pd.DataFrame:
     """Rows of the ablation: over seeds where there are several, else as if trials were independent."""
-    rows = summary[(summary["metric"] == "recall_1") & ~summary["matcher"].isin(UNRANKED) & summary["value"].notna()]
+    rows = summary[(summary["metric"] == "recall_1") & ~summary["matcher"].map(is_unranked) & summary["value"].notna()]
     if (rows["cluster"] == "tile").all():
         return rows.assign(how="Wilson's 95 % intervals, trials taken for independent")
     how = f"95 % intervals by resampling {rows['clusters'].max()} seeds, then trials within each"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline file -> queries, runs and a board; what is up to date is not done again."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -8,8 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.paper import made_paper_task, make_paper_task
+from sasgeo_bench.paper.task import region_name
 from sasgeo_bench.paperboard import paper_extra
 from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.plugins import check_names
@@ -19,7 +21,8 @@ from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
-from sasgeo_bench.tasks import made_tasks, make_tasks
+from sasgeo_bench.store import rundir
+from sasgeo_bench.tasks import ensure_tasks, is_of_region, made_tasks, why_to_draw
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
@@ -27,7 +30,7 @@ CONTROL_SPLIT: Final = "crossfit"
 CONTROL_SITES: Final = 8
 CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
 REFERENCE: Final = "fft_vote"  # on the controls of every board
-MOST_LINES: Final = 6  # of what could not be drawn; the rest is counted
+MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is counted
 
 Tell = Callable[[str], None]
 
@@ -44,18 +47,18 @@ class PipelinePlan:
     dask: str | None = None
 
     def to_text(self) -> str:
-        """A line for each stage, with what of it is up to date."""
-        made = [made_tasks(request) is not None for request in self.requests]
+        """What of each stage is up to date; every matcher is loaded to find out what it was asked.
+
+        Raises
+        ------
+        MatchError, StoreError
+            As the run would.
+        """
+        queries, controls = _stage("queries", self.requests), _stage("controls", self.controls)
+        stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
         lines = [f"{self.spec.id}: {self.spec.title}"]
-        if made:
-            lines.append(f"  queries: {len(made)} suites on regions, {sum(made)} of them up to date")
-        lines += [
-            f"    {request.suite} on {request.region.id}: {'up to date' if done else 'to be drawn'}"
-            for request, done in zip(self.requests, made, strict=True)
-        ]
-        lines += _paper_lines(self)
-        lines.append(f"  controls: on {', '.join(request.region.id for request in self.controls)}")
-        lines.append(f"  run: {', '.join(self.matchers)}; {REFERENCE} on the controls")
+        lines += [line for stage in stages for line in stage.lines()]
+        lines += _run_lines(self, stages, controls)
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
         lines.append(f"  board: {board_folder(self)}")
         return "\n".join(lines)
@@ -66,16 +69,101 @@ class PipelinePlan:
         return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
 
 
-def _paper_lines(plan: PipelinePlan) -> list[str]:
-    """A line for each seed of the paper's experiment."""
+@dataclass(frozen=True, kw_only=True)
+class _Lacking:
+    """A task that is to be drawn, and why."""
+
+    suite: str
+    region: str
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stage:
+    """Tasks of one kind: folders of those that are up to date, request by request, and what is to be drawn."""
+
+    name: str
+    made: tuple[tuple[Path, ...], ...]
+    lacking: tuple[_Lacking, ...]
+
+    def lines(self) -> list[str]:
+        """How many are up to date, why the others are not, and the first of these by name."""
+        state = f"{len(self.made)} of {counted(len(self.made) + len(self.lacking), 'task')} up to date"
+        if self.lacking:
+            reasons = Counter(item.why for item in self.lacking)
+            told = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
+            state = f"{state}, {len(self.lacking)} to be drawn ({told})"
+        lines = [f"  {self.name}: {state}"]
+        lines += [f"    to be drawn: {item.suite} on {item.region}" for item in self.lacking[:MOST_LINES]]
+        more = len(self.lacking) - MOST_LINES
+        return [*lines, f"    and {more} more"] if more > 0 else lines
+
+
+def _stage(name: str, requests: Sequence[Request]) -> _Stage:
+    """What of some requests is up to date."""
+    found = [(request, made_tasks(request)) for request in requests]
+    return _Stage(
+        name=name,
+        made=tuple(made for _, made in found if made is not None),
+        lacking=tuple(
+            _Lacking(suite=request.suite, region=request.region.id, why=why_to_draw(request))
+            for request, made in found
+            if made is None
+        ),
+    )
+
+
+def _paper_stage(plan: PipelinePlan) -> _Stage:
+    """What of the paper's experiment is up to date: a task for each seed."""
     paper = plan.spec.paper
     if paper is None:
-        return []
-    made = [made_paper_task(seed=seed, trials=paper.trials, out=plan.out) is not None for seed in paper.seeds]
-    return [
-        f"  the paper's {paper.trials} trials, seed {seed}: {'up to date' if done else 'to be drawn'}"
-        for seed, done in zip(paper.seeds, made, strict=True)
-    ]
+        return _Stage(name="", made=(), lacking=())
+    found = {seed: made_paper_task(seed=seed, trials=paper.trials, out=plan.out) for seed in paper.seeds}
+    tasks = plan.out / "tasks" / PAPER_SUITE
+    there = {seed: (tasks / region_name(seed)).is_dir() for seed in paper.seeds}
+    return _Stage(
+        name=f"the paper's experiment, {counted(paper.trials, 'trial')} of each seed",
+        made=tuple((made,) for made in found.values() if made is not None),
+        lacking=tuple(
+            _Lacking(
+                suite=PAPER_SUITE,
+                region=region_name(seed),
+                why="drawn otherwise or damaged" if there[seed] else "not there yet",
+            )
+            for seed, made in found.items()
+            if made is None
+        ),
+    )
+
+
+def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -> list[str]:
+    """By matcher what is answered and what is to be asked, and what answers lie with tasks that are drawn anew."""
+    asked = [(spec, list(stages)) for spec in plan.matchers]
+    asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
+    lines, all_done, all_left, all_behind = [], 0, 0, 0
+    for spec, mine in asked:
+        planned = plan_run(_run_request(plan, spec, [task for stage in mine for made in stage.made for task in made]))
+        left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
+        lacking = [item for stage in mine for item in stage.lacking]
+        run_folder = plan.out / "runs" / planned.card.name / planned.hash
+        behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
+        more = f", and what is drawn; {behind} answered there before" if lacking else ""
+        where = " (controls alone)" if mine == [controls] and len(stages) > 1 else ""
+        lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
+        all_done, all_left, all_behind = all_done + done, all_left + left, all_behind + behind
+    lines.insert(0, f"  run: {counted(len(asked), 'matcher')}, {all_done} answered, {all_left} to ask")
+    if all_behind:
+        lines.append(
+            f"    drawing anew leaves {counted(all_behind, 'answer')} where they are: those to the same queries "
+            "count again, the others are set aside"
+        )
+    return lines
+
+
+def _count_rows(run: Path, suite: str, region: str) -> int:
+    """How many answers the folder of a matcher's runs holds to queries of a suite on a region, whenever drawn."""
+    folders = [path for path in (run / suite).glob(f"{region}*") if path.is_dir() and is_of_region(path.name, region)]
+    return sum(len({(tie.query_id, tie.asked) for tie in rundir.read_ties(folder)}) for folder in folders)
 
 
 def board_folder(plan: PipelinePlan) -> Path:
@@ -199,6 +287,7 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
         rejectors=plan.spec.rejectors,
         contrasts=_contrasts(plan.spec),
         draws=plan.spec.draws,
+        pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
         extras=() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
     )
@@ -207,7 +296,16 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
 
 def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress: Progress | None) -> list[Path]:
     """Folders of the runs of one matcher, after whatever had no row was asked."""
-    request = RunRequest(
+    planned = plan_run(_run_request(plan, spec, tasks))
+    left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
+    tell(f"{spec}: {left} queries to ask, {done} answered before")
+    run(planned, tell=tell if left else _silent, progress=progress)
+    return [part.folder for part in planned.parts]
+
+
+def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest:
+    """What one matcher is asked."""
+    return RunRequest(
         spec=spec,
         tasks=tasks,
         out=plan.out,
@@ -216,11 +314,6 @@ def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress:
         jobs=plan.jobs,
         dask=plan.dask,
     )
-    planned = plan_run(request)
-    left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
-    tell(f"{spec}: {left} queries to ask, {done} answered before")
-    run(planned, tell=tell if left else _silent, progress=progress)
-    return [part.folder for part in planned.parts]
 
 
 def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
@@ -228,14 +321,10 @@ def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
     tasks: list[Path] = []
     lacking: list[str] = []
     for request in requests:
-        made = made_tasks(request)
-        if made is None:
-            try:
-                made = tuple(item.folder for item in make_tasks(request, tell=tell))
-            except ConfigError as error:
-                lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
-                continue
-        tasks += made
+        try:
+            tasks += ensure_tasks(request, tell=tell)
+        except ConfigError as error:
+            lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
     for line in lacking[:MOST_LINES]:
         tell(f"left out: {line}")
     if len(lacking) > MOST_LINES:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a file in `pipelines/` says: an experiment as data, read before anything is run."""
 
+import hashlib
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
@@ -10,7 +11,7 @@ from sasgeo_bench.tomlfile import Document
 
 PAPER_SUITE: Final = "paper-poc"
 
-Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
 
 
 class ContrastSpec(Document):
@@ -72,6 +73,11 @@ class PipelineFile(Document):
     match_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     draws: Annotated[int, Field(ge=100, le=100_000)] = 10_000
 
+    @property
+    def sha256(self) -> str:
+        """Hash of all that it says, defaults among it, as `board.json` names it."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:
         if self.rejectors and (self.split is None or not self.task):
@@ -106,6 +112,7 @@ class PipelineFile(Document):
         if CONTROLS in suites:
             message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
             raise ValueError(message)
+        _check_apart(self.contrast)
         for item in self.contrast:
             lost = next((name for name in item.suites if name not in suites), None)
             if lost is not None:
@@ -119,6 +126,20 @@ class PipelineFile(Document):
             if task.prior is not None:
                 PriorGroup.parse(task.prior)
         return self
+
+
+def _check_apart(contrasts: list[ContrastSpec]) -> None:
+    """Refuse a method against itself, and two contrasts of the same: Holm's adjustment would count both."""
+    seen: dict[object, str] = {}
+    for item in contrasts:
+        if item.first == item.second:
+            message = f"contrast {item.name!r} holds {item.first!r} against itself: name two methods"
+            raise ValueError(message)
+        what = (frozenset((item.first, item.second)), frozenset(item.suites), frozenset(item.kinds))
+        before = seen.setdefault((*what, item.metric, item.track), item.name)
+        if before != item.name:
+            message = f"contrasts {before!r} and {item.name!r} compare the same: leave one out"
+            raise ValueError(message)
 
 
 def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import Matcher, MatcherCard
 from sasgeo_bench.rejector import Rejector, RejectorCard
-from sasgeo_bench.results import one_line
+from sasgeo_bench.results import one_line, told
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
@@ -36,8 +36,7 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     try:
         installed = entry_points(group=group)
     except Exception as error:
-        said = one_line(f"{type(error).__name__}: {error}")
-        message = f"an installed package has entry points that cannot be read ({said}): reinstall or remove it"
+        message = f"an installed package has entry points that cannot be read ({told(error)}): reinstall or remove it"
         raise MatchError(message) from error
     points = sorted(installed, key=lambda point: (_home(point) != BUILT_IN, _home(point), point.value))
     for point in points:
@@ -102,12 +101,16 @@ def load_rejector(spec: str) -> Rejector:
 
 def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequence[str]) -> None:
     """Refuse what has not the card and the verbs of its kind."""
-    card = getattr(plugin, "card", None)
+    try:
+        card = getattr(plugin, "card", None)
+        missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
+    except (Exception, SystemExit) as error:
+        message = f"{spec}: its card and verbs cannot be read ({told(error)})"
+        raise MatchError(message) from error
     if not isinstance(card, card_type):
         expected = f"{card_type.__module__}.{card_type.__name__}"
         message = f"{spec}: card is a {type(card).__name__}, expected a {expected}"
         raise MatchError(message)
-    missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
     if missing:
         message = f"{spec}: {type(plugin).__name__} is not a {kind}, it has no {' and no '.join(missing)}"
         raise MatchError(message)
@@ -121,8 +124,8 @@ def _load(spec: str, group: str, kind: str) -> Callable[[], Any]:
         """Make one, telling in a line what went wrong."""
         try:
             return target()
-        except Exception as error:
-            message = f"{spec}: cannot be made ({one_line(f'{type(error).__name__}: {error}')})"
+        except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+            message = f"{spec}: cannot be made ({told(error)})"
             raise MatchError(message) from error
 
     return make
@@ -132,8 +135,8 @@ def _from_module(spec: str) -> Callable[[], Any]:
     module, _, name = spec.partition(":")
     try:
         return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
-    except Exception as error:
-        message = f"{one_line(spec)}: cannot be imported ({one_line(f'{type(error).__name__}: {error}')})"
+    except (Exception, SystemExit) as error:
+        message = f"{one_line(spec)}: cannot be imported ({told(error)})"
         raise MatchError(message) from error
 
 
@@ -169,7 +172,6 @@ def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
     point = _known(name, group, kind)
     try:
         return point.load()  # type: ignore[no-any-return]
-    except Exception as error:
-        said = one_line(f"{type(error).__name__}: {error}")
-        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({said})"
+    except (Exception, SystemExit) as error:
+        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({told(error)})"
         raise MatchError(message) from error

@@ -15,7 +15,13 @@ from sasgeo_bench.results import Prediction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RejectorCard:
-    """What a rejector says of itself; the fields are those of a `MatcherCard`.
+    """What a rejector says of itself; the fields are those of a `MatcherCard`, and one more.
+
+    Parameters
+    ----------
+    is_calibrated : bool
+        False where `p_false` keeps an order alone and is no probability. A board then tells neither Brier score nor
+        calibration error nor costs by Eq. 14: they would judge numbers that claim nothing.
 
     Raises
     ------
@@ -36,6 +42,7 @@ class RejectorCard:
     ours: str
     licence: str
     limits: str = ""
+    is_calibrated: bool = True
 
     def __post_init__(self) -> None:
         """Refuse a card that does not say what a reader of the board needs."""

@@ -57,6 +57,20 @@ def one_line(text: str) -> str:
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 
+def told(error: BaseException) -> str:
+    """What kind of error it is and what it says, in one line; the kind alone where it cannot say anything.
+
+    Examples
+    --------
+    >>> told(ValueError("no index today"))
+    'ValueError: no index today'
+    """
+    try:
+        return one_line(f"{type(error).__name__}: {error}")
+    except Exception:  # noqa: BLE001 - a plugin's own errors may fail at telling of themselves
+        return type(error).__name__
+
+
 def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
     """First 12 hex digits of what makes two runs of a matcher the same: its name, version, code and the run's settings.
 

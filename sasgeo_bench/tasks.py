@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A request -> queries and truths on disk: the order of the steps; and what was made, looked at again."""
+"""A request -> queries and truths on disk: the order of the steps, and whether they still belong together."""
 
 import datetime as dt
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -17,21 +18,18 @@ from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
 from sasgeo_bench.draw import LEAST_CANDIDATES, Drawer, Job
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
-from sasgeo_bench.evidence import Evidence, LayerBits
+from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
-from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import TASK_VERSION, Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
-from sasgeo_bench.store.sheet import Panel
 from sasgeo_bench.suites.all_suites import find_suite
-from sasgeo_bench.suites.base import DRAWN_CLASSES, Scene, Seeds, Site, State, Suite, changed_share
-from sasgeo_bench.suites.mining import describe, mine
+from sasgeo_bench.suites.base import Scene, Seeds, Site, State, Suite
 from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.suites.synthetic_age import ageing_of
 from sasgeo_bench.twin import paste
@@ -67,14 +65,32 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
         If there is no such suite, the count is not positive, the region cannot carry the suite or does not hold so many
         sites; nothing is written.
     """
+    with _locked(request, tell):
+        return _make_tasks(request, tell)
+
+
+def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
+    """Hold a request all the way: a second run of it would change the map that this one draws from."""
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
-    # Held all the way: a second run of the same request would change the map that this one draws from. The lock lies
-    # where maps are built, so that a request that is refused leaves nothing where tasks are.
-    name = f"{request.region.id}+{suite.card.name}.request"
-    with regiondir.locked(request.out / "regions" / name, tell=tell):
-        return _make_tasks(request, suite, tell)
+    # Where maps are built, so that a request that is refused leaves nothing where tasks are.
+    return regiondir.locked(request.out / "regions" / f"{request.region.id}+{suite.card.name}.request", tell=tell)
+
+
+def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
+    """Task folders of a request, drawn unless it has made them before; another run that draws them is waited for.
+
+    Raises
+    ------
+    ConfigError
+        As `make_tasks` does.
+    """
+    made = made_tasks(request)
+    if made is None:
+        with _locked(request, tell):
+            made = made_tasks(request) or tuple(item.folder for item in _make_tasks(request, tell))
+    return made
 
 
 def made_tasks(request: Request) -> tuple[Path, ...] | None:
@@ -99,6 +115,38 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
     return folders if plan.is_current else None
 
 
+def why_to_draw(request: Request) -> str:
+    """In a few words, why a request has to be carried out, where `made_tasks` finds that it has."""
+    suite_folder = request.out / "truth" / request.suite
+    folders = (
+        path
+        for path in sorted(suite_folder.glob(f"{request.region.id}*"))
+        if is_of_region(path.name, request.region.id)
+    )
+    there = [said for said in map(taskdir.read_hidden, folders) if said]
+    if not there:
+        return "not there yet"
+    if any(said.get("request_sha256") == _request_sha256(request) for said in there):
+        return "task, truths or map changed since"
+    if all(said.get("seed") != request.seed for said in there):
+        return "drawn with another seed"
+    counts = [said.get("count") for said in there]
+    if not {request.count, None} & set(counts):
+        return f"drawn with sites = {counts[0]}, now {request.count}"
+    return "drawn by other settings or an older version"
+
+
+def is_of_region(name: str, region: str) -> bool:
+    """Whether a map is that of a region, or of an older date or an edit of it.
+
+    Examples
+    --------
+    >>> [is_of_region(name, "vaduz") for name in ("vaduz", "vaduz@2021-10-28", "vaduz+alias", "vaduz-north")]
+    [True, True, True, False]
+    """
+    return name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0] == region
+
+
 def _request_sha256(request: Request) -> str:
     """Hash of all that decides which queries come of a request."""
     elsewhere = None if request.elsewhere is None else request.elsewhere.model_dump(mode="json")
@@ -115,7 +163,8 @@ def _request_sha256(request: Request) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
-def _make_tasks(request: Request, suite: Suite, tell: Tell) -> tuple[Made, ...]:
+def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
+    suite = find_suite(request.suite)
     if request.group is not None and suite.card.has_own_priors:
         message = f"suite {suite.card.name!r} is about what is known before: leave --prior out"
         raise ConfigError(message)
@@ -259,7 +308,7 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     left = [job for job in jobs if drawer.can_draw(job)]
     if len(left) < len(jobs):
         where = f"{drawer.suite.card.name} on {request.region.id}"
-        tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} decoys")
+        tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} candidates")
     by_map: dict[str, list[Job]] = {}
     if not left:
         raise _too_small(request, drawer.suite)
@@ -267,7 +316,8 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name
     # With the seed anyone could draw the truths again, so it is kept with them.
-    hidden = {"seed": request.seed, "request_sha256": _request_sha256(request), "maps": len(by_map)}
+    hidden: dict[str, Any] = {"seed": request.seed, "count": request.count, "maps": len(by_map)}
+    hidden["request_sha256"] = _request_sha256(request)
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
         made = put_task(map(drawer.draw, own), about, hidden, out=request.out, tell=tell)
@@ -336,7 +386,7 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
         "strength_unit": card.strength_unit,
         "region": region,
         "map_date": state.date.isoformat(),
-        "map_fingerprint": manifest.fingerprint,
+        **taskdir.map_of(manifest),
         "split": spec.id,
         "split_sha256": hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
         "sites": len(sites),
@@ -351,8 +401,8 @@ def check_task(task_folder: Path, *, out: Path) -> list[str]:
     about = taskdir.read_task(task_folder)
     faults = taskdir.task_faults(task_folder, out / "truth" / about["suite"] / about["region"])
     manifest = regiondir.read_manifest(out / "regions" / about["region"])
-    if manifest.fingerprint != about["map_fingerprint"]:
-        faults.append(_built_anew(about["region"]))
+    if not taskdir.is_of_map(about, manifest):
+        faults.append(built_anew(about["region"]))
     return faults
 
 
@@ -363,116 +413,6 @@ def has_truths(task_folder: Path, *, out: Path) -> bool:
     return path.is_file()
 
 
-def _built_anew(region: str) -> str:
+def built_anew(region: str) -> str:
+    """Say that a map is another than the one its queries were drawn on."""
     return f"{region} was built anew since: make the queries again"
-
-
-def panels(
-    task_folder: Path, truth_folder: Path, *, out: Path, count: int = 12, query_id: str | None = None
-) -> tuple[Panel, ...]:
-    """Choose queries of a task for a contact sheet: each kind and strength of a site, site by site.
-
-    Parameters
-    ----------
-    task_folder, truth_folder : Path
-        A task and its truths.
-    out : Path
-        Root with the regions the task searches.
-    count : int
-        At most so many.
-    query_id : str, optional
-        This query alone.
-
-    Raises
-    ------
-    StoreError
-        If a file is missing, the truths are those of other queries, or the map was built anew since.
-    ConfigError
-        If there is no such query.
-    """
-    about = taskdir.read_task(task_folder)
-    region = regiondir.read_region(out / "regions" / about["region"])
-    if region.manifest.fingerprint != about["map_fingerprint"]:
-        raise StoreError(_built_anew(about["region"]))
-    state = State.of(region, name=about["region"])
-    truths = {truth.query_id: truth for truth in taskdir.read_truths(truth_folder)}
-    strangers = StoreError(f"{truth_folder} does not hold the truths of {task_folder}: make the queries again")
-    chosen = _for_sheet(list(truths.values()), count)
-    if query_id is not None:
-        chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
-        if not chosen:
-            message = f"{task_folder} holds no query {query_id!r}"
-            raise ConfigError(message)
-    wanted = {truth.query_id for truth in chosen}
-    queries = {}
-    rivals: dict[Pose, tuple[Pose, ...]] = {}
-    poses = {truth.pose for truth in chosen}
-    for query in taskdir.read_queries(task_folder):
-        truth = truths.get(query.query_id)
-        if truth is None:
-            raise strangers
-        if query.query_id in wanted:
-            queries[query.query_id] = query
-        if query.candidates and truth.pose in poses and truth.pose is not None:
-            rivals.setdefault(truth.pose, _others(query, truth))
-    if wanted != set(queries):
-        raise strangers
-    return tuple(_panel(queries[truth.query_id], truth, state, rivals) for truth in chosen)
-
-
-def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
-    """Queries of as few sites as needed to show every variant, then more; controls first."""
-    first = {truth.pair_id: truth.block for truth in sorted(truths, key=lambda item: item.pair_id)}
-    rank = {"control": 0, "falsifier": 1, "stress": 2}
-    order = sorted(
-        truths, key=lambda item: (list(first).index(item.pair_id), rank[item.role], item.kind, item.strength)
-    )
-    seen: set[tuple[str, float, float]] = set()
-    chosen = []
-    for truth in order:
-        variant = (truth.kind, truth.strength, round(truth.unknown_share, 0) if truth.role == "falsifier" else 0.0)
-        if variant not in seen:
-            seen.add(variant)
-            chosen.append(truth)
-    rest = [truth for truth in order if truth not in chosen]
-    return (chosen + rest)[:count]
-
-
-def _others(query: Query, truth: Truth) -> tuple[Pose, ...]:
-    return tuple(pose for at, pose in enumerate(query.candidates) if at != truth.candidate)
-
-
-def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple[Pose, ...]]) -> Panel:
-    """What the map shows at the truth, and at the candidate that overlaps most with it.
-
-    A query without candidates takes those of another one at the same place, or what is mined where there is none.
-    """
-    if truth.pose is None:
-        return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
-    size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
-
-    def view(pose: Pose) -> Evidence:
-        """What the map shows there, of the classes that were looked for."""
-        return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
-
-    at_truth = view(truth.pose)
-    near = _others(query, truth) or rivals.get(truth.pose, ())
-    places = [(pose.easting_m, pose.northing_m) for pose in near]
-    if not places:
-        center_m, side_m = (truth.pose.easting_m, truth.pose.northing_m), size * cell_m
-        mined = mine(describe(state, side_m=side_m, clear_m=side_m * float(np.sqrt(0.5))), center_m, count=1).points_m
-        places = [(float(x), float(y)) for x, y in mined]
-    views = [view(replace(truth.pose, easting_m=x, northing_m=y)) for x, y in places]
-    hardest = min(views, key=lambda other: changed_share(_drawn(at_truth), _drawn(other)), default=None)
-    return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=hardest)
-
-
-def _drawn(evidence: Evidence) -> Evidence:
-    """What a person looks at: roads, buildings and water, not the ground cover that fills most of a view."""
-    return _only(evidence, [name for name in evidence.classes if name in (*DRAWN_CLASSES, "water", "bridge")])
-
-
-def _only(evidence: Evidence, classes: Sequence[str]) -> Evidence:
-    """Some of the classes of a view, in the order given."""
-    cells = evidence.cells[[evidence.classes.index(name) for name in classes]]
-    return Evidence(classes=tuple(classes), cells=cells, cell_size_m=evidence.cell_size_m)

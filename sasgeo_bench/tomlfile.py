@@ -59,7 +59,7 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     """
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # too many digits or brackets are no error of TOML's own
         message = f"{source}: not valid TOML: {error}"
         raise ConfigError(message) from error
     try:

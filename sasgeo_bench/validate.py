@@ -11,6 +11,7 @@ from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
 from sasgeo_bench.query import Query
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.runrows import differing_columns, prediction_of
 
 _ANSWERED: Final = "ok"
 _NO_ROW: Final = "no row for "
@@ -51,7 +52,8 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     path : Path
         A predictions file, or a run's folder of parts, newest first; there a query may have been asked again.
     tasks : sequence of Path
-        Task folders that it should answer, and no others.
+        Task folders that it should answer, and no others; rows of a run's folder that say they answer something else
+        are passed over (`set_aside` counts them).
 
     Yields
     ------
@@ -61,9 +63,11 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     Raises
     ------
     StoreError
-        If a file cannot be read at all, or a task is of another version.
+        If a file cannot be read at all, a task is of another version, or the folder holds runs of two matchers.
     """
+    rundir.check_one_matcher([path])
     queries = {query.query_id: query for task in tasks for query in _queries(task)}
+    asked = _asked(tasks)
     seen: dict[str, str] = {}
     files = rundir.parts_of(path)
     if not files:
@@ -74,18 +78,37 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     for file in reversed(files):
         before = frozenset(seen) if path.is_dir() else frozenset()
         table = rundir.read_part(file)
-        differing = rundir.differing_columns(table)
+        differing = differing_columns(table)
         for column, found, expected in differing:
             yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
         unread += bool(differing)
         for row, item in enumerate([] if differing else table.to_pylist()):
-            if item["query_id"] not in before:
+            tie = rundir.tie_of(item)
+            is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(asked)
+            if item["query_id"] not in before and not is_aside:
                 yield from _row_faults(file.name, row, item, queries, seen)
     missing = [] if unread else [name for name in queries if name not in seen]
     for name in missing:
         yield Violation(
             file=path.name, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
         )
+
+
+def set_aside(path: Path, tasks: Sequence[Path]) -> int:
+    """How many answers of a run's folder are to queries that the tasks do not hold, or do not hold as they were.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be read.
+    """
+    asked = _asked(tasks)
+    ties = rundir.read_ties(path) if path.is_dir() else []
+    return len({(tie.query_id, tie.asked) for tie in ties if tie.asked and not tie.answers(asked)})
+
+
+def _asked(tasks: Sequence[Path]) -> dict[str, str]:
+    return {name: said for task in tasks for name, said in taskdir.read_asked(task).items()}
 
 
 def _queries(task: Path) -> Iterator[Query]:
@@ -136,7 +159,7 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Query) -
         yield Violation(file=file, row=row, column="candidates", found=f"null in place {empty}", expected="numbers")
         return
     try:
-        prediction = rundir.prediction_of(item)
+        prediction = prediction_of(item)
         match = Match(
             poses=[pose for pose, _ in prediction.candidates],
             scores=[score for _, score in prediction.candidates],

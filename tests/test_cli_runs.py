@@ -204,6 +204,38 @@ def test_several_tasks_are_run_and_validated_at_once(program, out) -> None:
     assert (code, told) == (0, "all.parquet: answers every query of 2 tasks, and nothing else\n")
 
 
+def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_folder, ids, monkeypatch) -> None:
+    monkeypatch.setattr("sasgeo_bench.run.plan.MOST_LINES", 1)
+    monkeypatch.setattr("sasgeo_bench.run.runner.MOST_LINES", 0)
+    other = TASK.parent.parent / "clean" / TOWN
+    more = len(taskdir.read_ids(other))
+    code, told, _ = program(*ORACLE, "--tasks", other, "--dry-run")
+    assert (code, told.splitlines()[1:]) == (
+        0,
+        [
+            f"  {run_folder}: 0 queries left, {len(ids)} done",
+            f"  1 more tasks: {more} queries left, 0 done",
+            f"  all 2 tasks: {more} queries left, {len(ids)} done",
+        ],
+    )
+    code, _, err = program(*ORACLE, "--tasks", other)
+    assert (code, err.splitlines()[0]) == (0, "oracle_pose: nothing left in 1 of 2 tasks")
+
+
+def test_answers_to_what_a_query_was_are_set_aside_by_validate_and_merge(program, mistake, run_folder, ids) -> None:
+    rundir.write_part(run_folder, [Prediction(query_id=ids[0])], asked={ids[0]: "0" * 64})
+    code, told, err = program("validate", "--predictions", run_folder, "--tasks", TASK)
+    assert (code, err) == (0, "")
+    assert told == f"{run_folder}: answers every query of 1 task, 1 answer to other queries set aside\n"
+    code, told, _ = program(*ORACLE, "--dry-run")
+    assert f"0 queries left, {len(ids)} done, 1 answer to other queries set aside" in told
+    words = ("merge", "--runs", run_folder, "--into", "mine.parquet")
+    assert mistake(*words).endswith("name the tasks with --tasks")
+    code, told, _ = program(*words, "--tasks", TASK)
+    assert (code, told) == (0, f"mine.parquet: {len(ids)} predictions\n")
+    assert all(item.candidates or item.query_id != ids[0] for item in rundir.read_predictions(Path("mine.parquet")))
+
+
 @pytest.mark.parametrize("text", ["x", "1", "", "/", "1/", "/2", "-1/2", "1/2/3", "1/2 ", "1.0/2", "one/two", "²/2"])
 def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
     assert f"--shard must be i/n, as in 1/2, got {text!r}" in mistake(*ORACLE, f"--shard={text}")
@@ -286,14 +318,21 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     assert "part-9.parquet holds no predictions: move it out of the run's folder" in mistake(*ORACLE)
     (run_folder / "part-9.parquet").unlink()
     about = run_folder / rundir.RUN
+    sound = rundir.read_run(run_folder)
     for text in ("{", "[]", "null", '"run"'):
         about.write_text(text)
         assert "run.json is damaged: remove it and run again, the parts beside it are kept" in mistake(*ORACLE)
-    about.write_text('{"queries_sha256": "0"}')
-    told = mistake(*ORACLE)
-    assert "holds answers to other queries than" in told
-    assert told.endswith("move it away and run again, or make the old queries again")
+    about.write_text("{}")
+    assert "holds answers of None, not of" in mistake(*ORACLE)
+    about.write_text(json.dumps(sound | {"cpu_s": "long"}))
+    rows = pq.read_table(part)
+    pq.write_table(rows.slice(1), part)
+    assert "run.json is damaged (cpu_s is no number)" in mistake(*ORACLE)
     about.unlink()
+    pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
+    told = mistake(*ORACLE)
+    assert f"{run_folder} holds answers of an older version, and not to the queries that" in told
+    assert told.endswith("move it away and run again")
     about.mkdir()
     part.unlink()
     assert f"{run_folder} cannot be written (" in mistake(*ORACLE)
@@ -326,7 +365,8 @@ def test_what_cannot_be_merged_gets_one_line_and_nothing_is_written(mistake, min
     for file, words in (
         ("nowhere", "nowhere holds no predictions: run a matcher first, or name a predictions file"),
         ("notes.txt", "notes.txt cannot be read ("),
-        (TASK / taskdir.QUERIES, "holds no predictions: 'validate' says what is missing"),
+        (TASK / taskdir.QUERIES, "holds no predictions (candidates: found list"),
+        (TASK / taskdir.TASK, "cannot be read ("),
         (TASK, "holds no predictions"),
     ):
         assert words in mistake("merge", "--runs", rows, "--runs", file, "--into", "new.parquet")
@@ -395,6 +435,30 @@ def test_predictions_for_a_task_of_another_version_are_not_validated(mistake, mi
     told = mistake("validate", "--predictions", path, "--tasks", TASK)
     assert words in told
     assert told.endswith("make the queries again")
+
+
+def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
+    path, name = mine(), "x" * 300
+    for words in (
+        ("score", "--predictions", name),
+        ("validate", "--predictions", name, "--tasks", TASK),
+        ("validate", "--predictions", path, "--tasks", name),
+        ("leaderboard", f"{name}.toml"),
+    ):
+        told = mistake(*words)
+        assert "File name too long; check the path, your rights and the free space: xxx" in told
+    assert "--truth names nowhere, where there is no folder" in mistake(
+        "score", "--predictions", path, "--truth", "nowhere"
+    )
+    assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
+
+
+def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) -> None:
+    other = Path(shutil.copytree(run_folder, run_folder.parents[3] / "other" / "x" / SUITE / TOWN))
+    about = rundir.read_run(other)
+    rundir.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"name": "other"}})
+    told = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
+    assert told.endswith("two matchers, versions or settings are never mixed, name the folder of one")
 
 
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:

@@ -13,6 +13,7 @@ import shapely
 from sasgeo_bench.errors import ConfigError, PerturbError
 from sasgeo_bench.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.layers import OUTSIDE
+from sasgeo_bench.panels import panels
 from sasgeo_bench.paper import made_paper_task, make_paper_task, task
 from sasgeo_bench.paper.task import VERSION, region_name
 from sasgeo_bench.paper.tiles import CLASSES, GAP_M, TILE_M, TILES, draw_tile, mosaic_grid, tile_centre_m
@@ -21,7 +22,7 @@ from sasgeo_bench.paper.windows import CANDIDATES, MARGIN_M, STEP_M, WINDOW_CELL
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.store import regiondir, taskdir, taskrows
 from sasgeo_bench.suites.base import Seeds, State
-from sasgeo_bench.tasks import check_task, panels
+from sasgeo_bench.tasks import check_task
 
 FEW = 4
 DRAWS = 3000

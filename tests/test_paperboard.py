@@ -51,8 +51,8 @@ def made(tmp_path_factory, few_controls):  # noqa: ARG001
 
 def test_trials_are_drawn_once_and_asked_once(made):
     plan, _, one, lines, before = made
-    assert "the paper's 3 trials, seed 43: to be drawn" in before
-    assert "seed 43: up to date" in plan.to_text()
+    assert "3 trials of each seed: 0 of 2 tasks up to date, 2 to be drawn" in before
+    assert "3 trials of each seed: 2 of 2 tasks up to date" in plan.to_text()
     assert "to be drawn" not in plan.to_text() + one.to_text()
     asked = [line.split(",")[0] for line in lines if "to ask" in line]
     assert asked == [f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")]

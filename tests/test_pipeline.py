@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline draws, runs and scores; a second time it does only what is not up to date."""
 
+import json
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from sasgeo_bench import tasks
 from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.catalog import find_pipeline_file, list_pipeline_files, read_pipeline_file
-from sasgeo_bench.tasks import made_tasks
+from sasgeo_bench.tasks import ensure_tasks, made_tasks
 from sasgeo_bench.tomlfile import parse_toml
 
 TEXT = """
@@ -32,6 +34,14 @@ second = "prior_centre"
 suites = ["clean"]
 """
 
+MIRRORED = """
+[[contrast]]
+name = "mirrored"
+first = "prior_centre"
+second = "random"
+suites = ["clean"]
+"""
+
 
 def small(**changes):
     text = TEXT
@@ -44,7 +54,14 @@ def small(**changes):
 def made(tmp_path_factory, few_controls):  # noqa: ARG001
     out = tmp_path_factory.mktemp("pipeline") / "out"
     plan = plan_pipeline(small(), out=out, tell=lambda _: None)
-    assert "to be drawn" in plan.to_text()
+    told = plan.to_text().splitlines()
+    assert told[1:3] == [
+        "  queries: 0 of 1 task up to date, 1 to be drawn (1 not there yet)",
+        "    to be drawn: clean on town-suburb",
+    ]
+    assert told[3] == "  controls: 0 of 1 task up to date, 1 to be drawn (1 not there yet)"
+    assert "  run: 4 matchers, 0 answered, 0 to ask" in told
+    assert "    fft_vote (controls alone): 0 answered, 0 to ask, and what is drawn; 0 answered there before" in told
     lines = []
     return plan, run_pipeline(plan, tell=lines.append), lines
 
@@ -68,6 +85,8 @@ def test_every_board_has_controls_and_figures_without_them(made):
     assert set(board.table["suite"]) == {"clean", "all suites"}
     assert "fft_vote" not in set(board.table["matcher"])
     folder = plan.out / "boards" / "small"
+    about = json.loads((folder / "board.json").read_text(encoding="utf-8"))
+    assert about["pipeline"] == {"id": "small", "sha256": plan.spec.sha256}
     assert len(pd.read_parquet(folder / "controls.parquet")) == len(board.verdicts)
     text = (folder / "leaderboard.md").read_text(encoding="utf-8")
     assert f"- Controls: all {len(board.verdicts)} held." in text
@@ -95,8 +114,48 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
         f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
     ]
     assert again.table.equals(board.table)
-    assert "up to date" in plan.to_text()
-    assert "to be drawn" not in plan.to_text()
+    told = plan.to_text()
+    assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in told
+    count = len(board.scores["random"]) + len(
+        taskdir.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+    )
+    assert f"    random: {count} answered, 0 to ask\n" in told
+    assert "to be drawn" not in told
+
+
+def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_coming(made):
+    plan, board, _ = made
+    changes = {'id = "small"': 'id = "other"\nseed = 1', "sites = 1": "sites = 2"}
+    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    told = other.to_text()
+    assert "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with another seed)\n" in told
+    count = len(board.scores["random"]) + len(
+        taskdir.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+    )
+    assert f"    random: 0 answered, 0 to ask, and what is drawn; {count} answered there before\n" in told
+    assert "answers where they are: those to the same queries count again, the others are set aside\n" in told
+    run_pipeline(other, tell=lambda _: None)
+    assert "1 drawn with sites = 2, now 3" in _more_sites(other).to_text()
+    lines = []
+    again = run_pipeline(plan, tell=lines.append)
+    assert [line for line in lines if "queries to ask" in line and ": 0 queries" not in line] == []
+    for name, frame in board.scores.items():
+        assert again.scores[name].equals(frame)
+
+
+def _more_sites(plan):
+    (task,) = plan.spec.task
+    spec = plan.spec.model_copy(update={"task": [task.model_copy(update={"sites": 3})]})
+    return plan_pipeline(spec, out=plan.out, tell=lambda _: None)
+
+
+def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
+    request = made[0].requests[0]
+    folders = made_tasks(request)
+    found = iter((None, folders))
+    monkeypatch.setattr(tasks, "made_tasks", lambda _: next(found))
+    monkeypatch.setattr(tasks, "_make_tasks", None)
+    assert ensure_tasks(request, tell=lambda _: None) == folders
 
 
 @pytest.mark.parametrize(
@@ -143,6 +202,15 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
             "matcher 'random' is listed twice",
         ),
         ({"sites = 1": "sites = 0"}, "greater than or equal to 1"),
+        ({"sites = 1": "sites = -1"}, "greater than or equal to 1, got -1"),
+        ({"sites = 1": "sites = 1000000000"}, "less than or equal to 10000"),
+        ({'suites = ["clean"]\nsites': "suites = []\nsites"}, "at least 1 item"),
+        ({'suites = ["clean"]\nsites': 'suites = ["clean", "clean"]\nsites'}, "suite 'clean' is listed twice"),
+        ({'id = "small"': f'id = "{"x" * 300}"'}, "'id': String should match pattern"),
+        ({'id = "small"': 'id = "../../small"'}, "'id': String should match pattern"),
+        ({'second = "prior_centre"': 'second = "random"'}, "contrast 'nothing' holds 'random' against itself"),
+        ({"[[contrast]]": MIRRORED + "[[contrast]]"}, "contrasts 'mirrored' and 'nothing' compare the same"),
+        ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
@@ -236,3 +304,19 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
     plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
     assert plan.requests or plan.spec.paper is not None
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "may_differ"),
+    [
+        ("towns", "leaderboard", {"id", "title", "regions"}),
+        ("paper-poc", "paper-poc-20", {"id", "title", "paper"}),
+    ],
+)
+def test_a_rehearsal_asks_what_the_experiment_asks(small, large, may_differ):
+    one, other = (read_pipeline_file(find_pipeline_file(name)).model_dump() for name in (small, large))
+    for said in (one, other):
+        for item in said["task"]:
+            item.pop("sites")
+    assert {name for name in one if one[name] != other[name]} <= may_differ
+    assert one["contrast"]

@@ -39,6 +39,26 @@ class WantsMore(Sound):
         self.weights = weights
 
 
+class Leaves(Sound):
+    def __init__(self):
+        raise SystemExit(0)
+
+
+class CannotTell(Sound):
+    def __init__(self):
+        class Mute(Exception):
+            def __str__(self):
+                raise RuntimeError
+
+        raise Mute
+
+
+class CardRaises(Sound):
+    @property
+    def card(self):
+        raise SystemExit(0)
+
+
 class NoVerbs:
     card = Sound.card
 
@@ -174,6 +194,10 @@ def test_one_matcher_that_two_packages_name_alike_is_no_clash(install) -> None:
         ("mine", "cannot be made (TypeError: 'module' object is not callable)"),
         ("mine:a_number", "cannot be made (TypeError: 'int' object is not callable)"),
         ("mine:Raises", "cannot be made (RuntimeError: no weights here: fetch them first)"),
+        ("leaves:Sound", "cannot be imported (SystemExit: 0)"),
+        ("mine:Leaves", "cannot be made (SystemExit: 0)"),
+        ("mine:CannotTell", "cannot be made (Mute)"),
+        ("mine:CardRaises", "its card and verbs cannot be read (SystemExit: 0)"),
         ("mine:WantsMore", "cannot be made (TypeError: "),
         ("mine:NoVerbs", "NoVerbs is not a matcher, it has no prepare and no match"),
         ("mine:NoMatch", "NoMatch is not a matcher, it has no match"),
@@ -185,7 +209,13 @@ def test_one_matcher_that_two_packages_name_alike_is_no_clash(install) -> None:
 )
 def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, words) -> None:
     own(wrong=value, right="mine:Sound")
-    install("z-broken", {}, broken="def (", raises='raise OSError("weights.bin is\\n missing")')
+    install(
+        "z-broken",
+        {},
+        broken="def (",
+        raises='raise OSError("weights.bin is\\n missing")',
+        leaves="raise SystemExit(0)",
+    )
     told = refusal("wrong")
     assert told.startswith("wrong: ")
     assert words in told
@@ -237,6 +267,7 @@ def test_a_class_of_a_module_needs_no_entry_point(own) -> None:
         ("../mine:Sound", "cannot be imported"),
         ("mine.py:Sound", "cannot be imported"),
         ("mine:Raises", "cannot be made (RuntimeError: no weights here: fetch them first)"),
+        ("mine:Leaves", "cannot be made (SystemExit: 0)"),
         ("mine:NoCard", "card is a NoneType"),
         ("mine:NoVerbs", "it has no prepare and no match"),
         ("json:dumps", "cannot be made"),

@@ -20,10 +20,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.panels import panels
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.store import regiondir
 from sasgeo_bench.store.taskdir import QUERIES, TASK, TRUTH, TRUTH_OF, read_queries, read_task, read_truths, task_faults
-from sasgeo_bench.tasks import check_task, has_truths, make_tasks, panels
+from sasgeo_bench.tasks import check_task, has_truths, make_tasks
 
 RIVERSIDE = "town-riverside"
 PROGRAM = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()"]

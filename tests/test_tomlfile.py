@@ -57,5 +57,10 @@ def test_two_faults_are_both_told():
     assert "zzz" in message
 
 
+@pytest.mark.parametrize("text", ["name = " + "[" * 5000, "name = " + "9" * 5000, "name = \x00", "name"])
+def test_what_the_parser_itself_gives_up_on_is_a_fault_of_the_file(text):
+    assert "not valid TOML: " in fault(text)
+
+
 def test_no_toml_says_so():
     assert "not valid TOML" in fault("name = ")

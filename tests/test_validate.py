@@ -11,7 +11,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store import rundir, runrows, taskdir
 from sasgeo_bench.tasks import make_tasks
 from sasgeo_bench.validate import validate
 
@@ -32,8 +32,8 @@ def answers(task):
 
 def faults(tmp_path, task, predictions):
     path = tmp_path / "mine.parquet"
-    rows = [rundir.prediction_row(item) for item in predictions]
-    pq.write_table(pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA), path)
+    rows = [runrows.prediction_row(item) for item in predictions]
+    pq.write_table(pa.Table.from_pylist(rows, schema=runrows.PREDICTION_SCHEMA), path)
     return [(item.row, item.column, item.found, item.expected) for item in validate(path, [task])]
 
 
@@ -68,10 +68,10 @@ def test_a_fault_is_named_by_its_row_and_column(tmp_path, task, answers, change,
 
 def test_a_pose_without_a_place_is_named(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
-    rows = [rundir.prediction_row(item) for item in answers]
+    rows = [runrows.prediction_row(item) for item in answers]
     rows[1]["candidates"][0]["easting_m"] = float("nan")
     rows[2]["candidates"][0]["score"] = None
-    pq.write_table(pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA), path)
+    pq.write_table(pa.Table.from_pylist(rows, schema=runrows.PREDICTION_SCHEMA), path)
     listed = [(item.row, item.column) for item in validate(path, [task])]
     assert listed == [(1, "candidates"), (2, "candidates")]
     (fault, _) = validate(path, [task])
@@ -87,7 +87,7 @@ def test_missing_and_double_rows_are_named(tmp_path, task, answers):
 
 def test_columns_that_are_missing_or_of_another_kind_are_named(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
-    full = pa.Table.from_pylist([rundir.prediction_row(item) for item in answers], schema=rundir.PREDICTION_SCHEMA)
+    full = pa.Table.from_pylist([runrows.prediction_row(item) for item in answers], schema=runrows.PREDICTION_SCHEMA)
     pq.write_table(full.drop_columns(["confidence"]), path)
     assert ("confidence", "nothing") in [(item.column, item.found) for item in validate(path, [task])]
     pq.write_table(full.set_column(0, "query_id", pa.array(range(len(answers)))), path)
@@ -102,8 +102,8 @@ def test_a_null_where_something_must_stand_is_named(tmp_path, task, answers, cha
 
 def test_more_columns_in_any_order_do_no_harm(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
-    rows = [rundir.prediction_row(item) for item in answers]
-    full = pa.Table.from_pylist(rows, schema=rundir.PREDICTION_SCHEMA)
+    rows = [runrows.prediction_row(item) for item in answers]
+    full = pa.Table.from_pylist(rows, schema=runrows.PREDICTION_SCHEMA)
     pq.write_table(full.select(full.column_names[::-1]).append_column("rank", pa.array(range(len(rows)))), path)
     assert list(validate(path, [task])) == []
     candidates = pa.array([[item | {"rank": 1} for item in row["candidates"]] for row in rows])

@@ -12,7 +12,7 @@ from rich.table import Table
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.metrics.intervals import DRAWS
+from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.split import Split, make_split
@@ -26,7 +26,7 @@ from sasgeo_bench.store.catalog import (
 )
 
 CONTROL_FAILED: Final = 3  # exit status
-BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
 def score_command(  # noqa: PLR0913 - a command has as many flags as its users need
@@ -51,7 +51,10 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
 ) -> None:
     """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
     if not BOARD_NAME.fullmatch(name):
-        message = f"--name must hold letters, digits, hyphens and underscores, got {name!r}"
+        message = f"--name must hold letters, digits, hyphens and underscores, 100 at most, got {name!r}"
+        raise ConfigError(message)
+    if truth is not None and not truth.is_dir():
+        message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
         raise ConfigError(message)
     request = ScoreRequest(
         predictions=predictions,

@@ -62,7 +62,7 @@ def tell(line: str) -> None:
 
 
 class Bars:
-    """Progress of a run as a bar for each task; for a terminal."""
+    """Progress as a bar for each matcher; for a terminal."""
 
     def __init__(self) -> None:
         columns = (
@@ -88,7 +88,7 @@ class Bars:
 
     def begin(self, label: str, total: int) -> None:
         """Add a bar."""
-        self._tasks[label] = self._bars.add_task("/".join(label.split("/")[-2:]), total=total, rate="")
+        self._tasks[label] = self._bars.add_task(label, total=total, rate="")
 
     def advance(self, label: str, count: int) -> None:
         """Move a bar on."""

@@ -10,6 +10,7 @@ from rich.table import Table
 from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, tell
 from sasgeo_bench.duplicates import constellations, search_split
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.panels import panels
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.split import make_split
 from sasgeo_bench.store.catalog import (
@@ -24,7 +25,7 @@ from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
 from sasgeo_bench.store.taskdir import TASK, read_task
 from sasgeo_bench.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks import check_task, has_truths, panels
+from sasgeo_bench.tasks import check_task, has_truths
 
 TOP_DROPS: Final = 12
 

@@ -25,6 +25,7 @@ from sasgeo_bench.cli.regions import build_region_command, list_regions_command
 from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.results import one_line
 
 EXIT_INTERRUPTED: Final = 130
 
@@ -74,16 +75,20 @@ def _warn(
 ) -> None:
     """Print a warning as one line, without where it came from."""
     del category, filename, lineno, file, line
-    errors.print(f"sasgeo-bench: warning: {message}", markup=False)
+    errors.print(f"sasgeo-bench: warning: {one_line(str(message))}", markup=False)
 
 
 def main() -> None:
-    """Run the program: 0 done, 2 the user's mistake on one line, 1 our bug with a traceback."""
+    """Run the program: 0 done, 2 the user's mistake or the disk's refusal on one line, 1 our bug with a traceback."""
     warnings.showwarning = _warn
     try:
         app()
     except SasgeoError as error:
         errors.print(f"sasgeo-bench: {error}", markup=False)
+        sys.exit(EXIT_USER)
+    except OSError as error:  # whatever nobody has put in words of their own, as of a name that is too long
+        said = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
+        errors.print(f"sasgeo-bench: {one_line(said)}", markup=False)
         sys.exit(EXIT_USER)
     except SystemExit as leaving:
         if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word

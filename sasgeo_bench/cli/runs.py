@@ -14,7 +14,8 @@ from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store.rundir import merge_runs
-from sasgeo_bench.validate import validate
+from sasgeo_bench.store.taskdir import read_asked
+from sasgeo_bench.validate import set_aside, validate
 
 MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
@@ -84,9 +85,14 @@ def merge_command(
     *,
     runs: Annotated[list[Path], typer.Option(help="folder of parts, or file; may be repeated")],
     into: Annotated[Path, typer.Option(help="predictions file to write")],
+    tasks: Annotated[
+        list[Path] | None,
+        typer.Option(help="task folder; may be repeated; of folders, answers to these alone; default: all there are"),
+    ] = None,
 ) -> None:
     """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
-    count = merge_runs(runs, into)
+    asked = {name: said for task in tasks or () for name, said in read_asked(task).items()}
+    count = merge_runs(runs, into, asked=asked if tasks else None)
     typer.echo(f"{into}: {counted(count, 'prediction')}")
 
 
@@ -108,4 +114,6 @@ def validate_command(
     if count:
         tell(f"{predictions}: {counted(count, 'violation')}")
         raise typer.Exit(EXIT_USER)
-    typer.echo(f"{predictions}: answers every query of {counted(len(tasks), 'task')}, and nothing else")
+    aside = set_aside(predictions, tasks)
+    rest = f"{counted(aside, 'answer')} to other queries set aside" if aside else "and nothing else"
+    typer.echo(f"{predictions}: answers every query of {counted(len(tasks), 'task')}, {rest}")

@@ -16,6 +16,8 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.metrics.base import Bools, Floats, block_codes, check_column
 from sasgeo_bench.metrics.intervals import LEVEL, percentile_interval
 
+# Fewer blocks rank nobody and decide nothing: an exact test of their signs cannot reach 5 %, 2 / 2^5 being more.
+LEAST_BLOCKS: Final = 6
 _NOTHING: Final = 1e-12  # a difference of means this small is one of rounding
 
 

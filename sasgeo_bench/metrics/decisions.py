@@ -125,8 +125,8 @@ def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | N
 class Outcomes:
     """What a decision led to, each of shape (N,); every query has exactly one.
 
-    A withheld fix is correctly withheld if it would have been false, or if the place is absent; wrongly withheld if it
-    would have been right, or if the place is present and there was no answer.
+    A withheld fix is wrongly withheld if it would have been right. All else that is not accepted is correctly withheld:
+    a false fix, an absent place, and a query without an answer, for there nothing right was withheld (Eq. (13)).
     """
 
     false_fix: Bools
@@ -249,12 +249,11 @@ def outcomes(answers: Answers, accepted: ArrayLike) -> Outcomes:
     if (taken & ~answers.is_answered).any():
         message = "a query without an answer is accepted: decide with accept() or accept_by_cost()"
         raise MetricError(message)
-    would_help = answers.is_right | (answers.is_present & ~answers.is_answered)
     return Outcomes(
         false_fix=taken & ~answers.is_right,
         right_fix=taken & answers.is_right,
-        correctly_withheld=~taken & ~would_help,
-        wrongly_withheld=~taken & would_help,
+        correctly_withheld=~taken & ~answers.is_right,
+        wrongly_withheld=~taken & answers.is_right,
     )
 
 
@@ -273,8 +272,8 @@ def cost_values(
         Cost of a false fix.
     charged : {"right fix", "place"}
         What costs 1 when withheld: a right fix (Eq. (13); it judges the decision, whatever the answers are worth), or
-        every place that is present (it judges the whole method: false answers withheld are still no fixes). By the
-        first alone a matcher that is never right and withholds all would have cost 0.
+        every place that is present (it judges the whole method: false answers withheld, and none, are still no fixes).
+        By the first alone a matcher that is never right and withholds all would have cost 0.
 
     Returns
     -------

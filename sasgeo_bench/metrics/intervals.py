@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure a figure is: Wilson's interval within a region, a bootstrap over blocks and queries across regions.
+"""How sure a figure is: a bootstrap over blocks and sites, never narrower than Wilson's interval of as many sites.
 
 Intervals of the bootstrap are percentile intervals: they keep to the range of the figure, they do not change when the
 figure is mapped monotonically, and the same draws serve every figure and every difference. BCa intervals would need an
 acceleration from leaving out blocks, which with a few dozen blocks of unequal size is noise itself; studentised ones
-would need a standard error within each draw. A percentile interval is somewhat narrow for few blocks; drawing queries
-within drawn blocks as well makes it somewhat wide (Davison and Hinkley 1997, Sec. 3.8), the more so the less queries
-of a block are alike: up to the factor sqrt(2) if they are not alike at all.
+would need a standard error within each draw. A percentile interval is somewhat narrow for few blocks; drawing sites
+within drawn blocks as well makes it somewhat wide (Davison and Hinkley 1997, Sec. 3.8), the more so the less sites
+of a block are alike: up to the factor sqrt(2) if they are not alike at all. Of few sites the draws say too little, and
+where all answers are right nothing: `share_interval` holds them against Wilson's.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
+from numpy.typing import ArrayLike
 from statsmodels.stats.proportion import proportion_confint
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.metrics.base import Floats, Ints, block_codes, check_column, check_weights, weighted_mean
+from sasgeo_bench.metrics.draws import ClusterDraws
 
 LEVEL: Final = 0.95
-DRAWS: Final = 10_000
-_CHUNK_CELLS: Final = 2**21  # draws times queries held at once: 16 MB a column of numbers, some ten columns at most
 
 Statistic = Callable[[Floats], float]
 
@@ -126,145 +126,6 @@ def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None, *, level: f
     return wilson(min(share * trials, trials) if trials else 0.0, trials, level=level)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClusterDraws:
-    """Draws of queries, with replacement: first blocks, then queries within each block as often as it was drawn.
-
-    Parameters
-    ----------
-    blocks : sequence of str or ndarray of int, length N
-        Block of each query. Figures that are to be compared are given for the same queries in the same order.
-    seed : int
-        The same seed, blocks and number of draws give the same draws, whatever is computed from them.
-    draws : int
-        How many.
-    draws_queries : bool
-        False draws whole blocks, with the queries they hold.
-
-    Raises
-    ------
-    MetricError
-        If the number of draws is not positive.
-
-    Notes
-    -----
-    A block of n queries that is drawn c times gives c n queries, each drawn from its n. Numbers of queries differ
-    between draws if blocks differ in size; means are ratios of sums and take that into account.
-
-    Examples
-    --------
-    >>> drawn = ClusterDraws(blocks=["a", "a", "b"], seed=1, draws=1000)
-    >>> weights = np.vstack(list(drawn.weights()))
-    >>> weights.shape, bool((weights.sum(axis=1) >= 2).all()), round(float(weights.mean()), 1)
-    ((1000, 3), True, 1.0)
-    """
-
-    blocks: Sequence[str] | Ints
-    seed: int
-    draws: int = DRAWS
-    draws_queries: bool = True
-    count: int = field(init=False)  # of queries
-    blocks_count: int = field(init=False)
-    _sizes: tuple[tuple[int, Ints, Ints], ...] = field(init=False, repr=False)  # size, blocks (K,), queries (K, size)
-
-    def __post_init__(self) -> None:
-        """Gather blocks of equal size, so that drawing goes by few large steps."""
-        if self.draws < 1:
-            message = f"draws must be at least 1, got {self.draws!r}"
-            raise MetricError(message)
-        sizes, code = block_codes(self.blocks, len(self.blocks))
-        order = np.argsort(code, kind="stable")
-        first = np.cumsum(sizes) - sizes
-        grouped = []
-        for size in np.unique(sizes):
-            same = np.flatnonzero(sizes == size)
-            grouped.append((int(size), same, order[first[same][:, None] + np.arange(size)]))
-        object.__setattr__(self, "count", len(code))
-        object.__setattr__(self, "blocks_count", len(sizes))
-        object.__setattr__(self, "_sizes", tuple(grouped))
-
-    def weights(self) -> Iterator[Floats]:
-        """How often each query is drawn, shape (D, N), some draws at a time; all of them hold `draws` rows."""
-        for rows, parts in self._chunks():
-            drawn = np.empty((rows, self.count))
-            for part in parts:
-                drawn[:, part.queries] = part.weights(rows)
-            yield drawn
-
-    def sums(self, table: Floats) -> Iterator[Floats]:
-        """Sums of the columns of a table, shape (N, M), over the queries of each draw, shape (D, M), some at a time.
-
-        The same as `weights() @ table` to the last digits, and some times faster: no weight is ever written down.
-        """
-        for rows, parts in self._chunks():
-            total = np.zeros((rows, table.shape[1]))
-            for part in parts:
-                total += part.picks(rows) @ table[part.queries]
-            yield total
-
-    def _chunks(self) -> Iterator[tuple[int, Iterator["_Picked"]]]:
-        """How many draws at a time, and what each of them takes from the blocks of each size."""
-        rng = np.random.default_rng(self.seed)
-        step = max(1, _CHUNK_CELLS // max(self.count, 1))
-        for begin in range(0, self.draws if self.count else 0, step):
-            rows = min(step, self.draws - begin)
-            yield rows, self._some(rng, rows)
-
-    def _some(self, rng: np.random.Generator, rows: int) -> Iterator["_Picked"]:
-        """Draw blocks, then queries in them."""
-        blocks = self.blocks_count
-        shifted = rng.integers(0, blocks, size=(rows, blocks))
-        shifted += blocks * np.arange(rows)[:, None]
-        times = np.bincount(shifted.ravel(), minlength=rows * blocks).reshape(rows, blocks)
-        for size, which, queries in self._sizes:
-            copies = times[:, which]
-            if size == 1 or not self.draws_queries:
-                yield _Picked(size=size, queries=queries.ravel(), copies=copies, within=None)
-                continue
-            # Of each draw and block so many queries are drawn from `size`.
-            within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=_small(size))
-            yield _Picked(size=size, queries=queries.ravel(), copies=copies, within=within)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Picked:
-    """What some draws take from K blocks of one size.
-
-    `queries`, shape (K * size,), are those of the blocks, one block after the other; `copies`, shape (D, K), says how
-    often each block is drawn; `within` which of its queries, draw after draw and block after block: each of them as
-    often as its block where it is None.
-    """
-
-    size: int
-    queries: Ints
-    copies: Ints
-    within: NDArray[np.integer] | None
-
-    def weights(self, rows: int) -> Floats:
-        """How often each query is taken, shape (D, K * size)."""
-        if self.within is None:
-            return np.repeat(self.copies, self.size, axis=1).astype(np.float64)
-        cells = self.copies.ravel() * self.size
-        flat = np.repeat(np.arange(len(cells)) * self.size, cells) + self.within
-        return np.bincount(flat, minlength=len(cells) * self.size).reshape(rows, -1).astype(np.float64)
-
-    def picks(self, rows: int) -> csr_array | Floats:
-        """The same, as a table with one entry for each query that is taken."""
-        if self.within is None and self.size > 1:
-            return self.weights(rows)
-        first = np.arange(self.copies.shape[1], dtype=np.int32) * self.size
-        column = np.repeat(np.tile(first, rows), self.copies.ravel() * self.size)
-        if self.within is not None:
-            column += self.within
-        ends = np.concatenate(([0], np.cumsum(self.copies.sum(axis=1) * self.size)))
-        return csr_array((np.ones(len(column)), column, ends), shape=(rows, len(self.queries)))
-
-
-def _small(size: int) -> type[np.uint16] | type[np.uint32]:
-    """Give the type that draws numbers below a size fastest."""
-    return np.uint16 if size <= np.iinfo(np.uint16).max else np.uint32
-
-
 def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Floats:
     """Weighted means of every draw, of one or of several figures.
 
@@ -365,6 +226,105 @@ def percentile_interval(value: float, draws: ArrayLike, *, level: float = LEVEL)
     tail = (1.0 - level) / 2
     lo, hi = np.quantile(column, [tail, 1.0 - tail], method="inverted_cdf")
     return Interval(value=value, lo=float(lo), hi=float(hi))
+
+
+def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = None) -> float:
+    """How many groups of equal mass some queries are worth, as sites.
+
+    Parameters
+    ----------
+    groups : sequence of str or ndarray of int, length N
+        Group of each query.
+    weights : array_like, shape (N,), optional
+        Not negative; a query of weight 0 does not count.
+
+    Returns
+    -------
+    float
+        (sum m)^2 / sum m^2 of the groups' masses m (Kish 1965): their number where all weigh the same; 0 for nothing.
+
+    Examples
+    --------
+    >>> effective_count(["a", "a", "b", "b"]), effective_count(["a", "a", "a", "b"])
+    (2.0, 1.6)
+    """
+    sizes, code = block_codes(groups, len(groups))
+    mass = np.bincount(code, weights=check_weights(weights, len(code)), minlength=len(sizes))
+    squared = float((mass**2).sum())
+    return float(mass.sum()) ** 2 / squared if squared > 0 else 0.0
+
+
+def share_interval(value: float, draws: ArrayLike, trials: float, *, level: float = LEVEL) -> tuple[Interval, str]:
+    """Interval of a figure in [0, 1]: between percentiles of its draws, and never narrower than Wilson's.
+
+    Parameters
+    ----------
+    value : float
+        The figure itself.
+    draws : array_like, shape (D,)
+        The figure of each draw; none for a single block, which says nothing of others.
+    trials : float
+        How many trials the queries are worth at least, as the sites by `effective_count`.
+    level : float
+        In (0, 1).
+
+    Returns
+    -------
+    Interval, str
+        And how it was found: "blocks" where the draws decide both ends, "wilson" where Wilson's lies farther out at
+        one. NaN for a figure that is none.
+
+    Notes
+    -----
+    A mean of values in [0, 1] varies at most as much as a share does, so of as many sites Wilson's is wide enough if
+    blocks add nothing. Draws alone are too narrow for a few sites, and a point where all are right. The wider end of
+    both keeps the order: a method that is right wherever another one is has both ends at least as high.
+
+    Examples
+    --------
+    Four sites that were all found, and four that were all found but for one query of ten at one of them:
+
+    >>> found, how = share_interval(1.0, np.ones(100), 4)
+    >>> round(found.lo, 2), found.hi, how
+    (0.51, 1.0, 'wilson')
+    >>> round(share_interval(0.975, np.array([0.95, 0.975, 1.0]), 4)[0].lo, 2)
+    0.49
+    """
+    if math.isnan(value):
+        return Interval(value=value, lo=value, hi=value), ""
+    exact = wilson(min(max(value * trials, 0.0), trials), trials, level=level)
+    drawn = percentile_interval(value, draws, level=level)
+    ends = Interval(value=value, lo=float(np.fmin(drawn.lo, exact.lo)), hi=float(np.fmax(drawn.hi, exact.hi)))
+    return ends, "blocks" if (ends.lo, ends.hi) == (drawn.lo, drawn.hi) else "wilson"
+
+
+def difference_interval(first: Interval, second: Interval) -> Interval:
+    """Interval of a difference, first less second, from those of both sides.
+
+    Parameters
+    ----------
+    first, second : Interval
+        Of figures that are independent, or vary against each other no more than parts of one whole do.
+
+    Returns
+    -------
+    Interval
+        The distances to the ends, squared and added (Newcombe 1998; Zou and Donner, Statistics in Medicine 2008).
+
+    Examples
+    --------
+    No query of four was won by either of two methods:
+
+    >>> found = difference_interval(wilson(0, 4), wilson(0, 4))
+    >>> found.value, round(found.lo, 2), round(found.hi, 2)
+    (0.0, -0.49, 0.49)
+    """
+    value = first.value - second.value
+    return Interval(
+        value=value,
+        lo=value - math.hypot(first.value - first.lo, second.hi - second.value),
+        hi=value + math.hypot(first.hi - first.value, second.value - second.lo),
+    )
 
 
 def _told(value: float, draws: Callable[[], Floats], drawn: ClusterDraws, level: float) -> Interval:

@@ -187,7 +187,7 @@ def _about(region: Region) -> dict[str, Any]:
         "strength_unit": STRENGTH_UNIT,
         "region": region.manifest.id,
         "map_date": region.manifest.extract.date.isoformat(),
-        "map_fingerprint": region.manifest.fingerprint,
+        **taskdir.map_of(region.manifest),
         "sites": TILES,
         "views_cells": [WINDOW_CELLS],
         "epsg": region.manifest.epsg,

@@ -13,17 +13,24 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.metrics.base import Floats
-from sasgeo_bench.metrics.compare import holm, mcnemar_clustered, mcnemar_exact
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact
 from sasgeo_bench.metrics.decisions import Answers
+from sasgeo_bench.metrics.draws import DRAWS, ClusterDraws
 from sasgeo_bench.metrics.integrity import aurc
-from sasgeo_bench.metrics.intervals import DRAWS, ClusterDraws, mean_difference, statistic_interval
+from sasgeo_bench.metrics.intervals import (
+    Interval,
+    difference_interval,
+    effective_count,
+    mean_difference,
+    statistic_interval,
+    wilson,
+)
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.integrity import SLOW_DRAWS
 from sasgeo_bench.report.measures import primary_of
 from sasgeo_bench.report.rejection import answers_of
 
 ALPHA: Final = 0.05
-LEAST_BLOCKS: Final = 6  # with fewer no test over blocks can reach 5 %, however large the difference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,14 +74,14 @@ class Finding:
     first_value, second_value, difference, lo, hi : float
         Figures of both, first less second, and the paired 95 % interval; NaN where nothing could be drawn.
     n, blocks : int
-        Queries and blocks they are from.
+        Queries and blocks they are from; fewer than `LEAST_BLOCKS` decide nothing.
     first_only, second_only : int
         Discordant queries; 0 for "aurc".
     p_exact, p_clustered, p_holm : float
         McNemar's exact test (queries taken for independent), Obuchowski's for blocks, and that one adjusted by Holm
         over all registered contrasts; of "aurc" the share of draws on the other side of zero, twice.
     detectable : float
-        Least difference these queries would show; NaN for "aurc".
+        Least difference these queries would show; NaN for "aurc", and of too few blocks.
     verdict : str
         In words.
     """
@@ -202,8 +209,11 @@ def _seed(contrast: Contrast) -> int:
 def _means(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
     measure = primary_of(contrast.track)
     ours, theirs = measure.values(first), measure.values(second)
-    blocks = first["block"].tolist()
-    interval = mean_difference(ours, theirs, ClusterDraws(blocks=blocks, seed=_seed(contrast), draws=draws))
+    blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
+    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=draws)
+    apart = ours - theirs
+    sides = (float(np.maximum(apart, 0.0).mean()), float(np.maximum(-apart, 0.0).mean()))
+    interval = _guarded(mean_difference(ours, theirs, drawn), sides, drawn, effective_count(sites))
     won = [(values == 1).astype(float) for values in (ours, theirs)]  # a tie that is shared is no win
     exact, clustered = mcnemar_exact(won[0], won[1]), mcnemar_clustered(won[0], won[1], blocks)
     return replace(
@@ -219,28 +229,41 @@ def _means(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws:
         second_only=exact.second_only,
         p_exact=exact.p_value,
         p_clustered=clustered.p_value,
-        detectable=sensitivity(ours, theirs, blocks).detectable,
+        detectable=sensitivity(ours, theirs, blocks).detectable if len(set(blocks)) >= LEAST_BLOCKS else math.nan,
     )
 
 
 def _areas(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
     ours, theirs = (answers_of(frame) for frame in (first, second))
-    blocks = first["block"].tolist()
-    drawn = ClusterDraws(blocks=blocks, seed=_seed(contrast), draws=SLOW_DRAWS)
+    blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
+    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=SLOW_DRAWS)
     apart = partial(_apart, ours, theirs)
-    interval = statistic_interval(apart, drawn)
     everyone = np.ones(len(first))
+    values = (aurc(ours, everyone), aurc(theirs, everyone))
+    interval = _guarded(statistic_interval(apart, drawn), values, drawn, effective_count(sites))
     return replace(
         _nothing(contrast),
         n=len(first),
         blocks=len(set(blocks)),
-        first_value=aurc(ours, everyone),
-        second_value=aurc(theirs, everyone),
+        first_value=values[0],
+        second_value=values[1],
         difference=interval.value,
         lo=interval.lo,
         hi=interval.hi,
         p_clustered=_p_of_draws(apart, drawn),
     )
+
+
+def _guarded(found: Interval, sides: tuple[float, float], drawn: ClusterDraws, trials: float) -> Interval:
+    """Where draws say little, of few blocks or where nothing varies, no narrower than by Wilson's over sites.
+
+    `sides` are two shares whose difference it is: of queries won and lost, or two areas.
+    """
+    if drawn.blocks_count >= LEAST_BLOCKS and found.lo < found.hi:
+        return found
+    won, lost = (wilson(min(side * trials, trials), trials) for side in sides)
+    wide = difference_interval(won, lost)
+    return Interval(value=found.value, lo=float(np.fmin(found.lo, wide.lo)), hi=float(np.fmax(found.hi, wide.hi)))
 
 
 def _apart(ours: Answers, theirs: Answers, mass: Floats) -> float:

@@ -12,6 +12,7 @@ import pandas as pd
 from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 from sasgeo_bench.report.measures import is_present, primary_of
+from sasgeo_bench.report.rows import name_alone
 from sasgeo_bench.score import FIX_M, MISSING, NOT_APPLICABLE
 
 ORACLE: Final = "oracle_pose"
@@ -91,13 +92,14 @@ def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
     verdicts: list[Verdict] = []
     for matcher, frame in scored.items():
         asked = frame[~frame["status"].isin((MISSING, NOT_APPLICABLE))]
-        if matcher == ORACLE:
+        name = name_alone(matcher)
+        if name == ORACLE:
             verdicts += _perfect(matcher, asked)
             continue
         controls = asked[is_control(asked)]
         verdicts += _by_chance(matcher, controls)
         verdicts += _withheld(matcher, controls)
-        if matcher == REFERENCE:
+        if name == REFERENCE:
             verdicts += _nearly_all(matcher, controls)
     return tuple(sorted(verdicts, key=lambda item: (item.holds, item.control, item.matcher)))
 

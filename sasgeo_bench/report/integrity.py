@@ -12,8 +12,9 @@ import pandas as pd
 from sasgeo_bench.metrics.base import Floats, weighted_mean
 from sasgeo_bench.metrics.calibration import brier, calibration_error
 from sasgeo_bench.metrics.decisions import COST_RATIOS, PRESENT_SHARES, Answers, decision_cost, presence_weights
+from sasgeo_bench.metrics.draws import ClusterDraws
 from sasgeo_bench.metrics.integrity import augrc, aurc, drawn_areas, excess_aurc, false_fix_rate
-from sasgeo_bench.metrics.intervals import ClusterDraws, percentile_interval
+from sasgeo_bench.metrics.intervals import Interval, effective_count, share_interval
 from sasgeo_bench.report.rejection import RISKS, answers_of
 from sasgeo_bench.report.rows import ALL_SUITES, Better, Row, Told, bare, side_by_side
 
@@ -21,6 +22,10 @@ AS_DRAWN: Final = "as drawn"
 COVERAGES: Final = (0.5, 0.8)
 _CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take twice the time
 SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
+
+_AREAS: Final = {"aurc": 1.0, "augrc": 0.5}  # figures that have intervals, and how large they can be
+_OF_CHANCES: Final = ("brier", "ece", "cost_")  # how figures begin that take a confidence for a probability
+_NO_DRAWS: Final = np.empty(0)
 
 Figure = Callable[[Answers, Floats], float]
 
@@ -45,7 +50,7 @@ _FIGURES: Final[tuple[tuple[str, Figure], ...]] = (
 )
 
 
-def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterator[Row]:
+def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
     """Every integrity figure of a matcher with a rejector.
 
     Parameters
@@ -54,6 +59,8 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
         Their names.
     judged : pandas.DataFrame
         From `rejection.judge` or `rejection.own_word`.
+    is_calibrated : bool
+        Whether it gives probabilities; without, there are no figures that judge them.
 
     Yields
     ------
@@ -77,29 +84,41 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame) -> Iterato
         for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
-    yield from side_by_side(lambda item: _rows(*item), parts)
+    figures = [item for item in _FIGURES if is_calibrated or not item[0].startswith(_OF_CHANCES)]
+    yield from side_by_side(lambda item: _rows(*item, figures), parts)
 
 
-def _rows(told: Told, part: pd.DataFrame) -> Iterator[Row]:
+def _rows(told: Told, part: pd.DataFrame, figures: Sequence[tuple[str, Figure]]) -> Iterator[Row]:
     some = answers_of(part)
     # Of the queries alone, so that two rejectors are drawn alike.
     text = f"{told.suite}/{told.track}/{told.prior_group}"
     seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
-    drawn = ClusterDraws(blocks=part["block"].tolist(), seed=seed, draws=SLOW_DRAWS)
+    sites = np.unique(part["pair_id"], return_inverse=True)[1]
+    drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)
     is_pooled = told.suite == ALL_SUITES
     mixtures = dict(_mixtures(some, is_pooled=is_pooled))
     areas = _drawn_areas(some, mixtures, drawn) if is_pooled and drawn.blocks_count > 1 else {}
     shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
     drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
     for stratum, mass in mixtures.items():
-        mine = replace(told, stratum=stratum)
-        for name, figure in _FIGURES:
-            value, draws = figure(some, mass), areas.get((stratum, name))
-            found = bare(value) if draws is None else percentile_interval(value, draws)
-            yield mine.row(name, "1", "lower", found, "blocks")
+        mine, trials = replace(told, stratum=stratum), effective_count(sites, mass)
+        for name, figure in figures:
+            value, most = figure(some, mass), _AREAS.get(name)
+            if is_pooled and most is not None:
+                found, how = _area_interval(value, areas.get((stratum, name), _NO_DRAWS), trials, most)
+                yield mine.row(name, "1", "lower", found, how)
+            else:
+                yield mine.row(name, "1", "lower", bare(value))
         for share in shares[stratum]:
-            found = percentile_interval(weighted_mean(share.counted, share.mass), next(drawn_shares))
-            yield mine.row(share.name, "1", share.better, found, "blocks")
+            value = weighted_mean(share.counted, share.mass)
+            found, how = share_interval(value, next(drawn_shares), effective_count(sites, share.mass))
+            yield mine.row(share.name, "1", share.better, found, how)
+
+
+def _area_interval(value: float, draws: Floats, trials: float, most: float) -> tuple[Interval, str]:
+    """Interval of an area that can be as large as `most`: it is a mean risk, and told as a share of that."""
+    found, how = share_interval(value / most, draws / most, trials)
+    return Interval(value=value, lo=found.lo * most, hi=found.hi * most), how
 
 
 def _drawn_areas(

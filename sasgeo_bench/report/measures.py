@@ -117,9 +117,24 @@ FALSE_ABSENT: Final = Measure(
     values=lambda scores: scores["is_answered"].to_numpy(float),
     counts=is_absent,
 )
+WITHIN: Final = Measure(  # beside the primary figure: what a heading that is off takes away
+    name="within_25m",
+    unit="1",
+    better="higher",
+    values=lambda scores: successes(errors_of(scores), SUCCESS_M[0], 180.0).astype(float),
+    counts=is_present,
+)
+CHANCE: Final = Measure(  # the same for every matcher, so that a board says what guessing is worth
+    name="chance_1",
+    unit="1",
+    better="higher",
+    values=lambda scores: 1.0 / np.maximum(scores["pool"].to_numpy(float), 1.0),
+    counts=is_present,
+)
 MEASURES: Final[dict[str, tuple[Measure, ...]]] = {
     "localization": (
         *map(_success, SUCCESS_M),
+        WITHIN,
         Measure(
             name="success_auc_50m",
             unit="1",
@@ -132,6 +147,7 @@ MEASURES: Final[dict[str, tuple[Measure, ...]]] = {
     ),
     "retrieval": (
         *map(_recall, RECALL_AT),
+        CHANCE,
         Measure(
             name="mrr",
             unit="1",

@@ -17,8 +17,8 @@ from sasgeo_bench.metrics.intervals import Interval, wilson_mean
 from sasgeo_bench.metrics.ranking import hits, reciprocal_ranks
 from sasgeo_bench.query import Truth
 from sasgeo_bench.report.measures import ranks_of
+from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.report.strata import ALL
-from sasgeo_bench.report.tables import UNRANKED
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import NOT_APPLICABLE
 
@@ -63,8 +63,8 @@ def in_order(matchers: Sequence[str]) -> list[str]:
     ['global_descriptor', 'raster_graph', 'mine', 'random']
     """
     known = [item.matcher for item in PUBLISHED if item.matcher in matchers]
-    others = sorted(set(matchers) - set(known) - UNRANKED)
-    return [*known, *others, *sorted(set(matchers) & UNRANKED)]
+    others = sorted(set(matchers) - set(known), key=lambda name: (is_unranked(name), name))
+    return [*known, *others]
 
 
 def title_of(matcher: str) -> str:
@@ -262,7 +262,7 @@ def _contestants(trials: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Trials of each matcher that is no control and can answer."""
     asked = trials[trials["status"] != NOT_APPLICABLE]
     for matcher in in_order(list(dict.fromkeys(asked["matcher"]))):
-        if matcher not in UNRANKED:
+        if not is_unranked(matcher):
             yield matcher, trials[trials["matcher"] == matcher]
 
 

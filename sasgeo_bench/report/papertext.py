@@ -54,11 +54,12 @@ def _interval_note(summary: pd.DataFrame) -> str:
         return (
             "Intervals are 95 %: Wilson's, which take trials for independent, as the paper's do. They are not: those "
             f"of one seed share its tiles. `by tiles` resamples the {first['clusters']} tiles, then trials within "
-            "each. One seed says nothing of others."
+            "each, and is never narrower. One seed says nothing of others."
         )
     return (
-        f"Intervals are 95 %: {first['clusters']} seeds are resampled, then trials within each. `Wilson` takes trials "
-        "for independent; they are not, for those of one seed share its tiles."
+        f"Intervals are 95 %: {first['clusters']} seeds are resampled, then trials within each, and no interval is "
+        "narrower than Wilson's. `Wilson` takes trials for independent; they are not, for those of one seed share its "
+        "tiles."
     )
 
 

@@ -6,17 +6,19 @@ A matcher's own confidence stands beside the rejectors as one that needs no fit.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.metrics.decisions import Answers, accept
 from sasgeo_bench.metrics.integrity import choose_threshold
-from sasgeo_bench.rejector import Rejector, check_p_false
-from sasgeo_bench.results import Prediction, one_line
+from sasgeo_bench.plugins import load_rejector
+from sasgeo_bench.rejector import Rejector, RejectorCard, check_p_false
+from sasgeo_bench.results import Prediction, told
 from sasgeo_bench.score import NOT_APPLICABLE
 from sasgeo_bench.split import Split
 
@@ -25,6 +27,52 @@ RISKS: Final = (0.01, 0.05)
 _PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
 
 Make = Callable[[], Rejector]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """A rejector that is to be fitted: what it says of itself, what makes a new one, and on which places."""
+
+    card: RejectorCard
+    make: Make
+    split: Split
+
+
+def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
+    """Rejectors by name, each tried once before anything is read.
+
+    Parameters
+    ----------
+    specs : sequence of str
+        Names, or module:Class.
+    split : Split, optional
+        Says which places calibrate.
+
+    Raises
+    ------
+    ConfigError
+        If there is no split, two have one name, or one that of a matcher's own confidence.
+
+    Examples
+    --------
+    >>> rules_of([], None)
+    {}
+    """
+    found: dict[str, Rule] = {}
+    named: dict[str, str] = {}
+    for spec in specs:
+        if split is None:
+            message = "rejectors are fitted on the calibration places of a split: name one with --split"
+            raise ConfigError(message)
+        card = load_rejector(spec).card
+        if named.setdefault(card.name, spec) != spec:
+            message = f"{named[card.name]} and {spec} are both named {card.name!r}: rename one, or leave it out"
+            raise ConfigError(message)
+        if card.name == OWN:
+            message = f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
+            raise ConfigError(message)
+        found[card.name] = Rule(card=card, make=partial(load_rejector, spec), split=split)
+    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +143,26 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
     return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS), "is_own_calibration"])
+
+
+def why_not(scores: pd.DataFrame) -> str:
+    """Why `judge` has no row for a matcher, in words.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Of one matcher.
+
+    Examples
+    --------
+    >>> why_not(pd.DataFrame({"is_answered": [False, False], "place": ["vaduz", "monaco"]}))
+    'it has no answers to judge'
+    """
+    if not scores["is_answered"].any():
+        return "it has no answers to judge"
+    if len(set(scores["place"])) > 1:
+        return "no place that may calibrate another one has an answer"
+    return "no other place of the board calibrates"
 
 
 def own_word(scores: pd.DataFrame, split: Split | None = None) -> pd.DataFrame:
@@ -188,9 +256,8 @@ def _fit_and_say(make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictio
         rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
         if some:
             found[is_answered] = check_p_false(rejector.p_false(some), len(some))
-    except Exception as error:
-        said = one_line(f"{type(error).__name__}: {error}")
-        message = f"rejector {rejector.card.name!r} failed ({said}): mend it, or leave it out"
+    except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+        message = f"rejector {rejector.card.name!r} failed ({told(error)}): mend it, or leave it out"
         raise MatchError(message) from error
     return found
 

@@ -3,7 +3,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any, Final, Literal, Self, TypeVar
@@ -14,6 +14,9 @@ from sasgeo_bench.metrics.intervals import Interval
 from sasgeo_bench.score import MISSING
 
 ALL_SUITES: Final = "all suites"
+UNRANKED: Final = frozenset(
+    {"oracle_pose", "random", "prior_centre", "map_density_prior"}
+)  # controls: beside the ranks
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Better = Literal["higher", "lower"]
@@ -41,15 +44,16 @@ class Row:
     value, lo, hi : float
         The figure and its 95 % interval; NaN where there is none.
     interval : str
-        How it was found: "blocks" (bootstrap over blocks, then queries), "wilson" (fewer than two blocks, or nothing
-        that varies: then over blocks), or "".
+        How it was found: "blocks" (bootstrap over blocks, then sites), "wilson" (Wilson's over sites lies farther out
+        at one end or both: of few sites, or where nothing varies, draws say too little), or "".
     is_applicable : bool
         False where the matcher's card says it cannot; then there is no figure.
     rank_best, rank_worst : int
-        Ranks it can have among the matchers that are ranked; 0 where it is not.
+        Ranks it can have among the matchers that are ranked; None where it is not, and with fewer than `LEAST_BLOCKS`
+        blocks.
     detectable : float
         Least difference from the best of the others that these queries would show (alpha 5 %, power 80 %); NaN where
-        nothing can be said.
+        there is no rank.
     """
 
     matcher: str
@@ -71,8 +75,8 @@ class Row:
     hi: float = math.nan
     interval: str = ""
     is_applicable: bool = True
-    rank_best: int = 0
-    rank_worst: int = 0
+    rank_best: int | None = None
+    rank_worst: int | None = None
     detectable: float = math.nan
 
 
@@ -152,6 +156,28 @@ def side_by_side(make: Callable[[Item], Iterable[Row]], items: Iterable[Item]) -
         return [row for rows in pool.map(lambda item: list(make(item)), items) for row in rows]
 
 
+def name_alone(matcher: str) -> str:
+    """Name of a contestant without the version and hash that it bears beside another of its name.
+
+    Examples
+    --------
+    >>> name_alone("random 1 (c85212)"), name_alone("random")
+    ('random', 'random')
+    """
+    return matcher.partition(" ")[0]
+
+
+def is_unranked(matcher: str) -> bool:
+    """Whether a contestant is a control, of whatever version.
+
+    Examples
+    --------
+    >>> is_unranked("oracle_pose 1 (c85212)"), is_unranked("raster_uniform")
+    (True, False)
+    """
+    return name_alone(matcher) in UNRANKED
+
+
 def bare(value: float) -> Interval:
     """A figure without an interval."""
     return Interval(value=value, lo=math.nan, hi=math.nan)
@@ -165,4 +191,32 @@ def to_frame(rows: list[Row]) -> pd.DataFrame:
     >>> to_frame([]).columns[0]
     'matcher'
     """
-    return pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
+    frame = pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
+    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # whole numbers, and none where none is
+
+
+def with_contestants(board: pd.DataFrame, contestants: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
+    """Rows that also say which code they are of, and whether of a control.
+
+    Parameters
+    ----------
+    board : pandas.DataFrame
+        Columns as the fields of `Row`.
+    contestants : mapping of str to (str, str)
+        By matcher: version, and hash of its code and settings; empty for a file of predictions.
+
+    Returns
+    -------
+    pandas.DataFrame
+        With the columns version, hash (missing for a file) and is_control behind the matcher.
+
+    Examples
+    --------
+    >>> with_contestants(to_frame([]), {}).columns[:4].tolist()
+    ['matcher', 'version', 'hash', 'is_control']
+    """
+    board = board.copy()
+    for at, name in enumerate(("version", "hash")):
+        board.insert(1 + at, name, [contestants[matcher][at] or None for matcher in board["matcher"]])
+    board.insert(3, "is_control", board["matcher"].map(is_unranked).astype(bool))
+    return board

@@ -14,26 +14,17 @@ from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.metrics.base import Bools, Floats, Ints
-from sasgeo_bench.metrics.compare import RankInterval, distinguishable, rank_intervals
-from sasgeo_bench.metrics.intervals import (
-    DRAWS,
-    ClusterDraws,
-    Interval,
-    bootstrap_means,
-    percentile_interval,
-    wilson,
-)
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
+from sasgeo_bench.metrics.draws import DRAWS, ClusterDraws
+from sasgeo_bench.metrics.intervals import Interval, bootstrap_means, effective_count, share_interval
 from sasgeo_bench.metrics.pose import error_quantile
 from sasgeo_bench.metrics.power import sensitivity
 from sasgeo_bench.report.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
-from sasgeo_bench.report.rows import Row, Told, bare, side_by_side, to_frame
+from sasgeo_bench.report.rows import Row, Told, bare, is_unranked, side_by_side, to_frame
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, strata
 from sasgeo_bench.score import MISSING, NOT_APPLICABLE
 
 GROUP: Final = ("suite", "track", "prior_group")
-UNRANKED: Final = frozenset(
-    {"oracle_pose", "random", "prior_centre", "map_density_prior"}
-)  # controls: beside the ranks
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -199,16 +190,17 @@ def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
     """Means that share a denominator, by the same draws."""
     group, count = cell.group, len(cell.group.names)
     told, sites = cell.told(), group.sites[cell.chosen]
+    trials = effective_count(sites)
     below = list(_thresholds(cell, measures))
     columns = [group.measured[measure.name][cell.chosen] for measure in measures]
     table = np.column_stack((*columns, *(item.is_below for item in below)))
-    drawn = ClusterDraws(blocks=group.blocks[cell.chosen], seed=cell.seed, draws=cell.draws)
+    drawn = ClusterDraws(blocks=group.blocks[cell.chosen], sites=sites, seed=cell.seed, draws=cell.draws)
     means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.full((0, table.shape[1]), np.nan)
     for number, measure in enumerate(measures):
         part = slice(number * count, (number + 1) * count)
-        yield from _ranked(cell, told, measure, table[:, part], means[:, part])
+        yield from _ranked(cell, told, measure, table[:, part], means[:, part], trials)
     for at, item in enumerate(below, start=len(measures) * count):
-        found, how = mean_with_interval(table[:, at], sites, means[:, at])
+        found, how = share_interval(item.quantile.share, means[:, at], trials)
         errors = group.errors[item.quantile.column][cell.chosen, item.matcher]
         lo, hi = (_inverse(errors, share) for share in (found.lo, found.hi))
         interval = Interval(value=item.value, lo=lo, hi=hi)
@@ -217,7 +209,10 @@ def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Below:
-    """A quantile of the errors of one matcher (its number), and which errors do not exceed it."""
+    """A quantile of the errors of one matcher (its number), and which errors lie below it.
+
+    Errors that equal it count in proportion, so that the mean is the quantile's share even where many are infinite.
+    """
 
     matcher: int
     quantile: Quantile
@@ -226,7 +221,7 @@ class _Below:
 
 
 def _thresholds(cell: _Cell, measures: Sequence[Measure]) -> Iterator[_Below]:
-    """Quantiles of errors, whose intervals are those of the share below them (Woodruff 1952)."""
+    """Quantiles of errors, whose intervals are those of the share below them, read backwards (Woodruff 1952)."""
     is_pose = cell.group.key[1] == "localization" and any(measure.is_primary for measure in measures)
     if not is_pose or cell.stratum not in _WHOLE:
         return
@@ -234,7 +229,9 @@ def _thresholds(cell: _Cell, measures: Sequence[Measure]) -> Iterator[_Below]:
         for quantile in QUANTILE_MEASURES:
             errors = cell.group.errors[quantile.column][cell.chosen, at]
             value = error_quantile(errors, quantile.share)
-            yield _Below(matcher=at, quantile=quantile, value=value, is_below=(errors <= value).astype(float))
+            is_below, is_equal = errors < value, errors == value
+            part = np.clip((quantile.share - is_below.mean()) / is_equal.mean(), 0.0, 1.0)
+            yield _Below(matcher=at, quantile=quantile, value=value, is_below=is_below + part * is_equal)
 
 
 def _inverse(errors: Floats, share: float) -> float:
@@ -244,33 +241,34 @@ def _inverse(errors: Floats, share: float) -> float:
     return error_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
 
 
-def _ranked(cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, means: Floats) -> Iterator[Row]:
+def _ranked(
+    cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, means: Floats, trials: float
+) -> Iterator[Row]:
     """Rows of one measure; of the primary one with ranks."""
-    names, blocks, sites = cell.group.names, cell.group.blocks[cell.chosen], cell.group.sites[cell.chosen]
-    found = [mean_with_interval(table[:, at], sites, means[:, at]) for at in range(len(names))]
-    ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if measure.is_primary else {}
+    names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
+    found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
+    is_decidable = measure.is_primary and told[0].blocks >= LEAST_BLOCKS
+    ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
     for at, name in enumerate(names):
         interval, how = found[at]
-        rank = ranks.get(name, RankInterval(best=0, worst=0))
-        detectable = _detectable(name, names, table, blocks) if measure.is_primary else math.nan
+        rank = ranks.get(name)
+        detectable = _detectable(name, names, table, blocks) if is_decidable else math.nan
         yield told[at].row(
             measure.name,
             measure.unit,
             measure.better,
             interval,
             how,
-            rank_best=rank.best,
-            rank_worst=rank.worst,
+            rank_best=None if rank is None else rank.best,
+            rank_worst=None if rank is None else rank.worst,
             detectable=detectable,
         )
 
 
 def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
-    """Rank intervals of all but the controls; none where there are not two blocks to draw from."""
-    chosen = [at for at, name in enumerate(names) if name not in UNRANKED]
+    """Rank intervals of all but the controls."""
+    chosen = [at for at, name in enumerate(names) if not is_unranked(name)]
     if not chosen:
-        return {}
-    if not len(means):
         return {}
     better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
     return {names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
@@ -278,39 +276,8 @@ def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure
 
 def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Ints) -> float:
     """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
-    others = [at for at, other in enumerate(names) if other != name and other not in UNRANKED]
-    if not others or name in UNRANKED or (blocks == blocks[0]).all():
+    others = [at for at, other in enumerate(names) if other != name and not is_unranked(other)]
+    if not others or is_unranked(name):
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable
-
-
-def mean_with_interval(values: Floats, sites: Sequence[str] | Ints, draws: Floats) -> tuple[Interval, str]:
-    """A mean of values in [0, 1] with its interval, and how it was found.
-
-    Parameters
-    ----------
-    values : ndarray of float, shape (N,)
-        One for each query.
-    sites : sequence of str or ndarray of int, length N
-        Site of each: the queries of one site show one place.
-    draws : ndarray of float, shape (D,)
-        Means of the bootstrap; none where there are fewer than two blocks.
-
-    Returns
-    -------
-    Interval, str
-        By the bootstrap where there are two blocks or more and something varies. Of one block, or where all values are
-        0 or all are 1, the draws say nothing: then Wilson's interval, as if each site were one trial.
-
-    Examples
-    --------
-    >>> found, how = mean_with_interval(np.ones(40), ["a"] * 20 + ["b"] * 20, np.ones(100))
-    >>> round(found.lo, 2), found.hi, how
-    (0.34, 1.0, 'wilson')
-    """
-    value = float(values.mean())
-    if not len(draws) or value in {0.0, 1.0}:
-        count = len(set(sites))
-        return wilson(value * count, count), "wilson"
-    return percentile_interval(value, draws), "blocks"

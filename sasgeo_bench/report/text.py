@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A leaderboard as Markdown, LaTeX and lines for a terminal; the parquet is the master, these say a part of it."""
+"""A leaderboard as Markdown and as lines for a terminal; the parquet is the master, these say a part of it."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,14 +8,14 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS, RankInterval
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.integrity import AS_DRAWN
-from sasgeo_bench.report.measures import ANSWERED, FALSE_ABSENT, primary_of
-from sasgeo_bench.report.rows import ALL_SUITES
+from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.report.rows import ALL_SUITES, is_unranked
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
-from sasgeo_bench.report.tables import UNRANKED
 
 _INTEGRITY: Final = (
     "aurc",
@@ -30,6 +30,7 @@ _COSTS: Final = (
     *("latency_p50", "latency_p95", "prepare", "peak_memory"),
     *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
 )
+DAGGER: Final = "†"  # of an interval that Wilson's reaches beyond the draws
 _PRIOR_ALONE: Final = "prior_centre"
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
@@ -50,7 +51,7 @@ def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
     for (suite, track, prior_group), part in means.groupby(["suite", "track", "prior_group"], sort=True):
         primary = primary_of(str(track)).name
-        yield f"{suite}, {track}, prior group {prior_group}{_prior_alone(part, primary)}", _suite_table(part, primary)
+        yield f"{suite}, {track}, prior group {prior_group}{_for_nothing(part, primary)}", _suite_table(part, primary)
     judged = board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
     for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True):
         yield f"Rejection, {track}, prior group {prior_group}, all suites", _judged_table(part)
@@ -59,30 +60,39 @@ def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield "Costs", _cost_table(costs)
 
 
-def _prior_alone(part: pd.DataFrame, primary: str) -> str:
-    """What the prior alone is worth, for a title: nobody's merit, and so said beside every group."""
-    mine = part[part["matcher"] == _PRIOR_ALONE]
-    row = _pick(mine, primary, STRESS)
-    row = _pick(mine, primary, ALL) if row is None else row
-    return "" if row is None else f" (the prior alone: {_number(row['value'])})"
+def _for_nothing(part: pd.DataFrame, primary: str) -> str:
+    """What the prior alone and guessing are worth, for a title: nobody's merit, and so said beside every group."""
+    told = {
+        "the prior alone": _main(part[part["matcher"] == _PRIOR_ALONE], primary),
+        "chance": _main(part, CHANCE.name),
+    }
+    words = [f"{name}: {_number(row['value'])}" for name, row in told.items() if row is not None]
+    return f" ({', '.join(words)})" if words else ""
+
+
+def _main(rows: pd.DataFrame, metric: str) -> pd.Series | None:
+    """The row of a figure under stress, or of all where there is no stress."""
+    row = _pick(rows, metric, STRESS)
+    return _pick(rows, metric, ALL) if row is None else row
 
 
 def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
     """A matcher a line, by what it reaches under stress."""
     rows = []
     for matcher, mine in part.groupby("matcher", sort=True):
-        main = _pick(mine, primary, STRESS)
-        main = _pick(mine, primary, "all") if main is None else main
+        main = _main(mine, primary)
         if main is None:
             continue
         control, absent = _pick(mine, primary, CONTROL), _pick(mine, FALSE_ABSENT.name, ALL)
+        near = _pick(mine, WITHIN.name, str(main["stratum"]))
         rows.append(
             {
                 "matcher": matcher,
                 primary: _figure(main) if main["is_applicable"] else "not applicable",
                 "rank": _rank(main),
-                "control": "" if control is None else _figure(control),
-                "false fixes": "" if absent is None else _figure(absent),
+                WITHIN.name: "-" if near is None else _figure(near),
+                "control": "-" if control is None else _figure(control),
+                "false fixes": "-" if absent is None else _figure(absent),
                 "detectable": _number(main["detectable"]),
                 "n": str(main["n"]),
                 "missing": str(main["missing"]),
@@ -91,7 +101,7 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
             }
         )
     table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
-    empty = [name for name in ("false fixes",) if (table[name] == "").all()]
+    empty = [name for name in (WITHIN.name, "false fixes") if (table[name] == "-").all()]
     return table.drop(columns=["_key", *empty])
 
 
@@ -105,7 +115,7 @@ def _judged_table(part: pd.DataFrame) -> pd.DataFrame:
     for (matcher, rejector), mine in part.groupby(["matcher", "rejector"], sort=True):
         by_name = {str(row["metric"]): row for _, row in mine.iterrows()}
         row = {"matcher": matcher, "rejector": rejector}
-        row |= {name: _figure(by_name[name]) if name in by_name else "" for name in _INTEGRITY}
+        row |= {name: _figure(by_name[name]) if name in by_name else "-" for name in _INTEGRITY}
         rows.append(row | {"n": str(mine["n"].iloc[0]), "_key": by_name["aurc"]["value"]})
     table = pd.DataFrame(rows).sort_values(["_key", "matcher", "rejector"], kind="stable")
     return table.drop(columns="_key")
@@ -120,12 +130,13 @@ def _cost_table(part: pd.DataFrame) -> pd.DataFrame:
                 name = one["metric"] if one["track"] == "all" else f"{one['metric']}, {one['track']}"
                 row[f"{name} ({one['unit']})"] = _number(one["value"])
         rows.append(row)
-    return pd.DataFrame(rows).fillna("")
+    return pd.DataFrame(rows).fillna("-")
 
 
 def _figure(row: pd.Series) -> str:
-    """A figure with its interval, as in "0.63 [0.55, 0.70]"."""
-    return _with_interval(row["value"], row["lo"], row["hi"])
+    """A figure with its interval, as in "0.63 [0.55, 0.70]"; a dagger where that is Wilson's."""
+    mark = DAGGER if row["interval"] == "wilson" else ""
+    return _with_interval(row["value"], row["lo"], row["hi"]) + mark
 
 
 def _with_interval(value: float, lo: float, hi: float) -> str:
@@ -143,10 +154,9 @@ def _number(value: float) -> str:
 
 def _rank(row: pd.Series) -> str:
     """A rank or ranks that cannot be told apart; controls have none."""
-    best, worst = int(row["rank_best"]), int(row["rank_worst"])
-    if not best:
-        return "control" if row["matcher"] in UNRANKED else "-"
-    return str(best) if best == worst else f"{best}-{worst}"
+    if pd.isna(row["rank_best"]):
+        return "control" if is_unranked(row["matcher"]) else "-"
+    return RankInterval(best=int(row["rank_best"]), worst=int(row["rank_worst"])).text
 
 
 def warnings_of(board: pd.DataFrame) -> list[str]:
@@ -169,29 +179,47 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
 
 
 _NOTE: Final = (
-    "Intervals are 95 %: a bootstrap over blocks, then queries ({draws} draws), or Wilson's where blocks say nothing. "
+    "Intervals are 95 %: a bootstrap over blocks, then sites ({draws} draws), and never narrower than Wilson's of as "
+    f"many trials as there are sites; {DAGGER} marks those that Wilson's reaches farther out. "
     "A rank is an interval: matchers that share one cannot be told apart. Nothing is ranked across prior groups. "
     "What each column says is told at the end."
 )
 _TERMS: Final = {  # docs/scoring.md says the same at more length
     "success_25m, recall_1": "share of the stressed queries whose pose is within 25 m and 5 deg; whose first candidate "
     "is the right one, ties counted in proportion. Without an answer a query is a miss",
+    "within_25m": "the same as success_25m whatever the heading: what counts as a fix that is not false",
     "control": "the same figure at the same places without the stress; under `rank`, a matcher that is no rival",
     "false fixes": "share of absent places that were answered",
-    "detectable": "least difference from the best other matcher that these queries would show; inf where none would",
+    DAGGER: "Wilson: of a few sites, or where all answers are right, draws alone would be too narrow",
+    "-": "nothing to tell: no such query, no rank, nobody to compare with",
+    "the prior alone": "in a title, what `prior_centre` reaches, which looks at nothing: it answers with the middle of "
+    "the prior's disc, or of the map without one; of candidates with the one nearest to the middle of all",
+    "chance": "in a title, what guessing among the candidates reaches",
+    "rank": "ranks a matcher can have, all pairs at once; `-` where there are fewer than "
+    f"{LEAST_BLOCKS} blocks: they rank nobody, as they decide no contrast",
+    "detectable": "least difference from the best other matcher that these queries would show; inf where none would, "
+    "`-` where nobody is ranked",
     "n, missing, blocks": "queries counted; those of them without a row; pieces of ground they come from, which are "
     "what intervals count",
     "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
+    "contrast, first, second, difference": "a pair that was named before anything was run; what each reaches; the "
+    "first less the second, on the same queries",
+    "p (Holm)": "chance of a difference as large if there were none, counting blocks, adjusted by Holm for how many "
+    "contrasts were registered",
     "discordant": "queries that only the first method got right, and only the second",
+    "verdict": "which is better at 5 %; `null` where neither is shown to be, with or without ruling out a difference "
+    f"that matters; `not decided` with fewer than {LEAST_BLOCKS} blocks",
     "rejector": "says of each answer how likely it is false; `own` is the matcher's own confidence, fitted to nothing",
-    "aurc": "mean share of false fixes among the surest 1, 2, ..., all queries; lower is better",
+    "aurc": "mean share of false fixes (beyond 25 m, whatever the heading, or not the right candidate) among the "
+    "surest 1, 2, ..., all queries; lower is better",
     "coverage_at_risk_0.05, risk_reached_at_0.05": "share of queries accepted by the threshold that kept false fixes "
     "at 5 % on other places, and the share of false fixes among them here",
     "brier, ece": "how far the stated chances are from what came true: mean square; mean distance by bins of equal "
-    "mass",
+    "mass. `-`, as of the costs, for a rejector that keeps an order and states no chances",
     "cost_20, cost_20_place": "mean cost of a query if a fix is accepted where its chance to be false is below "
     "1 / (1 + 20) and a false fix costs 20: withheld right fixes cost 1 each, or every present place without an "
-    "accepted fix does. By the first compare rejectors on one matcher, by the second whole methods",
+    "accepted fix does. By the first compare rejectors on one matcher, by the second whole methods. "
+    "Where there is no answer the first is 0, for nothing right was withheld",
     "latency, prepare, peak_memory, cpu_per_fix": "of `match` alone; of a map once; of all its processes; processor "
     "seconds of all queries over answered ones",
     "map_per_km2, observation_per_fix": "files of the maps and what the matcher added to them over the mapped area; "
@@ -277,41 +305,25 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
 
 
 def markdown_table(table: pd.DataFrame) -> Iterator[str]:
-    """Lines of a table."""
-    yield "| " + " | ".join(map(str, table.columns)) + " |"
+    r"""Lines of a table; what a cell holds can neither end it nor begin a tag.
+
+    Examples
+    --------
+    >>> list(markdown_table(pd.DataFrame({"matcher": ["mine 1|2"]})))[-1]
+    '| mine 1\\|2 |'
+    """
+    yield "| " + " | ".join(map(_cell_text, table.columns)) + " |"
     yield "|" + "---|" * len(table.columns)
     for row in table.itertuples(index=False):
-        yield "| " + " | ".join(map(str, row)) + " |"
+        yield "| " + " | ".join(map(_cell_text, row)) + " |"
 
 
-_ESCAPED: Final = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#"}
-
-
-def board_latex(board: pd.DataFrame, about: Mapping[str, Any]) -> str:
-    """The tables of the board for a paper; needs the package booktabs."""
-    lines = [f"% {about['made_by']}, scorer version {about['scorer_version']}; {ATTRIBUTION}"]
-    for title, table in tables_of(board):
-        lines += [
-            r"\begin{table}",
-            rf"\caption{{{_tex(title)}}}",
-            rf"\begin{{tabular}}{{{'l' * len(table.columns)}}}",
-            r"\toprule",
-            " & ".join(map(_tex, table.columns)) + r" \\",
-            r"\midrule",
-            *(" & ".join(map(_tex, row)) + r" \\" for row in table.itertuples(index=False)),
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _tex(text: object) -> str:
-    return "".join(_ESCAPED.get(letter, letter) for letter in str(text))
+def _cell_text(value: object) -> str:
+    return str(value).replace("|", r"\|").replace("<", "&lt;")
 
 
 def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple[str, pd.DataFrame]]:
-    """What a terminal shows: by track and prior group a matcher a line, a suite a column, primary figure and rank.
+    """What a terminal shows: by track and prior group a matcher a line, a suite a column, figure, interval and rank.
 
     Parameters
     ----------
@@ -324,24 +336,31 @@ def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple
     means = means[means["suite"].isin(names)] if names else means
     for (track, prior_group), part in means.groupby(["track", "prior_group"], sort=True):
         primary = primary_of(str(track)).name
-        main = part[part["metric"] == primary]
         rows = []
-        for matcher, mine in main.groupby("matcher", sort=True):
+        for matcher, mine in part.groupby("matcher", sort=True):
             row = {"matcher": str(matcher)}
             total = []
             for suite, one in mine.groupby("suite", sort=True):
-                shown = _pick(one, primary, STRESS)
-                shown = _pick(one, primary, "all") if shown is None else shown
+                shown = _main(one, primary)
                 if shown is not None:
-                    row[str(suite)] = _cell(shown)
+                    row[_heading(str(suite), one, shown)] = _cell(shown)
                     total.append(shown["value"])
             numbers = [value for value in total if not math.isnan(value)]
             rows.append(row | {"_key": sum(numbers) / len(numbers) if numbers else -1.0})
         table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
-        yield f"{primary}, {track}, prior group {prior_group} (rank)", table.drop(columns="_key").fillna("")
+        title = f"{primary} [95 %] (rank), {track}, prior group {prior_group}"
+        yield title, table.drop(columns="_key").fillna("-")
+
+
+def _heading(suite: str, rows: pd.DataFrame, shown: pd.Series) -> str:
+    """A suite with its queries, and what guessing among candidates is worth."""
+    chance = _main(rows, CHANCE.name)
+    return f"{suite}, n = {shown['n']}" + ("" if chance is None else f", chance {_number(chance['value'])}")
 
 
 def _cell(row: pd.Series) -> str:
+    """As in "0.750 [0.30, 0.95] (2-3)"."""
     if not row["is_applicable"]:
         return "n/a"
-    return f"{_number(row['value'])} ({_rank(row)})"
+    ends = "" if math.isnan(row["lo"]) else f" [{row['lo']:.2f}, {row['hi']:.2f}]"
+    return f"{_number(row['value'])}{ends} ({_rank(row)})"

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Final
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.matcher import check_match, lacks
 from sasgeo_bench.plugins import ORACLE
 from sasgeo_bench.query import Query
@@ -18,6 +18,7 @@ from sasgeo_bench.run.plan import RunPart, RunPlan, by_map, reach_of
 from sasgeo_bench.run.schedule import Schedule
 from sasgeo_bench.run.worker import Reply, Worker
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.regiondir import read_manifest
 
 PART_ROWS: Final = 64
 PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
@@ -173,7 +174,10 @@ class _Map:
         """Query after query, task after task, each with where its row goes; a row group in memory."""
         for writer in self._writers:
             writer.begin()
-            for query, blob in taskdir.read_some(writer.part.task, frozenset(writer.part.left)):
+            for query, blob, asked in taskdir.read_some(writer.part.task, frozenset(writer.part.left)):
+                if writer.part.asked[query.query_id] != asked:
+                    message = f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
+                    raise StoreError(message)
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
@@ -183,6 +187,7 @@ class _Map:
             for writer, query, blob in schedule.items(number):
                 if ready is None:
                     ready = worker.prepare(self._writers[0].part.region)
+                    self._check_map()
                     if schedule.is_stopped:
                         return
                 writer.told_by(worker, ready)
@@ -197,6 +202,13 @@ class _Map:
                         is_warm = True
                     reply = worker.match(blob, top_k=top_k)
                 writer.add(_prediction(query, reply, top_k), cpu_s=reply.cpu_s)
+
+    def _check_map(self) -> None:
+        """Refuse a map that another run has replaced since; whatever was prepared before is of the old one."""
+        part = self._writers[0].part
+        if not taskdir.is_of_map(part.about, read_manifest(part.region)):
+            message = f"{part.region} was built anew while it was searched: run again, answers are kept"
+            raise StoreError(message)
 
     def _asked(self) -> Worker | Oracle:
         """Whoever is asked: a plugin in a process of its own, or the one control that is given the truth."""
@@ -267,7 +279,7 @@ class _Writer:
         """Write what there is."""
         with self._lock:
             if self._rows:
-                rundir.write_part(self.part.folder, self._rows)
+                rundir.write_part(self.part.folder, self._rows, asked=self.part.asked)
             self._rows = []
 
     def end(self) -> None:

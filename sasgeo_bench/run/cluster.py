@@ -93,9 +93,11 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
 
     threads = max(1, sum(client.nthreads().values()))
     where = {}
+    bare = replace(plan, parts=())  # other tasks' ids need not travel with every chunk
     for number, part in enumerate(parts):
         for ids in _chunks(part.left, threads):
-            where[client.submit(_answer_chunk, plan, part, ids, pure=False)] = (number, len(ids))
+            chunk = replace(part, left=ids, asked={name: part.asked[name] for name in ids})
+            where[client.submit(_answer_chunk, bare, chunk, pure=False)] = (number, len(ids))
     for future in as_completed(where):
         try:
             cost = future.result()
@@ -113,8 +115,8 @@ def _chunks(ids: Sequence[str], threads: int) -> Iterator[tuple[str, ...]]:
         yield tuple(ids[start : start + size])
 
 
-def _answer_chunk(plan: RunPlan, part: RunPart, ids: Sequence[str]) -> Cost:
+def _answer_chunk(plan: RunPlan, part: RunPart) -> Cost:
     """Ask one chunk in the process of a dask worker; what an earlier try of it has written is not asked again."""
-    done = rundir.ids_done(part.folder, again=plan.request.again) if part.folder.is_dir() else set()
-    left = tuple(name for name in ids if name not in done)
+    done = rundir.ids_done(part.folder, part.asked, again=plan.request.again)
+    left = tuple(name for name in part.left if name not in done)
     return answer(plan, [replace(part, left=left)], jobs=1, watch=Watch())

@@ -3,12 +3,12 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.matcher import MatcherCard
 from sasgeo_bench.plugins import ORACLE, list_entry_points
 from sasgeo_bench.results import STATUSES, matcher_hash
@@ -17,6 +17,7 @@ from sasgeo_bench.run.worker import Limits, Reach, Worker
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
 
+MOST_LINES: Final = 12  # tasks that are named; the others are counted
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
 _LEAST_MB, _MOST_MB = 64, 4_000_000
@@ -67,14 +68,21 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunPart:
-    """One task of a run: its folder of rows, its map, its truths, and the queries that are left to ask."""
+    """One task of a run: its folder of rows, its map, its truths, and the queries that are left to ask.
+
+    `about` is what `task.json` says, `asked` the hash of what is asked by each query that is left
+    (`taskdir.read_asked`), and `aside` how many rows of the folder answer other queries than the task holds now.
+    """
 
     task: Path
+    about: Mapping[str, Any]
     folder: Path
     region: Path
     truth: Path
     left: tuple[str, ...]
+    asked: Mapping[str, str]
     done: int
+    aside: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,10 +95,21 @@ class RunPlan:
     parts: tuple[RunPart, ...]
 
     def to_text(self) -> str:
-        """A line for each task."""
+        """What is left and done in all, and a line for each of the first tasks."""
         lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
-        lines += [f"  {part.folder}: {len(part.left)} queries left, {part.done} done" for part in self.parts]
+        lines += [f"  {part.folder}: {_state((part,))}" for part in self.parts[:MOST_LINES]]
+        if len(self.parts) > MOST_LINES:
+            lines.append(f"  {len(self.parts) - MOST_LINES} more tasks: {_state(self.parts[MOST_LINES:])}")
+        if len(self.parts) > 1:
+            lines.append(f"  all {len(self.parts)} tasks: {_state(self.parts)}")
         return "\n".join(lines)
+
+
+def _state(parts: Sequence[RunPart]) -> str:
+    """How far some tasks are."""
+    left, done, aside = (sum(column) for column in zip(*((len(x.left), x.done, x.aside) for x in parts), strict=True))
+    others = f", {counted(aside, 'answer')} to other queries set aside" if aside else ""
+    return f"{counted(left, 'query', 'queries')} left, {done} done{others}"
 
 
 def plan_run(request: RunRequest) -> RunPlan:
@@ -155,7 +174,11 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str]:
     with Worker(spec=request.spec, reach=reach_of(request, None), limits=request.limits) as worker:
         reply = worker.load()
     if reply.status != "ok" or reply.card is None:
-        raise MatchError(reply.message or f"{request.spec}: the plugin says nothing of itself")
+        said = reply.message or "the plugin says nothing of itself"
+        raise MatchError(said if request.spec in said else f"{request.spec}: cannot be made ({said})")
+    if reply.card.name == ORACLE:
+        message = f"{request.spec}: card: {ORACLE!r} is the name of a control of the runner, choose another one"
+        raise MatchError(message)
     return reply.card, reply.code
 
 
@@ -184,30 +207,47 @@ def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
 def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about: dict[str, Any]) -> RunPart:
     folder = request.out / "runs" / card.name / found / about["suite"] / about["region"]
     before = rundir.read_run(folder)
-    now = about["files"][taskdir.QUERIES]["sha256"]
-    if before is not None and before.get("queries_sha256") != now:
-        message = (
-            f"{folder} holds answers to other queries than {task} does now: "
-            "move it away and run again, or make the old queries again"
-        )
-        raise StoreError(message)
     if before is not None and before.get("hash") != found:
         message = f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away"
         raise StoreError(message)
     taskdir.check_queries(task)
     root = task.resolve().parent.parent.parent
     region = root / "regions" / about["region"]
-    if read_manifest(region).fingerprint != about["map_fingerprint"]:
+    if not taskdir.is_of_map(about, read_manifest(region)):
         message = f"{region} was built anew since the queries of {task} were made: make them again"
         raise StoreError(message)
-    ids = taskdir.read_ids(task)
+    asked = taskdir.read_asked(task)
+    ties = rundir.read_ties(folder) if folder.is_dir() else []
+    _check_old(folder, ties, before, task, about)
     index, count = request.shard
-    mine = [name for name in ids if _shard_of(name, count) == index - 1]
+    mine = [name for name in asked if _shard_of(name, count) == index - 1]
     mine = mine if request.limit is None else mine[: request.limit]
-    done = rundir.ids_done(folder, again=request.again) if folder.is_dir() else set()
+    done = {tie.query_id for tie in ties if tie.status not in request.again and tie.answers(asked)}
     left = tuple(name for name in mine if name not in done)
-    truth = root / "truth" / about["suite"] / about["region"]
-    return RunPart(task=task, folder=folder, region=region, truth=truth, left=left, done=len(mine) - len(left))
+    return RunPart(
+        task=task,
+        about=about,
+        folder=folder,
+        region=region,
+        truth=root / "truth" / about["suite"] / about["region"],
+        left=left,
+        asked={name: asked[name] for name in left},
+        done=len(mine) - len(left),
+        aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
+    )
+
+
+def _check_old(
+    folder: Path, ties: Sequence[rundir.Tie], before: Mapping[str, Any] | None, task: Path, about: Mapping[str, Any]
+) -> None:
+    """Refuse rows that do not say what they answer, unless `run.json` says that it is this very task."""
+    is_said = all(tie.asked for tie in ties)
+    if not is_said and (before or {}).get("queries_sha256") != about["files"][taskdir.QUERIES]["sha256"]:
+        message = (
+            f"{folder} holds answers of an older version, and not to the queries that {task} holds now: "
+            "move it away and run again"
+        )
+        raise StoreError(message)
 
 
 def _shard_of(query_id: str, count: int) -> int:

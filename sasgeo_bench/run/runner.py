@@ -5,19 +5,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
-from sasgeo_bench.run.plan import RunPart, RunPlan, by_map
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.run.plan import MOST_LINES, RunPart, RunPlan, by_map
+from sasgeo_bench.store import rundir, runrows, taskdir
 from sasgeo_bench.store.regiondir import locked
 
 TOLD_S: Final = 10.0
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
+_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earlier runs took, as run.json says it
 
 Tell = Callable[[str], None]
 
@@ -26,7 +28,7 @@ class Progress(Protocol):
     """Whoever shows how far a run is; is called by one thread at a time."""
 
     def begin(self, label: str, total: int) -> None:
-        """Begin a task of so many queries."""
+        """Begin something of so many queries: all that one matcher is asked."""
         ...
 
     def advance(self, label: str, count: int) -> None:
@@ -39,7 +41,7 @@ class Lines:
 
     Examples
     --------
-    >>> Lines(print, every_s=0.0).begin("clean/vaduz", 2)
+    >>> Lines(print, every_s=0.0).begin("fft_vote", 2)
     """
 
     def __init__(self, tell: Tell, *, every_s: float = TOLD_S) -> None:
@@ -49,7 +51,7 @@ class Lines:
         self._told = time.monotonic()
 
     def begin(self, label: str, total: int) -> None:
-        """Begin a task."""
+        """Begin to count."""
         self._begun[label], self._done[label] = (time.monotonic(), total), 0
 
     def advance(self, label: str, count: int) -> None:
@@ -98,10 +100,10 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
         If a cluster was named that is not there.
     """
     progress = progress or Lines(tell)
-    for part in plan.parts:
-        if not part.left:
-            tell(f"{part.folder}: nothing left, {part.done} done")
+    _tell_state(plan, tell)
     parts = [part for part in plan.parts if part.left]
+    if parts:
+        progress.begin(plan.card.name, sum(len(part.left) for part in parts))
     costs: list[Cost] = []
     if plan.request.dask is not None and parts:
         costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
@@ -112,13 +114,28 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
     return RunReport(counts=pooled.counts, messages=pooled.messages, folders=folders)
 
 
+def _tell_state(plan: RunPlan, tell: Tell) -> None:
+    """Say what is done already: of a few tasks which, of many how many; and what of the rows is not asked for."""
+    whole = [part for part in plan.parts if not part.left]
+    if len(whole) > MOST_LINES:
+        tell(f"{plan.card.name}: nothing left in {len(whole)} of {len(plan.parts)} tasks")
+    else:
+        for part in whole:
+            tell(f"{part.folder}: nothing left, {part.done} done")
+    aside = sum(part.aside for part in plan.parts)
+    if aside:
+        tell(f"{plan.card.name}: {counted(aside, 'answer')} to queries that these tasks do not hold now, set aside")
+
+
 def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
     """Ask the queries of all tasks on this machine."""
     costs = []
     for batch in _batches(by_map(plan.request.spec, parts)):
         with ExitStack() as locks:
             _lock(locks, batch, tell)
-            costs.append(answer(plan, batch, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
+            left = _still_left(plan, batch)
+            if left:
+                costs.append(answer(plan, left, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
     return costs
 
 
@@ -140,6 +157,17 @@ def _lock(locks: ExitStack, parts: Sequence[RunPart], tell: Tell) -> None:
         locks.enter_context(locked(folder, tell=tell))
 
 
+def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
+    """What nobody has answered while the locks were waited for; tasks of which nothing is left are gone."""
+    found = []
+    for part in parts:
+        done = rundir.ids_done(part.folder, part.asked, again=plan.request.again)
+        left = tuple(name for name in part.left if name not in done)
+        if left:
+            found.append(replace(part, left=left))
+    return found
+
+
 class _Notes(Watch):
     """Keeps `run.json` of each task, and tells of each row; progress is told by one thread at a time."""
 
@@ -151,12 +179,13 @@ class _Notes(Watch):
     def begin(self, part: RunPart) -> None:
         """Say that a task begins."""
         with self._lock:
-            self._before[part.folder] = _begin(self._plan, part, self._progress)
+            self._before[part.folder] = _begin(self._plan, part)
 
     def advance(self, part: RunPart) -> None:
         """Tell of a row."""
+        del part  # progress is told of the whole matcher: a task may be too short for a pace
         with self._lock:
-            self._progress.advance(str(part.folder), 1)
+            self._progress.advance(self._plan.card.name, 1)
 
     def end(self, part: RunPart, cost: Cost) -> None:
         """Write what it took."""
@@ -165,25 +194,30 @@ class _Notes(Watch):
 
 def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
     """Ask the queries of all tasks on a cluster at once."""
-    costs: list[list[Cost]] = [[] for _ in parts]
-    left = [len(part.left) for part in parts]
+    costs: list[list[Cost]] = []
     with ExitStack() as locks:
         client = locks.enter_context(connected(address))
         _lock(locks, parts, tell)
-        before = [_begin(plan, part, progress) for part in parts]
+        parts = _still_left(plan, parts)
+        costs, left = [[] for _ in parts], [len(part.left) for part in parts]
+        before = [_begin(plan, part) for part in parts]
         for number, count, cost in answer_on(client, plan, parts):
             costs[number].append(cost)
             left[number] -= count
-            progress.advance(str(parts[number].folder), count)
+            progress.advance(plan.card.name, count)
             if not left[number]:
                 _say(plan, parts[number], pool_costs(costs[number]), before[number])
     return [pool_costs(items) for items in costs]
 
 
-def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
+def _begin(plan: RunPlan, part: RunPart) -> Cost:
     """Say that a task begins; what earlier runs of it took."""
-    progress.begin(str(part.folder), len(part.left))
     said = rundir.read_run(part.folder) or {}
+    wrong = next((name for name in _COSTS if not isinstance(said.get(name), int | float | None)), None)
+    if wrong is not None:
+        path = part.folder / rundir.RUN
+        message = f"{path} is damaged ({wrong} is no number): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
     before = Cost(
         prepare_s=said.get("prepare_s"),
         index_bytes=said.get("index_bytes"),
@@ -197,13 +231,13 @@ def _begin(plan: RunPlan, part: RunPart, progress: Progress) -> Cost:
 
 def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: what the run is, and what it and the runs before it have taken."""
-    about = taskdir.read_task(part.task)
+    about = part.about
     told: dict[str, Any] = asdict(pool_costs([before, cost]))
     del told["counts"], told["messages"]
     rundir.write_run(
         part.folder,
         {
-            "schema_version": rundir.SCHEMA_VERSION,
+            "schema_version": runrows.SCHEMA_VERSION,
             "matcher": asdict(plan.card),
             "spec": plan.request.spec,
             "hash": plan.hash,

@@ -15,7 +15,7 @@ import psutil
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import Match, Matcher, check_match
 from sasgeo_bench.plugins import load_matcher
-from sasgeo_bench.results import one_line
+from sasgeo_bench.results import one_line, told
 from sasgeo_bench.run import wire
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.store.taskrows import query_from
@@ -46,9 +46,9 @@ class Server:
                 answer = {"status": "crash", "message": "out of memory"}
             except OSError as error:
                 status = "refused" if error.errno in _REFUSED else "crash"
-                answer = {"status": status, "message": one_line(f"{type(error).__name__}: {error}")}
+                answer = {"status": status, "message": told(error)}
             except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
-                answer = {"status": "crash", "message": one_line(f"{type(error).__name__}: {error}")}
+                answer = {"status": "crash", "message": told(error)}
             wire.send(self.channel, answer)
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:

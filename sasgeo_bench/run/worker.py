@@ -155,7 +155,7 @@ class Worker:
             return Reply(status="crash", message=str(large))
         try:
             return _reply_of(answer)
-        except (MatchError, ValueError, TypeError, KeyError) as error:
+        except (MatchError, ValueError, TypeError, KeyError, OverflowError) as error:
             self.end()
             return Reply(status="invalid", message=one_line(f"an answer that is none: {error}"))
 
@@ -238,7 +238,7 @@ class Worker:
                 code = None
         how = closed
         if code is not None:
-            how = f"died by {signal.Signals(-code).name}" if code < 0 else f"ended with exit status {code}"
+            how = f"died by {_signal_name(-code)}" if code < 0 else f"ended with exit status {code}"
         lines = b"".join(self._printed).decode(errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "")
         return one_line(f"{how}: {last}" if last else how)
@@ -252,6 +252,12 @@ class Worker:
         if self._scratch is not None:
             shutil.rmtree(self._scratch, ignore_errors=True)
         self._process, self._channel, self._scratch = None, None, None
+
+
+def _signal_name(number: int) -> str:
+    """Name of a signal; those of real time have a number alone."""
+    known = {item.value: item.name for item in signal.Signals}
+    return known.get(number, f"signal {number}")
 
 
 class _TooLarge(Exception):  # noqa: N818 - a limit, told as a row's message

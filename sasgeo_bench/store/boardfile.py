@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 
@@ -19,6 +19,7 @@ LEADERBOARD: Final = "leaderboard"
 SCORES: Final = "scores"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
+_VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
 _KNOWN: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
     *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
@@ -72,22 +73,35 @@ def write_board(
     Raises
     ------
     StoreError
-        If the folder holds a board of another scorer version, or something that is no part of a board.
+        If the folder holds a board of another scorer version, or something that is no part of a board, or cannot be
+        written; an older board is then as it was.
     """
     check_board(folder, scorer_version=int(about["scorer_version"]))
-    with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
-        said = {"attribution": ATTRIBUTION, "licence": LICENCE, "scorer_version": str(about["scorer_version"])}
-        for part in (Extra(tables=tables, texts=texts), *extras):
-            _write_part(scratch, part, said)
-        tables[LEADERBOARD].to_csv(scratch / f"{LEADERBOARD}.csv", index=False, lineterminator="\n")
-        content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
-        (scratch / BOARD).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    versions = {name: str(about[name]) for name in _VERSIONS if name in about}
+    said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
+    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
+    try:
+        with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
+            for part in (Extra(tables=tables, texts=texts), *extras):
+                _write_part(scratch, part, said)
+            tables[LEADERBOARD].to_csv(scratch / f"{LEADERBOARD}.csv", index=False, lineterminator="\n")
+            (scratch / BOARD).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = (
+            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights, and score "
+            "again; a board that was there is as it was"
+        )
+        raise StoreError(message) from error
 
 
 def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
     for name, frame in part.tables.items():
         table = pa.Table.from_pandas(frame, preserve_index=False)
-        pq.write_table(table.replace_schema_metadata(said), folder / f"{name}.parquet", compression="zstd")
+        # pandas gives back types by the key "pandas", and what is said as `attrs` by "PANDAS_ATTRS".
+        about = {**(table.schema.metadata or {}), **said, "PANDAS_ATTRS": json.dumps(said)}
+        pq.write_table(table.replace_schema_metadata(about), folder / f"{name}.parquet", compression="zstd")
     for name, text in part.texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     for name, draw in part.figures.items():
@@ -110,11 +124,9 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
     if other is not None:
         message = f"{other} is no part of a board and would be lost: move it away, or name another board"
         raise StoreError(message)
-    path = folder / f"{LEADERBOARD}.parquet"
-    if not path.is_file():
-        return
-    found = _version(path)
-    if found != str(scorer_version):
+    versions = map(_version, sorted(folder.glob("*.parquet")))
+    found = next((version for version in versions if version != str(scorer_version)), None)
+    if found is not None:
         message = (
             f"{folder} holds rows of scorer version {found}, this one is {scorer_version}: figures of two never share "
             "a board; name another one, or move it away and score again"

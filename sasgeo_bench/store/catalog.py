@@ -119,7 +119,7 @@ def find_pipeline_file(id_or_path: str) -> Path:
 
 def _read(path: Path, model: type[Model], kind: Kind) -> Model:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark of its byte order
     except (OSError, UnicodeDecodeError) as error:
         noun = kind.removesuffix("s")
         message = f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"

@@ -73,7 +73,7 @@ def draw_example(path: Path, panel: Panel, *, data: str) -> None:
     path : Path
         A .png or .svg to write.
     panel : Panel
-        From `tasks.panels`.
+        From `panels.panels`.
     data : str
         Where the data are from.
     """

@@ -203,18 +203,26 @@ def fresh_folder(target: Path) -> Iterator[Path]:
     if replaced.exists() and not target.exists():
         replaced.rename(target)  # killed between the two renames below: the old region is still whole
     for leftover in (scratch, replaced):
-        shutil.rmtree(leftover, ignore_errors=True)
+        _clear(leftover)
     scratch.mkdir(parents=True)
     try:
         yield scratch
-        for path in scratch.iterdir():
+        for path in scratch.rglob("*"):
             _flush(path)
-        if target.exists():
+        if os.path.lexists(target):  # a link that leads nowhere stands in the way too
             target.rename(replaced)
         scratch.rename(target)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-        shutil.rmtree(replaced, ignore_errors=True)
+        _clear(scratch)
+        _clear(replaced)
+
+
+def _clear(path: Path) -> None:
+    """Remove a folder, or a file or link where a folder was expected; what a link leads to stays."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    else:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _flush(path: Path) -> None:

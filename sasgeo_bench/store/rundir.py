@@ -3,8 +3,10 @@
 
 import json
 import os
+import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,81 +14,44 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import PoseError, StoreError
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.store.taskrows import POSE_FIELDS, poses_of
+from sasgeo_bench.store.runrows import (
+    PREDICTION_SCHEMA,
+    RUN_SCHEMA,
+    differing_columns,
+    prediction_of,
+    prediction_row,
+    with_candidates,
+)
+from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, poses_of
 
 RUN: Final = "run.json"
-SCHEMA_VERSION: Final = 1
-_CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
-PREDICTION_SCHEMA: Final = pa.schema(
-    [
-        ("query_id", pa.string()),
-        ("candidates", pa.list_(_CANDIDATE)),
-        ("confidence", pa.float64()),
-        ("diagnostics", pa.map_(pa.string(), pa.float64())),
-        ("status", pa.string()),
-        ("message", pa.string()),
-        ("latency_s", pa.float64()),
-    ],
-    metadata={"schema_version": str(SCHEMA_VERSION), "attribution": ATTRIBUTION, "licence": LICENCE},
-)
+_PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 
 
-def prediction_row(prediction: Prediction) -> dict[str, Any]:
-    """One prediction as a row of `PREDICTION_SCHEMA`."""
-    return {
-        "query_id": prediction.query_id,
-        "candidates": [
-            {
-                "easting_m": pose.easting_m,
-                "northing_m": pose.northing_m,
-                "yaw_deg": pose.yaw_deg,
-                "scale": pose.scale,
-                "score": score,
-            }
-            for pose, score in prediction.candidates
-        ],
-        "confidence": prediction.confidence,
-        "diagnostics": list(prediction.diagnostics.items()),
-        "status": prediction.status,
-        "message": prediction.message,
-        "latency_s": prediction.latency_s,
-    }
-
-
-def prediction_of(row: Mapping[str, Any]) -> Prediction:
-    """Inverse of `prediction_row`; whatever else a candidate holds is passed over."""
-    poses = tuple(
-        (Pose(**{name: item[name] for name in POSE_FIELDS}), item["score"]) for item in row["candidates"] or ()
-    )
-    return _prediction(row, poses)
-
-
-def _prediction(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ...]) -> Prediction:
-    return Prediction(
-        query_id=row["query_id"],
-        candidates=candidates,
-        confidence=row["confidence"],
-        diagnostics=dict(row["diagnostics"] or ()),
-        status=row["status"],
-        message=row["message"] or "",
-        latency_s=row["latency_s"],
-    )
-
-
-def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
+def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mapping[str, str] | None = None) -> Path:
     """Add some rows to a run, in a file of their own that is there whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    predictions : sequence of Prediction
+        The rows.
+    asked : mapping of str to str, optional
+        What each of them answers, by query id (`taskdir.read_asked`); without, a file as anyone may submit it.
 
     Raises
     ------
     StoreError
         If the disk is full or the folder cannot be written; what was there before is as it was.
     """
-    name = f"part-{time.time_ns():020d}-{os.getpid()}"
+    name = f"part-{_stamp_ns(folder):020d}-{os.getpid()}"
     scratch, path = folder / f".{name}.partial", folder / f"{name}.parquet"
-    table = pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=PREDICTION_SCHEMA)
+    rows = [prediction_row(item) for item in predictions]
+    if asked is not None:
+        rows = [row | {ASKED: asked[row["query_id"]]} for row in rows]
+    table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA if asked is None else RUN_SCHEMA)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, scratch, compression="zstd")
@@ -99,6 +64,12 @@ def write_part(folder: Path, predictions: Sequence[Prediction]) -> Path:
         )
         raise StoreError(message) from error
     return path
+
+
+def _stamp_ns(folder: Path) -> int:
+    """Now, or just after the last part where a clock was set back: the later name is the newer row."""
+    before = (_PART.fullmatch(path.name) for path in folder.glob("part-*.parquet"))
+    return max(time.time_ns(), 1 + max((int(found[1]) for found in before if found), default=0))
 
 
 def _remove(path: Path) -> None:
@@ -123,10 +94,73 @@ def parts_of(path: Path) -> list[Path]:
     return sorted(path.glob("part-*.parquet")) or sorted(path.rglob("part-*.parquet"), key=lambda part: part.name)
 
 
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """What a row answers: the id of a query, what came of it, and the hash of what was asked.
+
+    The hash is empty in files of predictions and in runs of an older program: their rows answer whatever has their id.
+    Whoever takes them for answers must know from elsewhere to which queries.
+    """
+
+    query_id: str
+    status: str
+    asked: str
+
+    def answers(self, asked: Mapping[str, str], *, is_tied: bool = True) -> bool:
+        """Whether the row answers one of these queries, as they are now; one without a hash does if `is_tied`.
+
+        Examples
+        --------
+        >>> [Tie("a", "ok", said).answers({"a": "ff"}) for said in ("ff", "ee", "")]
+        [True, False, True]
+        """
+        now = asked.get(self.query_id)
+        return now is not None and (self.asked == now if self.asked else is_tied)
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """Answers of a run's folder to some queries, by id, and how many rows beside them answer others."""
+
+    found: dict[str, Prediction]
+    aside: int
+
+
+def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Answers:
+    """Answers to some queries out of a run's folder; of two for one query, the one that was written last.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run; one that was cut off before its first row has none.
+    asked : mapping of str to str
+        By query id, what an answer has to say that it answers (`taskdir.read_asked`).
+    is_tied : bool
+        Whether rows that do not say so are known to answer these queries.
+
+    Raises
+    ------
+    StoreError
+        If a part cannot be read.
+    """
+    found: dict[str, Prediction] = {}
+    aside: set[Tie] = set()
+    for part in reversed(parts_of(folder)):
+        table = _checked(part)
+        ties = _ties_of(table)
+        is_mine = [tie.answers(asked, is_tied=is_tied) for tie in ties]
+        aside |= {replace(tie, status="") for tie, mine in zip(ties, is_mine, strict=True) if not mine}
+        if not all(is_mine):
+            table = table.filter(pa.array(is_mine, pa.bool_()))
+        for prediction in _rows_of(part, table, found):
+            found.setdefault(prediction.query_id, prediction)
+    return Answers(found, len(aside))
+
+
 def read_predictions(path: Path) -> Iterator[Prediction]:
     """Predictions of a run's folder or of a file, newest first; of two for one query, the one that was written last.
 
-    A folder holds two where a query was asked again.
+    A folder holds two where a query was asked again, or was drawn anew and asked: `read_answers` tells them apart.
 
     Raises
     ------
@@ -139,14 +173,25 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         raise StoreError(message)
     seen: set[str] = set()
     for part in reversed(parts):
-        table = read_part(part)
-        if differing_columns(table):
-            message = f"{part} holds no predictions: 'validate' says what is missing"
-            raise StoreError(message)
-        for prediction in _sound(table) or _one_by_one(part, table, seen):
+        for prediction in _rows_of(part, _checked(part), seen):
             if prediction.query_id not in seen:
                 seen.add(prediction.query_id)
                 yield prediction
+
+
+def _checked(part: Path) -> pa.Table:
+    """A part that holds the columns of predictions."""
+    table = read_part(part)
+    for name, found, expected in differing_columns(table):
+        fault = f"{name}: found {found}, expected {expected}"[:200]
+        message = f"{part} holds no predictions ({fault}): 'validate' lists all that is missing"
+        raise StoreError(message)
+    return table
+
+
+def _rows_of(part: Path, table: pa.Table, seen: Collection[str]) -> Iterable[Prediction]:
+    """Rows, last first."""
+    return _sound(table) or _one_by_one(part, table, seen)
 
 
 def _sound(table: pa.Table) -> list[Prediction]:
@@ -164,12 +209,12 @@ def _sound(table: pa.Table) -> list[Prediction]:
     scores, ends = values.field("score").to_pylist(), column.offsets.to_pylist()
     rows = table.drop_columns(["candidates"]).to_pylist()
     return [
-        _prediction(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
+        with_candidates(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
         for at in reversed(range(len(rows)))
     ]
 
 
-def _one_by_one(part: Path, table: pa.Table, seen: set[str]) -> Iterator[Prediction]:
+def _one_by_one(part: Path, table: pa.Table, seen: Collection[str]) -> Iterator[Prediction]:
     """Rows of queries that were not seen yet, last first, each refused in a word of its own."""
     for number, row in reversed(list(enumerate(table.to_pylist()))):
         if row["query_id"] not in seen:
@@ -190,43 +235,6 @@ def _read_row(part: Path, number: int, row: Mapping[str, Any]) -> Prediction:
         raise StoreError(message) from error
 
 
-def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
-    """Columns that a table of predictions must hold and this one does not: their names, what is found, and expected.
-
-    More columns, in any order, do no harm.
-
-    Examples
-    --------
-    >>> differing_columns(PREDICTION_SCHEMA.empty_table().drop_columns(["message"]))
-    [('message', 'nothing', 'string')]
-    """
-    found = {field.name: field.type for field in table.schema}
-    return [
-        (field.name, str(found.get(field.name, "nothing")), str(field.type))
-        for field in PREDICTION_SCHEMA
-        if field.name not in found or not _is_like(found[field.name], field.type)
-    ]
-
-
-def _is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
-    """Whether a column can be read as another: any float for a float, any string for a string, null for anything."""
-    if pa.types.is_null(found) or found.equals(wanted):
-        return True
-    if pa.types.is_floating(wanted):
-        return bool(pa.types.is_floating(found) or pa.types.is_integer(found))
-    if pa.types.is_string(wanted):
-        return bool(pa.types.is_string(found) or pa.types.is_large_string(found))
-    if pa.types.is_list(wanted):
-        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
-        return is_list and pa.types.is_struct(found.value_type) and _has_fields(found.value_type, wanted.value_type)
-    return bool(pa.types.is_map(wanted) and pa.types.is_map(found))
-
-
-def _has_fields(found: pa.StructType, wanted: pa.StructType) -> bool:
-    names = {field.name for field in found}
-    return all(field.name in names and _is_like(found.field(field.name).type, field.type) for field in wanted)
-
-
 def read_part(path: Path) -> pa.Table:
     """A parquet file whole.
 
@@ -244,25 +252,36 @@ def read_part(path: Path) -> pa.Table:
         raise StoreError(message) from error
 
 
-def merge_runs(runs: Sequence[Path], into: Path) -> int:
+def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | None = None) -> int:
     """Write the predictions of several folders or files into one file, sorted by query; how many there are.
 
     Of two for one query the first counts, in the order of `runs`. The same predictions give the same file, whatever
     parts they came in.
 
+    Parameters
+    ----------
+    runs : sequence of Path
+        Folders and files.
+    into : Path
+        File to write.
+    asked : mapping of str to str, optional
+        Of folders only answers to these queries (`taskdir.read_asked`); without, all there are.
+
     Raises
     ------
     StoreError
-        If there are none, the folders are of different matchers, versions or settings, a file cannot be read, or the
-        new one cannot be written.
+        If there are none, the folders are of different matchers, versions or settings, two rows answer different
+        queries of one id, a file cannot be read, or the new one cannot be written.
     """
-    _check_one_matcher(runs)
+    check_one_matcher(runs)
+    if asked is None:
+        _check_one_query(runs)
     if into.exists() and not _is_ours(into):
         message = f"{into} is no predictions file and would be lost: name another one"
         raise StoreError(message)
     found: dict[str, Prediction] = {}
     for path in runs:
-        for prediction in read_predictions(path):
+        for prediction in _to_merge(path, asked):
             found.setdefault(prediction.query_id, prediction)
     rows = [prediction_row(found[name]) for name in sorted(found)]
     scratch = into.with_name(f".{into.name}.partial")
@@ -278,8 +297,25 @@ def merge_runs(runs: Sequence[Path], into: Path) -> int:
     return len(rows)
 
 
-def _check_one_matcher(runs: Sequence[Path]) -> None:
-    """Refuse folders whose `run.json` say different things of who answered; files say nothing of it."""
+def _to_merge(path: Path, asked: Mapping[str, str] | None) -> Iterable[Prediction]:
+    """All rows of a file; of a folder those that are asked for."""
+    if asked is None or not path.is_dir() or not parts_of(path):
+        return read_predictions(path)
+    return read_answers(path, asked).found.values()
+
+
+def check_one_matcher(runs: Sequence[Path]) -> None:
+    """Refuse folders whose `run.json` say different things of who answered; files say nothing of it.
+
+    Raises
+    ------
+    StoreError
+        If two folders are of different matchers, versions or settings, or a `run.json` is damaged.
+
+    Examples
+    --------
+    >>> check_one_matcher([Path("mine.parquet")])
+    """
     folders = [run.parent for path in runs if path.is_dir() for run in sorted(path.rglob(RUN))]
     said = [(path, read_run(path)) for path in folders]
     known = [(path, about) for path, about in said if about is not None]
@@ -288,9 +324,22 @@ def _check_one_matcher(runs: Sequence[Path]) -> None:
         if about.get("hash") != other.get("hash"):
             message = (
                 f"{path} holds answers of {_who(about)}, {first} those of {_who(other)}: "
-                "two matchers, versions or settings are never mixed"
+                "two matchers, versions or settings are never mixed, name the folder of one"
             )
             raise StoreError(message)
+
+
+def _check_one_query(runs: Sequence[Path]) -> None:
+    """Refuse answers to a query and to what it was once: a file of predictions could not tell them apart."""
+    found: dict[str, str] = {}
+    for path in runs:
+        for tie in read_ties(path) if path.is_dir() else []:
+            if tie.asked and found.setdefault(tie.query_id, tie.asked) != tie.asked:
+                message = (
+                    f"{path} holds answers to query {tie.query_id} and to what it was when it was drawn otherwise: "
+                    "name the tasks with --tasks"
+                )
+                raise StoreError(message)
 
 
 def _who(about: Mapping[str, Any]) -> str:
@@ -306,8 +355,36 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
-    """Ids of the queries a run has answered; those with a status in `again` do not count.
+def read_ties(folder: Path) -> list[Tie]:
+    """What the rows of a run's folder answer, in the order they were written.
+
+    Raises
+    ------
+    StoreError
+        If a part cannot be read, or is none.
+    """
+    found: list[Tie] = []
+    for part in parts_of(folder):
+        table = read_part(part)
+        if differing_columns(table):
+            message = f"{part} holds no predictions: move it out of the run's folder"
+            raise StoreError(message)
+        found += _ties_of(table)
+    return found
+
+
+def _ties_of(table: pa.Table) -> list[Tie]:
+    columns = [name for name in ("query_id", "status", ASKED) if name in table.column_names]
+    return [tie_of(row) for row in table.select(columns).to_pylist()]
+
+
+def tie_of(row: Mapping[str, Any]) -> Tie:
+    """What one row answers."""
+    return Tie(str(row["query_id"]), str(row["status"]), str(row.get(ASKED) or ""))
+
+
+def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = ()) -> set[str]:
+    """Ids of those queries that a run has answered as they are now; rows with a status in `again` do not count.
 
     Raises
     ------
@@ -315,15 +392,8 @@ def ids_done(folder: Path, *, again: Iterable[str] = ()) -> set[str]:
         If a part cannot be read, or is none.
     """
     left_out = set(again)
-    found: set[str] = set()
-    for part in parts_of(folder):
-        table = read_part(part)
-        if differing_columns(table):
-            message = f"{part} holds no predictions: move it out of the run's folder"
-            raise StoreError(message)
-        pairs = zip(table["query_id"].to_pylist(), table["status"].to_pylist(), strict=True)
-        found |= {name for name, status in pairs if status not in left_out}
-    return found
+    ties = read_ties(folder) if folder.is_dir() else []
+    return {tie.query_id for tie in ties if tie.status not in left_out and tie.answers(asked)}
 
 
 def write_run(folder: Path, about: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -17,12 +17,15 @@ import pyarrow.parquet as pq
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.evidence import CELLS_PER_BYTE
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
-from sasgeo_bench.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.store.regiondir import file_record, sha256_of
 from sasgeo_bench.store.taskrows import (
+    ASKED,
+    FILE_SCHEMA,
     HEAD_SCHEMA,
     QUERY_SCHEMA,
     TRUTH_SCHEMA,
+    asked_sha256,
     poses_of,
     query_of,
     query_row,
@@ -38,6 +41,7 @@ TRUTH_OF: Final = "truth.json"
 SCHEMA_VERSION: Final = 1
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of a suite or a region: one folder, never a way out
 _ROWS: Final = 128  # a row group; what is held in memory at once
+_MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
 _SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
 
 
@@ -73,10 +77,12 @@ def write_task(
     with ExitStack() as stack:
         queries, truths = (
             stack.enter_context(pq.ParquetWriter(path, schema, compression="zstd", compression_level=9))
-            for path, schema in ((task_folder / QUERIES, QUERY_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
+            for path, schema in ((task_folder / QUERIES, FILE_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
         )
         for part in _batches(pairs):
-            queries.write_table(pa.Table.from_pylist([query_row(query) for query, _ in part], schema=QUERY_SCHEMA))
+            rows = pa.Table.from_pylist([query_row(query) for query, _ in part], schema=QUERY_SCHEMA)
+            asked = [asked_sha256(row, _map_said(about)) for row in rows.to_pylist()]
+            queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
             for query, _ in part:
                 counts[query.track] = counts.get(query.track, 0) + 1
@@ -284,14 +290,55 @@ def read_hidden(truth_folder: Path) -> dict[str, Any]:
         return {}
 
 
-def read_some(folder: Path, wanted: frozenset[str]) -> Iterator[tuple[Query, bytes]]:
-    """The queries of some ids, each with its bytes for a matcher's process; a row group in memory at a time."""
+def map_of(manifest: Manifest) -> dict[str, str]:
+    """What `task.json` says of a map: what is on it, and all that it was built of."""
+    return {"map_fingerprint": manifest.fingerprint, "map_inputs_sha256": manifest.inputs_sha256}
+
+
+def is_of_map(about: Mapping[str, Any], manifest: Manifest) -> bool:
+    """Whether a task is to be searched in this very build of a map; one of an older program says less of it."""
+    return all(about.get(name, said) == said for name, said in map_of(manifest).items())
+
+
+def _map_said(about: Mapping[str, Any]) -> dict[str, str]:
+    return {name: str(about[name]) for name in _MAP if name in about}
+
+
+def read_asked(folder: Path) -> dict[str, str]:
+    """By query id, the hash of the query and of its map: what an answer has to say that it answers.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing or damaged.
+    """
+    about, path = _map_said(read_task(folder)), folder / QUERIES
+    with _named(path):
+        is_said = ASKED in pq.read_schema(path).names
+        columns = ["query_id", ASKED] if is_said else QUERY_SCHEMA.names
+        rows = (row for batch in _batches_of(path, columns) for row in batch.to_pylist())
+        return {row["query_id"]: _asked_of(row, about) for row in rows}
+
+
+def _asked_of(row: Mapping[str, Any], about: Mapping[str, str]) -> str:
+    """As the file says, or reckoned from the row where it was drawn before files said so."""
+    said = row.get(ASKED)
+    return asked_sha256(row, about) if said is None else str(said)
+
+
+def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
+    """The queries of some ids, each with its bytes for a matcher's process and the hash of what is asked.
+
+    A row group is in memory at a time.
+    """
+    about = _map_said(read_task(folder))
     with pq.ParquetFile(folder / QUERIES) as source:
         for batch in source.iter_batches(batch_size=_ROWS):
-            for row in range(batch.num_rows):
-                one = batch.slice(row, 1)
-                if one.column("query_id")[0].as_py() in wanted:
-                    yield query_of(one.to_pylist()[0]), stream_of(one)
+            sent = batch.select([name for name in batch.schema.names if name != ASKED])
+            for at, name in enumerate(batch["query_id"].to_pylist()):
+                if name in wanted:
+                    row = batch.slice(at, 1).to_pylist()[0]
+                    yield query_of(row), stream_of(sent.slice(at, 1)), _asked_of(row, about)
 
 
 def read_ids(folder: Path) -> list[str]:

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Queries and truths as rows: the columns of `queries.parquet` and `truth.parquet`, and back."""
 
+import datetime as dt
+import hashlib
+import json
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, Final
 
@@ -60,6 +64,11 @@ QUERY_SCHEMA: Final = pa.schema(
     ],
     metadata=_META,
 )
+
+
+# What is asked, in one word: an answer says it too, so that it is taken for that query on that map and for no other.
+ASKED: Final = "asked_sha256"
+FILE_SCHEMA: Final = QUERY_SCHEMA.append(pa.field(ASKED, pa.string()))
 
 
 HEAD_SCHEMA: Final = pa.schema(
@@ -187,6 +196,31 @@ def _vectors_of(rows: list[dict[str, Any]]) -> gpd.GeoDataFrame:
         },
         geometry=gpd.GeoSeries(shapely.from_wkb([row["wkb"] for row in rows]), dtype="geometry"),
     )
+
+
+def asked_sha256(row: Mapping[str, Any], map_said: Mapping[str, str]) -> str:
+    """Hash of all that decides an answer: the row of a query, and the map it is to be searched in.
+
+    Parameters
+    ----------
+    row : mapping
+        Of `QUERY_SCHEMA`, as it is read from a file; what is null or no column of the schema says nothing.
+    map_said : mapping of str to str
+        What `task.json` says of the map.
+
+    Examples
+    --------
+    >>> asked_sha256({"query_id": "a", "season": None}, {}) == asked_sha256({"query_id": "a", "more": 1}, {})
+    True
+    """
+    said = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
+    text = json.dumps([TASK_VERSION, dict(map_said), said], sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(value: bytes | dt.date) -> str:
+    """A value that JSON does not know, as text."""
+    return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
 
 
 def truth_row(truth: Truth) -> dict[str, Any]:

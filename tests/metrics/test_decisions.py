@@ -45,6 +45,9 @@ def test_every_query_has_one_outcome(rows, threshold) -> None:
     assert not (found.right_fix & ~answers.is_present).any()
 
 
+_JUNK = (0.0, True, False, True)
+
+
 def test_the_outcomes_of_every_kind_of_query() -> None:
     rows = [
         (0.9, True, True, True),  # right, accepted
@@ -60,10 +63,10 @@ def test_the_outcomes_of_every_kind_of_query() -> None:
     found = outcomes(answers, accept(answers, 0.5))
     assert np.flatnonzero(found.right_fix).tolist() == [0]
     assert np.flatnonzero(found.false_fix).tolist() == [1, 2]
-    assert np.flatnonzero(found.wrongly_withheld).tolist() == [3, 6]
-    assert np.flatnonzero(found.correctly_withheld).tolist() == [4, 5, 7]
-    # Ratio 20: two false fixes at 20, two withheld at 1; charged by place, the withheld wrong one of row 4 costs, too.
-    assert cost_values(answers, accept(answers, 0.5), 20.0).sum() == 42.0
+    assert np.flatnonzero(found.wrongly_withheld).tolist() == [3]
+    assert np.flatnonzero(found.correctly_withheld).tolist() == [4, 5, 6, 7]
+    # Ratio 20: two false fixes at 20, a right one withheld at 1; by place rows 4 and 6, present and not fixed, too.
+    assert cost_values(answers, accept(answers, 0.5), 20.0).tolist() == [0.0, 20.0, 20.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     assert cost_values(answers, accept(answers, 0.5), 20.0, charged="place").sum() == 43.0
 
 
@@ -112,7 +115,15 @@ def test_the_cost_of_withholding_everything_is_the_share_that_could_be_had() -> 
     assert decision_cost(answers, 5.0) == pytest.approx(1 / 3)
     assert decision_cost(answers, 5.0, charged="place") == pytest.approx(2 / 3)
     silent = answers_of([(None, False, False, True)] * 2)
-    assert decision_cost(silent, 5.0) == 1.0
+    assert decision_cost(silent, 5.0) == 0.0
+    assert decision_cost(silent, 5.0, charged="place") == 1.0
+
+
+def test_an_answer_withheld_costs_as_much_as_junk_that_nobody_trusts() -> None:
+    withheld, junk = (answers_of([(0.9, True, True, True), last]) for last in ((None, False, False, True), _JUNK))
+    for charged in ("right fix", "place"):
+        costs = [decision_cost(some, 20.0, charged=charged) for some in (withheld, junk)]
+        assert costs[0] == costs[1]
 
 
 @given(rows=ROWS, share=st.sampled_from([0.9, 0.7, 0.5]))

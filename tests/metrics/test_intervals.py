@@ -10,16 +10,20 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, bootstrap
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.metrics import intervals
+from sasgeo_bench.metrics import draws
 from sasgeo_bench.metrics.decisions import Answers
+from sasgeo_bench.metrics.draws import ClusterDraws
 from sasgeo_bench.metrics.integrity import aurc
 from sasgeo_bench.metrics.intervals import (
-    ClusterDraws,
+    Interval,
     bootstrap_means,
     bootstrap_statistic,
+    difference_interval,
+    effective_count,
     mean_difference,
     mean_interval,
     percentile_interval,
+    share_interval,
     statistic_interval,
     wilson,
     wilson_mean,
@@ -86,7 +90,7 @@ def test_a_draw_takes_as_many_blocks_as_there_are_and_from_each_as_many_queries_
     copies = np.stack([weights[:, names == name].sum(axis=1) / (names == name).sum() for name in set(blocks)], axis=1)
     assert (copies == np.round(copies)).all()
     assert (copies.sum(axis=1) == len(set(blocks))).all()
-    whole = np.vstack(list(ClusterDraws(blocks=blocks, seed=seed, draws=20, draws_queries=False).weights()))
+    whole = np.vstack(list(ClusterDraws(blocks=blocks, seed=seed, draws=20, draws_within=False).weights()))
     for name in set(blocks):
         assert (np.ptp(whole[:, names == name], axis=1) == 0).all()
 
@@ -98,38 +102,59 @@ def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch)
     assert bootstrap_means(values, one).tolist() == bootstrap_means(values, same).tolist()
     assert bootstrap_means(values, one).tolist() == bootstrap_means(values, one).tolist()
     assert bootstrap_means(values, one).tolist() != bootstrap_means(values, other).tolist()
-    monkeypatch.setattr(intervals, "_CHUNK_CELLS", 6 * 8)
+    monkeypatch.setattr(draws, "_CHUNK_CELLS", 6 * 8)
     chunks = list(one.weights())
     assert [len(chunk) for chunk in chunks] == [8] * 6 + [2]
     assert not np.array_equal(chunks[0], chunks[1])
 
 
-@given(blocks=BLOCKS, draws_queries=st.booleans())
-def test_sums_are_those_of_the_weights_and_numbers_serve_as_names(blocks, draws_queries) -> None:
-    drawn = ClusterDraws(blocks=blocks, seed=5, draws=20, draws_queries=draws_queries)
+@given(blocks=BLOCKS, draws_within=st.booleans())
+def test_sums_are_those_of_the_weights_and_numbers_serve_as_names(blocks, draws_within) -> None:
+    drawn = ClusterDraws(blocks=blocks, seed=5, draws=20, draws_within=draws_within)
     table = np.random.default_rng(6).random((len(blocks), 3))
     sums = np.vstack(list(drawn.sums(table)))
     np.testing.assert_allclose(sums, np.vstack(list(drawn.weights())) @ table, rtol=1e-12)
     hits = (table > 0.5).astype(float)  # whole numbers come out whole
     assert np.array_equal(np.vstack(list(drawn.sums(hits))), np.vstack(list(drawn.weights())) @ hits)
     numbers = np.unique(blocks, return_inverse=True)[1]
-    same = ClusterDraws(blocks=numbers, seed=5, draws=20, draws_queries=draws_queries)
+    same = ClusterDraws(blocks=numbers, seed=5, draws=20, draws_within=draws_within)
     assert np.array_equal(np.vstack(list(same.sums(table))), sums)
 
 
-@pytest.mark.parametrize("draws_queries", [True, False])
-def test_the_spread_of_means_is_what_theory_says(draws_queries) -> None:
+@pytest.mark.parametrize("draws_within", [True, False])
+def test_the_spread_of_means_is_what_theory_says(draws_within) -> None:
     # B equal blocks of n: variance of block means / B, and with queries drawn the mean variance within / (B n).
     rng = np.random.default_rng(2)
     values = rng.normal(size=(12, 9)) + rng.normal(size=(12, 1))
     blocks = np.repeat([f"block {at}" for at in range(12)], 9)
-    drawn = ClusterDraws(blocks=list(blocks), seed=3, draws=20_000, draws_queries=draws_queries)
+    drawn = ClusterDraws(blocks=list(blocks), seed=3, draws=20_000, draws_within=draws_within)
     means = bootstrap_means(values.ravel(), drawn)
     expected = values.mean(axis=1).var() / 12
-    if draws_queries:
+    if draws_within:
         expected += values.var(axis=1).mean() / (12 * 9)
     assert means.var() == pytest.approx(expected, rel=0.05)
     assert means.mean() == pytest.approx(values.mean(), abs=4 * math.sqrt(expected / 20_000))
+
+
+@given(sites=st.lists(st.integers(0, 9), min_size=1, max_size=25), seed=st.integers(0, 2**40))
+def test_the_queries_of_a_site_are_drawn_together_as_one_of_its_block(sites, seed) -> None:
+    names = list(dict.fromkeys(sites))
+    blocks = [f"block {site % 3}" for site in sites]
+    drawn = ClusterDraws(blocks=blocks, sites=[f"site {site}" for site in sites], seed=seed, draws=20)
+    weights = np.vstack(list(drawn.weights()))
+    alone = ClusterDraws(blocks=[f"block {site % 3}" for site in names], seed=seed, draws=20)
+    of_site = np.vstack(list(alone.weights()))
+    assert np.array_equal(weights, of_site[:, [names.index(site) for site in sites]])
+    table = np.random.default_rng(6).random((len(sites), 3))
+    np.testing.assert_allclose(np.vstack(list(drawn.sums(table))), weights @ table, rtol=1e-12)
+
+
+def test_a_name_of_a_site_in_two_blocks_is_two_sites() -> None:
+    drawn = ClusterDraws(blocks=["a", "b"], sites=["p", "p"], seed=1, draws=100)
+    weights = np.vstack(list(drawn.weights()))
+    assert not np.array_equal(weights[:, 0], weights[:, 1])
+    with pytest.raises(MetricError, match="1 blocks for 2 queries"):
+        ClusterDraws(blocks=["a", "b"], sites=["p"], seed=1)
 
 
 @given(blocks=BLOCKS)
@@ -156,7 +181,7 @@ def test_two_methods_share_their_draws() -> None:
     np.testing.assert_allclose(side_by_side[:, 0] - side_by_side[:, 1], apart)
     found = mean_difference(ours, theirs, drawn)
     assert (found.lo, found.hi) == tuple(np.quantile(apart, [0.025, 0.975], method="inverted_cdf"))
-    assert mean_difference(ours, ours, drawn) == intervals.Interval(value=0.0, lo=0.0, hi=0.0)
+    assert mean_difference(ours, ours, drawn) == Interval(value=0.0, lo=0.0, hi=0.0)
     # A difference that holds for every query is seen however much the queries vary.
     assert mean_difference(ours + 0.01, ours, drawn).lo == pytest.approx(0.01)
 
@@ -200,7 +225,7 @@ def test_draws_without_a_query_that_counts_are_left_out() -> None:
     drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=200)
     means = bootstrap_means([1.0, 0.0], drawn, [1.0, 0.0])
     assert 0.15 < np.isnan(means).mean() < 0.35  # block b twice
-    assert mean_interval([1.0, 0.0], drawn, [1.0, 0.0]) == intervals.Interval(value=1.0, lo=1.0, hi=1.0)
+    assert mean_interval([1.0, 0.0], drawn, [1.0, 0.0]) == Interval(value=1.0, lo=1.0, hi=1.0)
     assert math.isnan(percentile_interval(1.0, [math.nan]).lo)
 
 
@@ -231,3 +256,51 @@ def test_what_cannot_be_is_refused() -> None:
         ClusterDraws(blocks=["a"], seed=1, draws=0)
     with pytest.raises(MetricError, match="weights"):
         bootstrap_means([1.0, 0.0], drawn, [1.0, -1.0])
+
+
+# Few sites
+
+
+def test_sites_count_by_their_mass() -> None:
+    assert effective_count(["p", "q", "p", "q", "r", "r"]) == pytest.approx(3)
+    # Masses 9 and 1: 100 / 82.
+    assert effective_count([0] * 9 + [1]) == pytest.approx(100 / 82)
+    assert effective_count(["p", "q", "r"], [1.0, 1.0, 0.0]) == 2
+    assert effective_count([]) == effective_count(["p"], [0.0]) == 0
+
+
+def test_an_interval_is_the_wider_of_both_at_each_end() -> None:
+    # z^2 = 3.8415: of 3 in 4 Wilson's is (0.75 + 0.4802 -+ 1.96 sqrt(0.1875 / 4 + 0.0600)) / 1.9604.
+    lo, hi = 0.30064, 0.95441
+    few, how = share_interval(0.75, np.array([0.7, 0.75, 0.8]), 4)
+    assert (few.lo, few.hi, how) == (pytest.approx(lo, abs=1e-4), pytest.approx(hi, abs=1e-4), "wilson")
+    apart, how = share_interval(0.75, np.linspace(0.2, 1.0, 1001), 4)
+    assert (apart.lo, apart.hi, how) == (pytest.approx(0.22), pytest.approx(0.98), "blocks")
+    one_sided, how = share_interval(0.75, np.linspace(0.5, 1.0, 1001), 4)
+    assert (one_sided.lo, one_sided.hi, how) == (pytest.approx(lo, abs=1e-4), pytest.approx(0.9875), "wilson")
+    alone, how = share_interval(0.75, [], 4)
+    assert (alone, how) == (wilson(3, 4), "wilson")
+    nothing, how = share_interval(math.nan, [math.nan], 4)
+    assert math.isnan(nothing.lo)
+    assert how == ""
+
+
+@given(
+    sites=st.lists(st.integers(0, 6), min_size=2, max_size=40),
+    seed=st.integers(0, 2**30),
+    shares=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+)
+def test_who_is_right_wherever_another_one_is_has_no_lower_end(sites, seed, shares) -> None:
+    lot = np.random.default_rng(seed).random(len(sites))
+    table = np.column_stack([lot < share for share in sorted(shares)] + [np.ones(len(sites))]).astype(float)
+    drawn = ClusterDraws(blocks=[str(site % 3) for site in sites], sites=sites, seed=seed, draws=50)
+    means, trials = bootstrap_means(table, drawn), effective_count(sites)
+    ends = [share_interval(float(table[:, at].mean()), means[:, at], trials)[0] for at in range(3)]
+    assert sorted(end.lo for end in ends) == [end.lo for end in ends]
+    assert sorted(end.hi for end in ends) == [end.hi for end in ends]
+
+
+def test_a_difference_of_shares_has_both_their_doubts() -> None:
+    ours, theirs = Interval(value=0.5, lo=0.2, hi=0.8), Interval(value=0.1, lo=0.0, hi=0.5)
+    found = difference_interval(ours, theirs)
+    assert (found.value, found.lo, found.hi) == pytest.approx((0.4, 0.4 - 0.5, 0.4 + math.hypot(0.3, 0.1)))

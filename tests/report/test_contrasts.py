@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Registered contrasts: a real difference is found, none is a null, and what cannot be decided is said to be so."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.metrics.intervals import wilson
 from sasgeo_bench.report.contrasts import COLUMNS, Contrast, contrast_frame, hold_contrasts
 from tests.report.test_tables import scores
 
@@ -54,6 +56,23 @@ def test_no_difference_is_a_null_and_says_how_sure_it_is():
     few = errors(0.7, 40)
     unsure = held(CONTRAST, **{"with": scores(few, blocks=10), "without": scores(errors(0.7, 40, seed=9), blocks=10)})
     assert unsure.verdict == "null: no difference shown, and one that matters is not ruled out"
+
+
+def test_of_few_sites_no_difference_is_not_ruled_out():
+    same = {name: scores(np.ones(6), blocks=6) for name in ("with", "without")}
+    found = held(CONTRAST, **same)
+    most = wilson(0, 6).hi  # neither won a query: each may have, as often as 0 of 6 allows
+    assert (found.lo, found.hi) == pytest.approx((-most, most))
+    assert found.verdict == "null: no difference shown, and one that matters is not ruled out"
+
+
+def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
+    # Two blocks of two sites of ten queries: the first is right at all of them, the second at none.
+    sites = {"block": [f"b{at // 20}" for at in range(40)], "pair_id": [f"s{at // 10}" for at in range(40)]}
+    found = held(CONTRAST, **{"with": scores(np.ones(40), **sites), "without": scores(99 * np.ones(40), **sites)})
+    won, lost = wilson(4, 4), wilson(0, 4)
+    assert found.lo == pytest.approx(1 - math.hypot(1 - won.lo, lost.hi))
+    assert (found.difference, found.hi) == (1.0, 1.0)
 
 
 def test_few_blocks_decide_nothing():

@@ -8,8 +8,9 @@ import pytest
 
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.metrics.decisions import COST_RATIOS
+from sasgeo_bench.metrics.draws import ClusterDraws
 from sasgeo_bench.metrics.integrity import aurc
-from sasgeo_bench.metrics.intervals import ClusterDraws, statistic_interval
+from sasgeo_bench.metrics.intervals import statistic_interval, wilson
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import OWN, answers_of, own_word
 from sasgeo_bench.report.rows import to_frame
@@ -94,11 +95,26 @@ def test_nothing_but_right_or_nothing_but_false_fixes_is_told_plainly(error_m):
     is_right = error_m < 25
     table = scores(np.full(120, error_m), confidence=np.random.default_rng(2).random(120))
     found = pooled(table, split_of("crossfit"))
-    assert found["aurc"]["value"] == found["aurc"]["lo"] == found["aurc"]["hi"] == (0.0 if is_right else 1.0)
+    assert found["aurc"]["value"] == (0.0 if is_right else 1.0)
+    expected = wilson(0 if is_right else 120, 120)
+    assert (found["aurc"]["lo"], found["aurc"]["hi"], found["aurc"]["interval"]) == (expected.lo, expected.hi, "wilson")
     assert found["e_aurc"]["value"] == 0.0
     assert found["coverage_at_risk_0.05"]["value"] == pytest.approx(1.0 if is_right else 0.0, abs=0.1)
     reached = found["risk_reached_at_0.05"]["value"]
     assert reached == 0.0 if is_right else math.isnan(reached)
+
+
+def test_ten_queries_of_a_site_are_one_place_to_rejection_too():
+    sure = np.random.default_rng(3).random(30)
+    one = scores(ERRORS[:30], confidence=sure)
+    ten = scores(
+        np.repeat(ERRORS[:30], 10),
+        confidence=np.repeat(sure, 10),
+        **{name: np.repeat(one[name], 10).to_numpy() for name in ("pair_id", "block", "place")},
+    )
+    for name in ("augrc", "coverage_at_risk_0.05"):
+        rows = [pooled(table, split_of("crossfit"))[name][["value", "lo", "hi"]].tolist() for table in (one, ten)]
+        assert rows[0] == pytest.approx(rows[1])
 
 
 def test_thresholds_of_a_split_are_chosen_on_other_places():
@@ -120,3 +136,26 @@ def test_withholding_all_is_no_cost_by_right_fixes_and_the_whole_one_by_places()
     for ratio in COST_RATIOS:
         assert found[f"cost_{ratio:g}"]["value"] == 0.0
         assert found[f"cost_{ratio:g}_place"]["value"] == 1.0
+
+
+def test_without_an_answer_a_query_is_false_at_full_coverage_and_no_part_of_calibration():
+    # Half of the answers are withheld or missing, the others right and sure: risk is 0 up to half of the coverage.
+    is_there = np.arange(120) % 2 == 0
+    status = np.where(is_there, "ok", np.where(np.arange(120) % 4 == 1, "ok", "missing"))
+    table = scores(np.where(is_there, 1.0, math.inf), confidence=np.where(is_there, 0.96, math.nan), status=status)
+    found = {name: row["value"] for name, row in pooled(table).items()}
+    false = np.arange(1, 61)
+    assert found["aurc"] == pytest.approx((false / (60 + false)).sum() / 120)
+    assert (found["brier"], found["ece"]) == pytest.approx((0.04**2, 0.04))
+    assert (found["cost_20"], found["cost_20_place"]) == (0.0, 0.5)
+
+
+def test_an_order_that_is_no_probability_has_no_figures_that_judge_one():
+    judged = own_word(scores(ERRORS, confidence=np.where(ERRORS < 25, 0.75, 0.25)))
+    told, bare = (
+        {row.metric for row in integrity_rows("mine", "margin", judged, is_calibrated=is_calibrated)}
+        for is_calibrated in (True, False)
+    )
+    costs = {f"cost_{ratio:g}{kind}" for ratio in COST_RATIOS for kind in ("", "_place")}
+    assert told - bare == {"brier", "ece", *costs}
+    assert {"aurc", "e_aurc", "augrc"} < bare

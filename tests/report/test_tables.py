@@ -2,20 +2,25 @@
 """The leaderboard: figures worked out by hand, denominators that never move, ranks that say how sure they are."""
 
 import math
+import re
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from sasgeo_bench.errors import MetricError
+from sasgeo_bench.metrics.compare import LEAST_BLOCKS
 from sasgeo_bench.metrics.intervals import wilson
+from sasgeo_bench.report.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.report.controls import Verdict
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
+from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.rejection import own_word
 from sasgeo_bench.report.rows import COLUMNS, to_frame
 from sasgeo_bench.report.strata import strata
 from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.report.text import board_latex, board_markdown, summary, tables_of, warnings_of
+from sasgeo_bench.report.text import board_markdown, summary, tables_of, warnings_of
 from sasgeo_bench.score import COLUMNS as SCORED
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
@@ -39,7 +44,7 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
             "view_cells": 192,
             "cell_size_m": 1.0,
             "pool": 0,
-            "pair_id": "p",
+            "pair_id": [f"p{at:05d}" for at in range(count)],
             "role": "stress",
             "kind": "U1",
             "strength": 0.3,
@@ -72,6 +77,10 @@ def pick(board, matcher, metric, stratum="all"):
     return rows.iloc[0]
 
 
+def ranks(row):
+    return tuple(None if pd.isna(row[name]) else int(row[name]) for name in ("rank_best", "rank_worst"))
+
+
 def test_figures_are_what_they_are_by_hand():
     board = leaderboard({"mine": scores([1.0, 8.0, 20.0, 40.0, math.inf, 25.0, 25.1, 5.0])}, draws=200)
     assert tuple(board.columns) == COLUMNS
@@ -86,6 +95,15 @@ def test_figures_are_what_they_are_by_hand():
     assert (row["n"], row["answered"], row["missing"], row["blocks"], row["places"]) == (8, 7, 0, 4, 2)
     assert row["lo"] < row["value"] < row["hi"]
     assert row["interval"] == "blocks"
+
+
+def test_a_fix_that_is_near_and_turned_is_no_success_and_yet_within():
+    table = scores([1.0, 1.0, 25.0, 26.0], yaw_error_deg=[5.0, 5.1, 180.0, 0.0])
+    board = leaderboard({"mine": table}, draws=200)
+    assert pick(board, "mine", "success_25m")["value"] == 0.25
+    assert pick(board, "mine", "within_25m")["value"] == 0.75 == table["is_right"].mean()
+    ((_, shown),) = tables_of(board)
+    assert shown["within_25m"].iloc[0].startswith("0.750 [")
 
 
 def test_recall_counts_ties_in_proportion():
@@ -109,16 +127,59 @@ def test_of_one_block_the_interval_is_wilsons_over_sites_and_nothing_is_ranked()
     sites = ["one", "one", "other", "other"]
     both = {"a": scores([1.0] * 3 + [99.0], blocks=1, pair_id=sites), "b": scores([99.0] * 4, blocks=1, pair_id=sites)}
     board = leaderboard(both, draws=200)
-    row, expected = pick(board, "a", "success_25m"), wilson(0.75 * 2, 2)
+    row, expected = pick(board, "a", "success_25m"), wilson(0.75 * 2, 2.0)
     assert (row["lo"], row["hi"], row["interval"]) == (expected.lo, expected.hi, "wilson")
-    assert {tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in both} == {(0, 0)}
+    assert {ranks(pick(board, name, "success_25m")) for name in both} == {(None, None)}
     assert math.isnan(row["detectable"])
 
 
 def test_where_nothing_varies_the_interval_is_as_wide_as_few_sites_make_it():
-    sites = [f"s{at % 7}" for at in range(100)]
-    row = pick(leaderboard({"mine": scores([1.0] * 100, blocks=5, pair_id=sites)}, draws=200), "mine", "success_25m")
+    sites = [f"s{at % 7}" for at in range(98)]
+    row = pick(leaderboard({"mine": scores([1.0] * 98, blocks=5, pair_id=sites)}, draws=200), "mine", "success_25m")
     assert (row["value"], row["lo"]) == (1.0, wilson(7, 7).lo)
+
+
+def test_ten_queries_of_a_site_say_no_more_of_other_sites_than_one():
+    errors = np.where(np.random.default_rng(4).random(36) < 0.6, 1.0, 99.0)
+    sites, copies = [f"s{at}" for at in range(36)], 10
+    one = scores(errors, blocks=12, pair_id=sites)
+    ten = scores(
+        np.repeat(errors, copies), pair_id=np.repeat(sites, copies), block=np.repeat(one["block"].to_numpy(), copies)
+    )
+    boards = [leaderboard({"mine": table}, draws=500) for table in (one, ten)]
+    for metric in ("success_25m", "success_auc_50m", "position_median", "position_p90"):
+        rows = [pick(board, "mine", metric)[["value", "lo", "hi"]].tolist() for board in boards]
+        assert rows[0] == pytest.approx(rows[1])
+
+
+def test_figures_of_few_sites_keep_their_order_whichever_way_their_ends_were_found():
+    sites, kinds = [f"s{at // 10}" for at in range(40)], ["U1"] * 40
+    part = np.where(np.arange(40) % 10 < 7, 1.0, 99.0)  # seven of ten at each of four sites
+    tables = {name: scores(errors, blocks=2, block=[f"b{at // 20}" for at in range(40)], pair_id=sites, kind=kinds)
+              for name, errors in (("all", np.ones(40)), ("part", part))}  # fmt: skip
+    board = leaderboard(tables, draws=200)
+    all_of_it, part_of_it = (pick(board, name, "success_25m") for name in ("all", "part"))
+    assert (part_of_it["lo"], part_of_it["hi"]) == pytest.approx((wilson(2.8, 4).lo, wilson(2.8, 4).hi))
+    assert part_of_it["lo"] < all_of_it["lo"]
+    assert {all_of_it["interval"], part_of_it["interval"]} == {"wilson"}
+
+
+def test_a_higher_quantile_has_no_lower_end():
+    # Of four sites nine in ten errors are small: p90 is the largest of these, p99 the largest of all.
+    errors = [0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 20.0, 60.0, 500.0] * 4
+    board = leaderboard({"mine": scores(errors, blocks=2, pair_id=[f"s{at // 10}" for at in range(40)])}, draws=200)
+    rows = [pick(board, "mine", f"position_{name}") for name in ("median", "p90", "p99")]
+    assert [row["value"] for row in rows] == [1.0, 60.0, 500.0]
+    assert sorted(row["lo"] for row in rows) == [row["lo"] for row in rows]
+    assert sorted(row["hi"] for row in rows) == [row["hi"] for row in rows]
+
+
+def test_an_infinite_quantile_is_as_unsure_as_any():
+    # 12 of 100 without an answer: p90 is infinite, but Wilson's of 90 in 100 begins at 0.826, the 83rd error.
+    board = leaderboard({"mine": scores([*range(88), *[math.inf] * 12], blocks=1)}, draws=200)
+    row = pick(board, "mine", "position_p90")
+    assert wilson(90, 100).lo == pytest.approx(0.8256, abs=1e-4)
+    assert (row["value"], row["lo"], row["hi"]) == (math.inf, 82.0, math.inf)
 
 
 def test_ranks_tell_apart_what_differs_and_nothing_else():
@@ -126,10 +187,25 @@ def test_ranks_tell_apart_what_differs_and_nothing_else():
     good, same, bad = (np.where(chance.random(600) < share, 1.0, 99.0) for share in (0.8, 0.8, 0.2))
     tables = {name: scores(errors, blocks=60) for name, errors in (("good", good), ("same", same), ("bad", bad))}
     board = leaderboard(tables | {"oracle_pose": scores(np.ones(600), blocks=60)}, draws=1000)
-    ranks = {name: tuple(pick(board, name, "success_25m")[["rank_best", "rank_worst"]]) for name in tables}
-    assert ranks == {"good": (1, 2), "same": (1, 2), "bad": (3, 3)}
-    assert tuple(pick(board, "oracle_pose", "success_25m")[["rank_best", "rank_worst"]]) == (0, 0)
+    assert {name: ranks(pick(board, name, "success_25m")) for name in tables} == {
+        "good": (1, 2),
+        "same": (1, 2),
+        "bad": (3, 3),
+    }
+    assert ranks(pick(board, "oracle_pose", "success_25m")) == (None, None)
     assert 0 < pick(board, "good", "success_25m")["detectable"] < 0.2
+
+
+@pytest.mark.parametrize(("blocks", "expected"), [(5, {(None, None)}), (6, {(1, 1), (2, 2)})])
+def test_as_few_blocks_as_decide_no_contrast_rank_nobody(blocks, expected):
+    both = {"good": scores([1.0] * 60, blocks=blocks), "bad": scores([99.0] * 60, blocks=blocks)}
+    board = leaderboard(both, draws=200)
+    rows = [pick(board, name, "success_25m") for name in both]
+    assert {ranks(row) for row in rows} == expected
+    assert [math.isnan(row["detectable"]) for row in rows] == [blocks < LEAST_BLOCKS] * 2
+    contrast = Contrast(name="both", first="good", second="bad", suites=("occlusion",))
+    (found,) = hold_contrasts([contrast], both, {}, draws=200)
+    assert found.verdict.startswith("not decided") == (blocks < LEAST_BLOCKS)
 
 
 def test_absent_places_are_no_part_of_success_and_are_counted_apart():
@@ -140,12 +216,12 @@ def test_absent_places_are_no_part_of_success_and_are_counted_apart():
 
 
 def test_a_suite_a_matcher_cannot_has_a_row_without_a_figure_and_no_rank():
-    tables = {"a": scores([1.0, 99.0]), "b": scores([math.inf] * 2, status="not applicable")}
+    tables = {"a": scores([1.0, 99.0] * 3, blocks=6), "b": scores([math.inf] * 6, blocks=6, status="not applicable")}
     board = leaderboard(tables, draws=200)
     row = pick(board, "b", "success_25m")
     assert not row["is_applicable"]
     assert math.isnan(row["value"])
-    assert tuple(pick(board, "a", "success_25m")[["rank_best", "rank_worst"]]) == (1, 1)
+    assert ranks(pick(board, "a", "success_25m")) == (1, 1)
 
 
 def test_prior_groups_are_never_ranked_together():
@@ -205,9 +281,33 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
     ((title, short),) = summary(board)
-    assert title == "success_25m, localization, prior group r500-weak-s3 (rank)"
-    assert short["occlusion"].tolist() == ["0.250 (1)", "0.000 (control)"]
+    assert title == "success_25m [95 %] (rank), localization, prior group r500-weak-s3"
+    one, none = wilson(1, 4), wilson(0, 4)
+    expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
+    shown = short["occlusion, n = 4"].tolist()
+    assert shown[1] == expected[1]
+    assert shown[0].endswith("] (-)")
+    assert f"| {none.value:.3f} [0.000, {none.hi:.3f}]† |" in text
     assert len(warnings_of(board)) == 2
+
+
+def test_two_versions_of_a_control_are_controls_both():
+    names = ("oracle_pose 1 (aaaaaa)", "oracle_pose 1 (bbbbbb)", "mine")
+    board = leaderboard({name: scores([1.0, 99.0] * 10, blocks=6) for name in names}, draws=200)
+    found = {name: ranks(pick(board, name, "success_25m")) for name in names}
+    assert found == {names[0]: (None, None), names[1]: (None, None), "mine": (1, 1)}
+    ((_, short),) = summary(board)
+    assert sorted(cell.partition("] ")[2] for cell in short["occlusion, n = 20"]) == ["(1)", "(control)", "(control)"]
+
+
+def test_no_name_breaks_a_table():
+    name = r"mine 1|2 <b> \$ {x} ~ ^"
+    board = leaderboard({name: scores([1.0, 99.0])}, draws=200)
+    (row,) = (line for line in board_markdown(board, ABOUT).splitlines() if "mine 1" in line)
+    assert r"mine 1\|2 &lt;b>" in row
+    assert row.replace(r"\|", "").count("|") == 10
+    expected = r"mine 1$|$2 $<$b$>$ \textbackslash{}\$ \{x\} \textasciitilde{} \textasciicircum{}"
+    assert expected in board_latex(board, ABOUT)
 
 
 def test_the_board_says_what_each_of_its_columns_is():
@@ -221,7 +321,7 @@ def test_the_board_says_what_each_of_its_columns_is():
     told = {name for line in text.splitlines() if line for name in line.split("**")[1].split(", ")}
     shown = {str(column) for _, table in tables_of(board) for column in table.columns}
     names = {column.split(",")[0].split(" (")[0].removesuffix("_p50").removesuffix("_p95") for column in shown}
-    assert names - told == {"matcher", "rank"}
+    assert names - told == {"matcher"}
     assert "rejector" in shown
     assert "false fixes" in shown
 
@@ -232,7 +332,7 @@ def test_one_query_of_a_kind_and_none_of_another_are_told_as_they_are():
     row = pick(board, "mine", "success_25m", "U2")
     assert (row["n"], row["blocks"], row["value"], row["interval"]) == (1, 1, 0.0, "wilson")
     assert (row["lo"], row["hi"]) == (0.0, wilson(0, 1).hi)
-    assert tuple(row[["rank_best", "rank_worst"]]) == (0, 0)
+    assert ranks(row) == (None, None)
     assert math.isnan(row["detectable"])
     assert "U3" not in set(board["stratum"])
     assert "answered_absent" not in set(board["metric"])  # no place was absent
@@ -249,3 +349,29 @@ def test_a_board_of_nothing_is_an_empty_table():
     assert to_frame([]).empty
     assert leaderboard({}).empty
     assert warnings_of(leaderboard({})) == []
+
+
+def test_of_candidates_a_board_says_what_guessing_is_worth():
+    found = {"above": [0, 1, 0, 0], "tied": 1, "right": 1}
+    board = leaderboard({"mine": scores([math.nan] * 4, track="retrieval", pool=[10, 10, 50, 50], **found)}, draws=200)
+    assert pick(board, "mine", "chance_1")["value"] == pytest.approx((0.1 + 0.02) / 2)
+    ((title, _),) = tables_of(board)
+    assert title.endswith(" (chance: 0.060)")
+    ((_, short),) = summary(board)
+    assert short.columns[1] == "occlusion, n = 4, chance 0.060"
+
+
+def test_a_paper_gets_contrasts_controls_labels_and_where_data_are_from():
+    tables = {"mine": scores([1.0, 99.0] * 4), "other": scores([99.0] * 8)}
+    contrast = Contrast(name="first_one", first="mine", second="other", suites=("occlusion",))
+    findings = hold_contrasts([contrast], tables, {}, draws=200)
+    verdict = Verdict(control="twins", matcher="mine", n=4, found=2.0, expected=2.0, p=math.nan, holds=True)
+    latex = board_latex(leaderboard(tables, draws=200), ABOUT, findings, [verdict])
+    labels = re.findall(r"label{tab:(.*)}", latex)
+    assert labels == ["contrasts", "occlusion-localization-prior-group-r500-weak-s3", "controls"]
+    captions = [line for line in latex.splitlines() if line.startswith(r"\caption")]
+    assert all("(c) OpenStreetMap contributors, ODbL" in line for line in captions)
+    assert [r"$^\dagger$ Wilson" in line for line in captions] == [False, True, False]
+    assert r"first\_one" in latex
+    assert "booktabs" in latex.split(r"\begin{table}")[0]
+    assert "resizebox" in latex.split(r"\begin{table}")[0]

@@ -112,6 +112,14 @@ class Segfaults(Plain):
         time.sleep(5)
 
 
+class DiesByAnySignal(Plain):
+    """A signal of real time, which has no name."""
+
+    def match(self, query, *, top_k):
+        os.kill(os.getpid(), 40)
+        time.sleep(5)
+
+
 class Exits(Plain):
     def match(self, query, *, top_k):
         print("last words")
@@ -156,6 +164,33 @@ class Prints(Plain):
 class ScoresNan(Plain):
     def match(self, query, *, top_k):
         return Match(poses=[Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)], scores=[float("nan")])
+
+
+class SureByWords(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=(), scores=(), confidence="0.5")
+
+
+class SureBeyondNumbers(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=(), scores=(), confidence=10**400)
+
+
+class MeasuresItself(Plain):
+    """Has the runner told of a map of endless size: it changes what is measured with in its own process."""
+
+    def __init__(self):
+        sizes = iter((0, float("inf")))
+        sys.modules["sasgeo_bench.run.serve"]._resident_bytes = lambda: next(sizes)
+
+
+class LeavesAtOnce(Plain):
+    def __init__(self):
+        sys.exit(0)
+
+
+class ClaimsToBeTheOracle(Plain):
+    card = MatcherCard(name="oracle_pose", tracks=("localization", "retrieval"), **SAID)
 
 
 class ReturnsText(Plain):

@@ -85,6 +85,13 @@ def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
     assert len(table(folder)) == 5
 
 
+def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
+    plans = [plan_run(request_of(task, tmp_path, limit=count)) for count in (2, 2, 3)]
+    reports = [run(plan, tell=lambda _: None) for plan in plans]
+    assert [report.counts for report in reports] == [{"ok": 2}, {}, {"ok": 1}]
+    assert sum(len(rundir.read_part(part)) for part in rundir.parts_of(plans[0].parts[0].folder)) == 3
+
+
 def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, name="Raises", limit=2))
     assert {item.status for item in table(folder)} == {"crash"}
@@ -116,7 +123,7 @@ def test_killed_at_random_moments_a_run_ends_with_the_same_rows(place, task, und
         time.sleep(0 if number == 0 else chance.uniform(0.5, 4.0))
         process.kill()
         process.wait()
-        done = len(rundir.ids_done(folder)) if folder.is_dir() else 0
+        done = len(rundir.ids_done(folder, taskdir.read_asked(task)))
         cut_off += 0 < done < every
         if done == every:
             for part in rundir.parts_of(folder):
@@ -152,7 +159,7 @@ def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task
     _, told = process.communicate()
     assert process.returncode == 130
     assert "interrupted; what was finished is kept" in told.splitlines()[-1]
-    assert 0 < len(rundir.ids_done(folder)) < len(taskdir.read_ids(task))
+    assert 0 < len(rundir.ids_done(folder, taskdir.read_asked(task))) < len(taskdir.read_ids(task))
     run_all(request_of(task, tmp_path, name="Slow"))
     assert table(folder) == table(undisturbed[1])
 
@@ -196,6 +203,7 @@ def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path):
         ({"jobs": 0}, ConfigError, "--jobs must be at least 1"),
         ({"top_k": 0}, ConfigError, "--top-k must be at least 1"),
         ({"spec": "hostile:NoCard"}, MatchError, "card is a NoneType"),
+        ({"spec": "hostile:ClaimsToBeTheOracle"}, MatchError, "'oracle_pose' is the name of a control of the runner"),
         ({"spec": "no_such_matcher"}, MatchError, "there is no matcher"),
         ({"spec": "no_such_module:Class"}, MatchError, "cannot be imported"),
     ],
@@ -206,12 +214,17 @@ def test_what_makes_no_sense_is_refused_before_anything_is_written(task, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_answers_to_other_queries_are_not_added_to(task, tmp_path):
-    _, folder = run_all(request_of(task, tmp_path, limit=1))
+def test_rows_of_an_older_program_are_taken_for_the_task_that_its_run_json_names_and_for_no_other(task, tmp_path):
+    _, folder = run_all(request_of(task, tmp_path, limit=2))
+    (part,) = rundir.parts_of(folder)
+    pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
+    assert plan_run(request_of(task, tmp_path, limit=2)).parts[0].left == ()
     about = rundir.read_run(folder)
     rundir.write_run(folder, about | {"queries_sha256": "0" * 64})
-    with pytest.raises(StoreError, match="holds answers to other queries"):
-        plan_run(request_of(task, tmp_path, limit=1))
+    with pytest.raises(
+        StoreError, match=r"answers of an older version, and not to the queries that .* holds now: move"
+    ):
+        plan_run(request_of(task, tmp_path, limit=2))
 
 
 def test_another_version_of_a_matcher_has_a_folder_of_its_own(place, task, tmp_path):

@@ -125,7 +125,8 @@ def test_rows_are_written_while_the_next_query_hangs(pair, tmp_path, monkeypatch
 
     class Looks(answers.Watch):
         def advance(self, part):
-            found.append(len(rundir.ids_done(part.folder)))  # the first row is in its file when the second one comes
+            # The first row is in its file when the second one comes.
+            found.append(len(rundir.ids_done(part.folder, part.asked)))
 
     answers.answer(plan, plan.parts, jobs=1, watch=Looks())
     assert found == [0, 1]

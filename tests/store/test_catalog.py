@@ -56,6 +56,13 @@ def test_a_missing_file_or_folder_is_told(tmp_path):
         list_region_files(folders=[tmp_path / "none"])
 
 
+@pytest.mark.parametrize("change", [lambda data: b"\xef\xbb\xbf" + data, lambda data: data.replace(b"\n", b"\r\n")])
+def test_a_mark_of_the_byte_order_and_other_line_ends_do_no_harm(tmp_path, change):
+    shipped = shipped_dir("regions") / "vaduz.toml"
+    (tmp_path / "mine.toml").write_bytes(change(shipped.read_bytes()))
+    assert read_region_file(tmp_path / "mine.toml") == read_region_file(shipped)
+
+
 def test_a_region_file_that_is_no_text_is_told(tmp_path):
     (tmp_path / "bad.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="cannot be read"):

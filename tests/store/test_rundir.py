@@ -2,6 +2,7 @@
 """A run on disk: rows that are read as they were written, whoever wrote them; what is wrong with a file, in a line."""
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -11,7 +12,7 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.store import rundir
+from sasgeo_bench.store import rundir, runrows
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
 FULL = Prediction(
@@ -56,8 +57,8 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     rundir.write_part(folder, [FULL])
     rundir.write_part(folder, [FAILED])
     assert sorted(everything(folder), key=lambda item: item.query_id) == [FAILED, FULL]
-    assert rundir.ids_done(folder) == {"a", "b"}
-    assert rundir.ids_done(folder, again=("crash",)) == {"b"}
+    assert rundir.ids_done(folder, {"a": "", "b": ""}) == {"a", "b"}
+    assert rundir.ids_done(folder, {"a": "", "b": ""}, again=("crash",)) == {"b"}
     assert {path.suffix for path in folder.iterdir()} == {".parquet"}
 
 
@@ -70,16 +71,36 @@ def test_more_columns_other_orders_and_like_types_are_read_too(rows, write):
     assert {item.latency_s for item in everything(write(nothing))} == {None}
 
 
-@pytest.mark.parametrize("name", rundir.PREDICTION_SCHEMA.names)
+@pytest.mark.parametrize("name", runrows.PREDICTION_SCHEMA.names)
 def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_are_read(tmp_path, rows, write, name):
     for table in (rows.drop_columns([name]), with_column(rows, name, pa.array([[True], [False]]))):
-        (column, _, _) = rundir.differing_columns(table)[0]
+        (column, _, _) = runrows.differing_columns(table)[0]
         assert column == name
         path = write(table, "part-1.parquet")
-        assert "holds no predictions: 'validate' says what is missing" in refusal(everything, path)
+        assert f"part-1.parquet holds no predictions ({name}: found " in refusal(everything, path)
         assert "holds no predictions" in refusal(rundir.merge_runs, [path], tmp_path / "new.parquet")
-        assert "move it out of the run's folder" in refusal(rundir.ids_done, tmp_path)
+        assert "move it out of the run's folder" in refusal(rundir.ids_done, tmp_path, {})
     assert not (tmp_path / "new.parquet").exists()
+
+
+@pytest.mark.parametrize("name", ["query_id", "confidence"])
+def test_a_column_that_is_there_twice_is_refused(rows, write, name):
+    path = write(rows.append_column(name, rows[name]))
+    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'validate'" in refusal(
+        everything, path
+    )
+    same = pa.array([[]] * 2, type=pa.list_(pa.struct([*rows.schema.field("candidates").type.value_type] * 2)))
+    assert "(candidates: found list<" in refusal(everything, write(with_column(rows, "candidates", same)))
+
+
+def test_where_a_clock_was_set_back_the_row_that_was_written_last_still_counts(tmp_path, monkeypatch):
+    late = replace(FAILED, status="timeout", message="too late")
+    for now_ns, row in ((2_000, late), (1_000, FAILED), (1_500, replace(FAILED, status="ok", message=""))):
+        monkeypatch.setattr(rundir.time, "time_ns", lambda now_ns=now_ns: now_ns)
+        rundir.write_part(tmp_path / "run", [row])
+    assert [item.status for item in everything(tmp_path / "run")] == ["ok"]
+    assert len(rundir.parts_of(tmp_path / "run")) == 3
+    assert rundir.ids_done(tmp_path / "run", {"a": ""}) == {"a"}
 
 
 @pytest.mark.parametrize(
@@ -97,7 +118,7 @@ def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words
     row = rows.to_pylist()[0]
     if name == "candidates":
         value = [item and row["candidates"][0] | item for item in value]
-    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=rundir.PREDICTION_SCHEMA)
+    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=runrows.PREDICTION_SCHEMA)
     pq.write_table(table, tmp_path / "mine.parquet")
     told = refusal(everything, tmp_path / "mine.parquet")
     assert "mine.parquet, row 1, is no prediction (" in told

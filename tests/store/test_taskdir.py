@@ -31,7 +31,7 @@ from sasgeo_bench.store.taskdir import (
     task_faults,
     write_task,
 )
-from sasgeo_bench.store.taskrows import QUERY_SCHEMA, query_of, query_row, truth_of, truth_row
+from sasgeo_bench.store.taskrows import ASKED, QUERY_SCHEMA, asked_sha256, query_of, query_row, truth_of, truth_row
 
 ABOUT = {"suite": "clean", "title": "Clean", "region": "here", "map_fingerprint": "0"}
 
@@ -229,6 +229,23 @@ def test_more_queries_than_fit_into_a_row_group_keep_their_order(folders):
     assert task_faults(*folders) == []
 
 
+def test_what_is_asked_has_one_hash_for_good_and_another_for_whatever_decides_an_answer():
+    row = {
+        "query_id": "a",
+        "evidence": b"\x01",
+        "observed_on": dt.date(2026, 1, 2),
+        "prior_radius_m": 500.0,
+        "frame": None,
+    }
+    said = {"map_fingerprint": "ff"}
+    # If this changes, all answers there are have to be given anew.
+    assert asked_sha256(row, said)[:16] == "8e5fa691a0d01c92"
+    others = [row | {name: row[name] * 2} for name in ("query_id", "evidence", "prior_radius_m")]
+    others += [row | {"observed_on": dt.date(2026, 1, 3)}, row | {"season": "snow"}]
+    found = {asked_sha256(row, said), asked_sha256(row, {"map_fingerprint": "ee"}), asked_sha256(row, {})}
+    assert len(found | {asked_sha256(other, said) for other in others}) == len(others) + 3
+
+
 def test_the_tables_have_room_for_sequences_and_images(written):
     types = {name: str(kind) for name, kind in zip(QUERY_SCHEMA.names, QUERY_SCHEMA.types, strict=True)}
     assert types["sequence_id"] == "string"
@@ -236,7 +253,7 @@ def test_the_tables_have_room_for_sequences_and_images(written):
     assert types["increment"].startswith("list<")
     assert types["increment_covariance"].startswith("list<")
     assert types["image"] == "binary"
-    assert pq.read_schema(written[0] / QUERIES).names == QUERY_SCHEMA.names
+    assert pq.read_schema(written[0] / QUERIES).names == [*QUERY_SCHEMA.names, ASKED]
 
 
 def test_every_file_says_whose_data_it_holds_and_under_which_licence(written):

@@ -29,6 +29,7 @@ class Entropy:
             "Uncalibrated: the softmax has no fitted temperature; blind to the scale of the scores; the number of "
             "candidates that a matcher gives moves it"
         ),
+        is_calibrated=False,
     )
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:

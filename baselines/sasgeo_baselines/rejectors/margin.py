@@ -25,6 +25,7 @@ class Margin:
             "Uncalibrated: the numbers keep an order and are no probabilities; the second candidate may be the same "
             "place; scores of another scale give other numbers"
         ),
+        is_calibrated=False,
     )
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:

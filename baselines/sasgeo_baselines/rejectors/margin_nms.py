@@ -25,6 +25,7 @@ class MarginNms:
         ),
         licence="Apache-2.0",
         limits="Uncalibrated: numbers keep an order and are no probabilities; scores of another scale give others",
+        is_calibrated=False,
     )
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who is to be scored: matchers as they were run, and files of predictions."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
+from sasgeo_bench.matcher import check_name
+from sasgeo_bench.metrics.cost import run_cost
+from sasgeo_bench.report.rows import is_unranked
+from sasgeo_bench.results import one_line
+from sasgeo_bench.store import rundir
+
+FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+REPRODUCED: Final = "reproduced"
+AS_SUBMITTED: Final = "as submitted"
+_RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One contestant: a matcher as it was run, or a file of predictions.
+
+    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them.
+    """
+
+    name: str
+    version: str
+    hash: str
+    how: str
+    sources: tuple[Path, ...]
+    runs: tuple[Mapping[str, Any], ...] = ()
+
+
+def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
+    """Who is to be scored.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Folders with runs somewhere in them, and files of predictions.
+
+    Returns
+    -------
+    tuple of Entry
+        By name; two versions of one matcher are two entries, with the version in their names, and with the hash where
+        that is the same.
+
+    Raises
+    ------
+    StoreError
+        If a path holds no predictions, or a `run.json` does not say whose answers lie beside it.
+    ConfigError
+        If two files have one name, or one has that of a control.
+    """
+    by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
+    files: list[Entry] = []
+    seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
+    for path in paths:
+        if path.is_file():
+            if _is_new(path, seen):
+                files.append(_file_entry(path))
+            continue
+        found = sorted(path.rglob(rundir.RUN))
+        if not found:
+            message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
+            raise StoreError(message)
+        for run in found:
+            if _is_new(run, seen):
+                about = _read_run(run)
+                card = about["matcher"]
+                by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
+    names = [name for name, _, _ in by_run]
+    versions = [(name, number) for name, number, _ in by_run]
+
+    def shown(name: str, number: str, digest: str) -> str:
+        """As short as it can be and still be one contestant's alone."""
+        if names.count(name) == 1:
+            return name
+        return f"{name} {number}" if versions.count((name, number)) == 1 else f"{name} {number} ({digest[:6]})"
+
+    entries = [
+        Entry(
+            name=shown(name, number, digest),
+            version=number,
+            hash=digest,
+            how=REPRODUCED,
+            sources=tuple(folder for folder, _ in found),
+            runs=tuple(about for _, about in found),
+        )
+        for (name, number, digest), found in by_run.items()
+    ]
+    entries += files
+    listed = [entry.name for entry in entries]
+    twice = next((name for name in listed if listed.count(name) > 1), None)
+    if twice is not None:
+        message = f"two contestants are named {twice!r}: rename the file of one"
+        raise ConfigError(message)
+    return tuple(sorted(entries, key=lambda entry: entry.name))
+
+
+def _is_new(path: Path, seen: set[Path]) -> bool:
+    place = path.parent.resolve() / path.name
+    is_new = place not in seen
+    seen.add(place)
+    return is_new
+
+
+def _file_entry(path: Path) -> Entry:
+    if not FILE_NAME.fullmatch(path.stem):
+        message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
+        raise ConfigError(message)
+    if is_unranked(path.stem):
+        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: rename the file"
+        raise ConfigError(message)
+    return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """What a `run.json` says, after a look at whatever a board takes from it: it may be anyone's."""
+    about = rundir.read_run(path.parent) or {}
+    card = about.get("matcher")
+    said = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
+    if isinstance(card, dict):
+        said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
+    fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
+    try:
+        check_name(str(said["matcher.name"]))
+        run_cost(about)
+    except (MatchError, MetricError) as error:
+        fault = fault or str(error)
+    if fault is not None:
+        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
+    return about

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks that are drawn anew: a query that is the same keeps its answer, one that is not is asked again."""
+
+import json
+from dataclasses import replace
+
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.query import PriorGroup
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.run import answers
+from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.runner import run
+from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.tasks import make_tasks
+from sasgeo_bench.validate import set_aside, validate
+
+TOWN = "town-riverside"
+
+
+def quiet(_):
+    pass
+
+
+@pytest.fixture
+def draw(own_out):
+    """Draw the task in place of whatever was drawn before."""
+
+    def drawn(count=1, seed=0, prior=None):
+        group = None if prior is None else PriorGroup.parse(prior)
+        wanted = Wanted(
+            suites=("no-priors",) if group is None else ("clean",),
+            regions=(TOWN,),
+            split="crossfit",
+            count=count,
+            seed=seed,
+            out=own_out,
+            group=group,
+        )
+        (request,) = plan_requests(wanted, tell=quiet)
+        (made,) = make_tasks(request, tell=quiet)
+        return made.folder
+
+    return drawn
+
+
+def plan_of(task, **changes):
+    return plan_run(replace(RunRequest(spec="oracle_pose", tasks=(task,), out=task.parents[2]), **changes))
+
+
+def ask(task):
+    """Ask what is left; the part as it was planned, and how many were asked."""
+    plan = plan_of(task)
+    report = run(plan, tell=quiet)
+    return plan.parts[0], sum(report.counts.values())
+
+
+def test_more_sites_fewer_sites_and_another_seed_ask_nothing_twice(draw):
+    task = draw()
+    few = set(taskdir.read_ids(task))
+    assert ask(task)[1] == len(few)
+    draw(count=2)
+    more = set(taskdir.read_ids(task))
+    assert few < more
+    part, asked = ask(task)
+    assert (set(part.left), asked) == (more - few, len(more - few))
+    draw(seed=1)
+    other = set(taskdir.read_ids(task))
+    part, asked = ask(task)
+    assert (asked, part.done, part.aside) == (len(other), 0, len(more))
+    draw()
+    part, asked = ask(task)
+    assert (part.left, asked, part.done, part.aside) == ((), 0, len(few), len(more - few) + len(other))
+    draw(count=2)
+    assert ask(task)[1] == 0
+    # All of it is there, and every task is answered by its own.
+    assert {row.query_id for row in rundir.read_predictions(part.folder)} == more | other
+    assert list(validate(part.folder, [task])) == []
+    assert set_aside(part.folder, [task]) == len(other)
+
+
+def test_a_query_whose_content_changed_is_asked_again_and_both_answers_stay(draw, tmp_path):
+    task = draw(prior="r500-weak-s3")
+    before = taskdir.read_asked(task)
+    folder = ask(task)[0].folder
+    draw(prior="r250-known-s3")
+    after = taskdir.read_asked(task)
+    assert before.keys() == after.keys()
+    assert not set(before.values()) & set(after.values())
+    assert len(list(validate(folder, [task]))) == len(after)
+    part, asked = ask(task)
+    assert (asked, part.aside) == (len(after), len(before))
+    with pytest.raises(StoreError, match="and to what it was when it was drawn otherwise: name the tasks with --tasks"):
+        rundir.merge_runs([folder], tmp_path / "both.parquet")
+    assert rundir.merge_runs([folder], tmp_path / "mine.parquet", asked=after) == len(after)
+    assert list(validate(tmp_path / "mine.parquet", [task])) == []
+    found = rundir.read_answers(folder, before)
+    assert (found.found.keys(), found.aside) == (before.keys(), len(after))
+    draw(prior="r500-weak-s3")
+    assert ask(task)[1] == 0
+
+
+def test_a_task_that_is_drawn_anew_while_it_is_asked_ends_the_run(draw):
+    task = draw(prior="r500-weak-s3")
+    plan = plan_of(task)
+    draw(prior="r250-known-s3")
+    with pytest.raises(StoreError, match="was made anew while it was asked: run again, answers are kept"):
+        run(plan, tell=quiet)
+    assert rundir.ids_done(plan.parts[0].folder, taskdir.read_asked(task)) == set()
+
+
+def test_another_build_of_the_map_is_another_question(draw, own_out):
+    task = draw()
+    plan = plan_of(task)
+    path = own_out / "regions" / TOWN / "region.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"inputs_sha256": "0" * 64}))
+    with pytest.raises(StoreError, match="was built anew since the queries"):
+        plan_of(task)
+    with pytest.raises(StoreError, match="was built anew while it was searched: run again"):
+        answers.answer(plan, plan.parts, jobs=1, watch=answers.Watch())
+    about = task / "task.json"
+    before = taskdir.read_asked(task)
+    (query, *_), said = taskdir.read_some(task, set(before)), json.loads(about.read_text())
+    assert query[2] == before[query[0].query_id]
+    # Of a task of an older program the hashes are reckoned, and say as much of the map as it does.
+    strip(task)
+    assert taskdir.read_asked(task) == before
+    about.write_text(json.dumps(said | {"map_fingerprint": "0" * 64}))
+    assert not set(taskdir.read_asked(task).values()) & set(before.values())
+
+
+def strip(task):
+    path = task / taskdir.QUERIES
+    pq.write_table(pq.read_table(path).drop_columns(["asked_sha256"]), path)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import PRESENT, Evidence
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import Region
@@ -21,6 +21,7 @@ THIN: Final = frozenset(
     {"road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"}
 )
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
+DOUBT_M: Final = 8.0  # beside a seen line: what is mapped there may be the same line
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
@@ -74,6 +75,26 @@ def read_field(region: Region, likeness: NDArray[np.float64], *, cell_size_m: fl
 def _pooled(layer: NDArray[np.uint8], around: tuple[tuple[int, int], tuple[int, int]], grid: Grid) -> NDArray[np.uint8]:
     size = (grid.cols, grid.rows)
     return np.asarray(cv2.resize(np.pad(layer, around), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def doubted(evidence: Evidence) -> Evidence:
+    """Leave open what lies beside a seen line: a line of the map that runs there may be the same, some metres off.
+
+    The view's side of the distance-transform compatibility that `likeness_by_hand` gives the map.
+
+    Examples
+    --------
+    >>> row = np.zeros((1, 1, 12), dtype=np.uint8)
+    >>> row[0, 0, 0] = PRESENT
+    >>> doubted(Evidence(classes=("railway",), cells=row, cell_size_m=2.0)).cells[0, 0].tolist()
+    [1, 2, 2, 2, 2, 0, 0, 0, 0, 0, 0, 0]
+    """
+    cells = evidence.cells.copy()
+    for name, layer in zip(evidence.classes, cells, strict=True):
+        if name in THIN and (layer == PRESENT).any():
+            off = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            layer[(layer == ABSENT) & (off * evidence.cell_size_m <= DOUBT_M)] = UNKNOWN
+    return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
 
 
 @dataclass(frozen=True, kw_only=True)

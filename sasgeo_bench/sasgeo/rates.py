@@ -130,7 +130,9 @@ def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]
     for layer, into in zip(layers, made, strict=True):
         if (layer == PRESENT).any():
             distance = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            into[:] = np.searchsorted((0.0, *RINGS_M), distance * cell_size_m - _SLACK_M)
+            into[:] = 0
+            for edge_m in (0.0, *RINGS_M):  # a sorted search through millions of cells takes several times as long
+                into += distance > (edge_m + _SLACK_M) / cell_size_m
         else:
             into[:] = FAR
     made[:, (layers > PRESENT).any(axis=0)] = NOWHERE
@@ -186,14 +188,41 @@ def likeness(tallies: Sequence[Tally]) -> NDArray[np.float64]:
     >>> likeness([one]).round(1).tolist()
     [[1.0, 0.8, 0.3, 0.2, 0.0]]
     """
-    seen = np.sum([one.seen for one in tallies], axis=0) / _CELLS_PER_WITNESS
-    all_seen = seen + np.sum([one.missed for one in tallies], axis=0) / _CELLS_PER_WITNESS
-    far = (seen[:, FAR:] + _EDGE) / (all_seen[:, FAR:] + 2 * _EDGE)
-    share = np.log((seen + far) / (all_seen + 1))  # one witness for what is seen far away
+    share = np.log(_seen_share(tallies))
     span = share[:, :1] - share[:, FAR:]
     ratio = np.where(span > _EDGE, (share - share[:, FAR:]) / np.maximum(span, _EDGE), 0.0)
     ratio[:, 0], ratio[:, FAR] = 1.0, 0.0
     return np.minimum.accumulate(np.clip(ratio, 0.0, 1.0), axis=1)
+
+
+def missed_share(tallies: Sequence[Tally], near: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much of a miss on a class one degree of its likeness is worth, 0..1, shape (C,).
+
+    The score of a cell is linear in the likeness of the map, `near`, of shape (C, FAR + 1). What is seen follows it by
+    its making; what is missed beside a class says less than that. This is the slope of least squares through the rings,
+    as a share of the step from far away onto the class.
+
+    Examples
+    --------
+    >>> seen, missed = np.array([[900, 300, 40, 20, 100]]), np.array([[100, 700, 960, 980, 9900]])
+    >>> one = Tally(classes=("building",), age_years=0.0, block="a", seen=seen * 99, missed=missed * 99)
+    >>> missed_share([one], likeness([one])).round(1).tolist()
+    [0.3]
+    """
+    share = np.log1p(-_seen_share(tallies))
+    step = share - share[:, FAR:]
+    cells = np.sum([one.missed for one in tallies], axis=0) + 1.0
+    slope = (cells * near * step).sum(axis=1) / (cells * near**2).sum(axis=1)
+    down = step[:, 0]
+    return np.clip(np.where(down < -_EDGE, slope / np.minimum(down, -_EDGE), 0.0), 0.0, 1.0)
+
+
+def _seen_share(tallies: Sequence[Tally]) -> NDArray[np.float64]:
+    """Share of cells that were seen present by ring, shape (C, FAR + 1); with one witness for what is seen far away."""
+    seen = np.sum([one.seen for one in tallies], axis=0) / _CELLS_PER_WITNESS
+    known = seen + np.sum([one.missed for one in tallies], axis=0) / _CELLS_PER_WITNESS
+    far = (seen[:, FAR:] + _EDGE) / (known[:, FAR:] + 2 * _EDGE)
+    return np.clip((seen + far) / (known + 1), _EDGE, 1 - _EDGE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -49,6 +49,24 @@ class Gains:
         return type(self)(agree=agree, extra=extra, missed=missed, quiet=quiet)
 
 
+    def softened(self, shares: NDArray[np.float64]) -> Self:
+        """The same, a miss worth a share of each class, shape (C,): see `rates.missed_share`."""
+        missed = self.quiet + shares * (self.missed - self.quiet)
+        return type(self)(agree=self.agree, extra=self.extra, missed=missed, quiet=self.quiet)
+
+
+def even_gains(classes: Sequence[str]) -> Gains:
+    """Eq. 7 with nothing known of classes: all lambdas 1.
+
+    Examples
+    --------
+    >>> even_gains(["railway"]).missed.tolist()
+    [-1.0]
+    """
+    one = np.ones(len(classes))
+    return Gains(agree=one, extra=-one, missed=-one, quiet=np.zeros(len(classes)))
+
+
 def likelihood_gains(rates: Sequence[ClassRates], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
     """Log-likelihood ratios of what is seen of each class, given the map, against not knowing the map.
 
@@ -113,9 +131,7 @@ def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[f
     taxonomy = load_taxonomy()
     hand = [taxonomy[name].persistence for name in classes]
     decay = np.array([one.prior * np.exp(-one.vanish_per_year * max(age_years, 0.0)) for one in hand], dtype=np.float64)
-    one = np.ones(len(hand))
-    lambdas = Gains(agree=one, extra=-one, missed=-one, quiet=np.zeros(len(hand)))
-    return lambdas.scaled(decay * (np.array(persists, dtype=np.float64) if persists else one))
+    return even_gains(classes).scaled(decay * (np.array(persists, dtype=np.float64) if persists else 1.0))
 
 
 def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

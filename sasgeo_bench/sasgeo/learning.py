@@ -17,22 +17,15 @@ from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.raster import RasterView, read_field
+from sasgeo_bench.sasgeo.joint import Blend, columns
 from sasgeo_bench.sasgeo.rates import NOWHERE, Tally, rings, tally
+from sasgeo_bench.sasgeo.reading import Reader, age_years
 from sasgeo_bench.sasgeo.temper import fit_temper
-from sasgeo_bench.search.field import Field
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
 
-DAYS_PER_YEAR: Final = 365.25
 MODES: Final = 16  # of a search to learn from
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
-ROUNDS: Final = 2  # exponents change what a search finds; after two rounds hardly
-
-
-def age_years(query: Query, region: Region) -> float:
-    """From the map to the view; 0 where the map is the younger one."""
-    return max(0.0, (query.observed_on - region.manifest.extract.date).days / DAYS_PER_YEAR)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +36,6 @@ class Lesson:
     truth: Truth
     pose: Pose
     region: Region
-
-    @property
-    def age_years(self) -> float:
-        """Of the map."""
-        return age_years(self.query, self.region)
 
 
 def lessons_of(training: Training) -> list[Lesson]:
@@ -88,11 +76,34 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         raise ConfigError(message)
     by_map = _by_map(lessons)
     learnt = Learnt.of([one for some in by_map.values() for one in _tallies(some, switches)])
-    for _ in range(ROUNDS):
-        choices = [one for some in by_map.values() for one in _choices(some, learnt, switches, plan or Plan())]
-        if choices:
-            learnt = replace(learnt, temper=fit_temper(choices))
-    return learnt
+    lists = [one for some in by_map.values() for one in _lists(some, learnt, switches, plan or Plan())]
+    lists = [one for one in lists if len(one.by_class) > 1]
+    if not lists:
+        return learnt
+    learnt = replace(learnt, temper=fit_temper([one.by_class for one in lists]))
+    if not switches.has_graph:
+        return learnt
+    return replace(learnt, blend=_fit_blend(lists, learnt.temper))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _List:
+    """The right place and the wrong ones a search found, the right one first: scores by class, of graph, its nodes."""
+
+    by_class: NDArray[np.float64]
+    graph: NDArray[np.float64] | None
+    nodes: int
+
+
+def _fit_blend(lists: Sequence[_List], temper: NDArray[np.float64]) -> Blend:
+    """Weights of the joint score by the same logit, exponents held."""
+    terms = [
+        columns(one.by_class * temper, one.graph, Blend(alpha=1.0, beta=1.0, eta=1.0), nodes=one.nodes)
+        for one in lists
+    ]
+    sums = [np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:])) for rows in terms]
+    alpha, beta, eta = fit_temper(sums, start=(1.0, Blend().beta, Blend().eta)).tolist()
+    return Blend(alpha=alpha, beta=beta, eta=eta)
 
 
 def _by_map(lessons: Sequence[Lesson]) -> Mapping[str, list[Lesson]]:
@@ -115,7 +126,8 @@ def _tally(lesson: Lesson, near: NDArray[np.uint8], switches: Switches) -> Tally
     for at, name in enumerate(region.classes):
         if name in seen.classes:
             cells[at] = seen.layer(name)
-    return tally(region.classes, cells, under, age_years=lesson.age_years, block=lesson.truth.block)
+    age = age_years(lesson.query, region)
+    return tally(region.classes, cells, under, age_years=age, block=lesson.truth.block)
 
 
 def _under(
@@ -130,24 +142,18 @@ def _under(
     return np.asarray(np.where(inside, found, NOWHERE), dtype=np.uint8).reshape(len(near), *shape)
 
 
-def _choices(
-    lessons: Sequence[Lesson], learnt: Learnt, switches: Switches, plan: Plan
-) -> list[NDArray[np.float64]]:
-    """Scores by class of the truth and of the wrong places a search finds, for each view of one map."""
-    region = lessons[0].region
-    field = read_field(region, learnt.likeness)
-    found = (_choice(lesson, field, learnt, switches, plan) for lesson in lessons)
-    return [one for one in found if len(one) > 1]
+def _lists(lessons: Sequence[Lesson], learnt: Learnt, switches: Switches, plan: Plan) -> list[_List]:
+    """Right and wrong places of each view of one map."""
+    reader = Reader.of(lessons[0].region, learnt, switches)
+    return [_list(lesson, reader, plan) for lesson in lessons]
 
 
-def _choice(
-    lesson: Lesson, field: Field, learnt: Learnt, switches: Switches, plan: Plan
-) -> NDArray[np.float64]:
-    query, pose = lesson.query, lesson.pose
-    gains = switches.gains(learnt, age_years=lesson.age_years)
-    view = RasterView.of(switches.seen(query.evidence), learnt.classes, gains)
-    modes = search(field, view.tempered(learnt.temper).template(), query.prior, plan, count=MODES).modes
+def _list(lesson: Lesson, reader: Reader, plan: Plan) -> _List:
+    glance, pose = reader.glance(lesson.query), lesson.pose
+    modes = search(reader.field, glance.template, lesson.query.prior, plan, count=MODES).modes
     here = (pose.easting_m, pose.northing_m)
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
-    return np.stack([view.by_class(field, one) for one in (pose, *wrong)])
-
+    poses = [pose, *wrong]
+    verified = glance.verified(poses)
+    graph = None if verified is None else np.array([one.score for one in verified])
+    return _List(by_class=glance.by_class(poses), graph=graph, nodes=0 if graph is None else len(glance.observed.nodes))

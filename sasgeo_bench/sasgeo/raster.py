@@ -157,3 +157,7 @@ class RasterView:
         """The same, the score of each class times its exponent."""
         scale = temper.astype(np.float32)[:, None, None]
         return replace(self, weights=self.weights * scale, known=self.known * scale)
+
+    def times(self, weight: NDArray[np.float32] | np.float32) -> Self:
+        """The same, all cells times a weight, or each times its own, shape (rows, cols): the w of Eq. 8."""
+        return replace(self, weights=self.weights * weight, known=self.known * weight)

@@ -14,17 +14,21 @@ START: Final = 0.01  # one cell in a hundred is news: what a class is worth that
 _WIDTH: Final = 1.0  # of the prior around it, in logarithms
 
 
-def fit_temper(choices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def fit_temper(
+    choices: Sequence[NDArray[np.float64]], *, start: float | Sequence[float] = START
+) -> NDArray[np.float64]:
     """Estimate one exponent for each class, so that the right mode of a search has the probability it deserves.
 
     Scores add cells up as if they were independent. Here the score of each class is multiplied by an exponent of its
     own, found by conditional logit (McFadden 1974): the chance of the right place among the modes of its search is the
-    softmax of the sums. Exponents are positive, with a log-normal prior around `START`.
+    softmax of the sums. Exponents are positive, with a log-normal prior around `start`.
 
     Parameters
     ----------
     choices : sequence of ndarray of float, shape (M, C) each
         Scores by class of the modes of one search, the first of them the right one; M may differ.
+    start : float or sequence of float
+        What they are where no search tells, shape (C,) or for all.
 
     Returns
     -------
@@ -64,12 +68,12 @@ def fit_temper(choices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
         highest = np.maximum.reduceat(sums, starts)
         mass = np.exp(sums - highest[owner])
         total = np.add.reduceat(mass, starts)
-        value = float((np.log(total) + highest).sum() + 0.5 * (((logs - start) / _WIDTH) ** 2).sum())
-        slope = ((mass / total[owner]) @ rows) * exponents + (logs - start) / _WIDTH**2
+        value = float((np.log(total) + highest).sum() + 0.5 * (((logs - begin) / _WIDTH) ** 2).sum())
+        slope = ((mass / total[owner]) @ rows) * exponents + (logs - begin) / _WIDTH**2
         return value, slope
 
-    start = np.full(rows.shape[1], np.log(START))
-    found = optimize.minimize(loss, start, jac=True, method="L-BFGS-B")
+    begin = np.log(np.broadcast_to(np.asarray(start, dtype=np.float64), rows.shape[1:]))
+    found = optimize.minimize(loss, begin, jac=True, method="L-BFGS-B")
     return np.asarray(np.exp(found.x))
 
 

@@ -84,14 +84,19 @@ class _Votes:
         half = math.ceil(template.reach_m * largest / step_m) + 1
         shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)
         size = int(fft.next_fast_len(max(max(shape) for shape in shapes) + 2 * half, real=True))
+        windows = [
+            level.window(tile.row - half, tile.col - half, (rows + 2 * half, cols + 2 * half), template.speaking)
+            for tile, (rows, cols) in zip(tiles, shapes, strict=True)
+        ]
+        is_used = [any(window[at].any() for window in windows) for at in range(len(template.speaking))]
+        used = np.flatnonzero(is_used) if any(is_used) else np.arange(1)
         spectra = []
-        for tile, (rows, cols) in zip(tiles, shapes, strict=True):
-            shape = (rows + 2 * half, cols + 2 * half)
-            under = level.window(tile.row - half, tile.col - half, shape, template.speaking)
-            turned = (np.rot90(under, quarter, (1, 2)) for quarter in range(turns.quarters))
+        for window in windows:
+            turned = (np.rot90(window[used], quarter, (1, 2)) for quarter in range(turns.quarters))
             spectra.append(tuple(np.conj(fft.rfft2(each, s=(size, size))) for each in turned))
         ratio = step_m / template.cell_size_m
         bands, frame = pooled(template, level, max(1, round(ratio / _BLUR)))
+        bands = bands[used]  # what the map holds nowhere here adds nothing
         width = 2 * math.floor(step_m / frame.cell_size_m / 2) + 1
         bands = np.stack([cv2.blur(band, (width, width), borderType=cv2.BORDER_CONSTANT) for band in bands])
         reach_m, side = (half + 0.5) * step_m, 2 * half + 1

@@ -87,10 +87,13 @@ class Stride:
         return replace(pose, yaw_deg=pose.yaw_deg + yaw * self.yaw_deg, scale=larger)
 
     def around(self, pose: Pose) -> Iterator[Pose]:
-        """A pose and its neighbours in heading and scale."""
-        for scale in (0, -1, 1) if self.scale else (0,):
-            for yaw in (0, -1, 1) if self.yaw_deg else (0,):
-                yield self.moved(pose, yaw=yaw, scale=scale)
+        """A pose and its neighbours in heading or scale."""
+        yield pose
+        for sign in (-1, 1):
+            if self.yaw_deg:
+                yield self.moved(pose, yaw=sign)
+            if self.scale:
+                yield self.moved(pose, scale=sign)
 
 
 def climbed(sight: Sight, stride: Stride, guess: Guess, disc: Disc) -> Guess:

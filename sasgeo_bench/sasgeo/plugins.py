@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arms of the experiment as plugins: a card for each setting of the switches."""
+
+from typing import Final
+
+from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.sasgeo.matchers import LearningMatcher, SasgeoMatcher
+
+_SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), {what}"
+_OURS: Final = (
+    "dense search over place, heading and scale in the Fourier domain, coarse to fine, 20 modes; what lies within 8 m "
+    "of a seen line is left open; a posterior over the modes and none of them"
+)
+_EVEN: Final = "gains of 1 for all classes (Eq. 7), distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for lines"
+_GRAPH: Final = (
+    "correspondences by assignment within a gate and relations of matched nodes (Eq. 9), on the list of modes that the "
+    "raster found; nodes of perceived vectors, or of the thinned mask where there are none; likelihood ratios set by "
+    "hand, weights of raster, graph and contradiction (Eq. 11) {how}"
+)
+_FITTED: Final = (
+    "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "
+    "class is like being on it, and an exponent for each class by conditional logit; all learnt on train places"
+)
+_BLIND: Final = "what is unknown counts as absent, as in all variants of the paper but its last"
+_SILENT: Final = "what is unknown says nothing"
+_LIMITS: Final = (
+    "headings and scales beyond 2.5 standard deviations are not searched; places are 2 m apart before they are "
+    "refined; the graph finds no place that the raster has not found"
+)
+
+
+def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -> MatcherCard:
+    return MatcherCard(
+        name=name,
+        version="1",
+        title=title,
+        source=_SOURCE.format(what=what),
+        ours="; ".join((_OURS, *ours)),
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits=limits,
+    )
+
+
+class SasgeoRaster(SasgeoMatcher):
+    """Raster alone, all classes alike."""
+
+    card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _BLIND)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
+
+
+class SasgeoGraph(SasgeoMatcher):
+    """Raster and graph."""
+
+    card = _card(
+        "sasgeo_graph", "SASGeo: raster and graph", "Eqs. 7-9, 11", _EVEN, _GRAPH.format(how="set by hand"), _BLIND
+    )
+    switches = Switches(weights="even", is_unknown_silent=False)
+
+
+class SasgeoStability(LearningMatcher):
+    """Raster and graph, classes weighed by what lasts."""
+
+    card = _card(
+        "sasgeo_stability",
+        "SASGeo: raster, graph and stability",
+        "Eqs. 5, 7-9, 11",
+        _FITTED,
+        _GRAPH.format(how="learnt"),
+        _BLIND,
+        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+    )
+    switches = Switches(is_unknown_silent=False)
+
+
+class Sasgeo(LearningMatcher):
+    """The whole scorer."""
+
+    card = _card(
+        "sasgeo",
+        "SASGeo, whole",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _GRAPH.format(how="learnt"),
+        _SILENT,
+        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+    )
+    switches = Switches()
+
+
+class SasgeoHand(SasgeoMatcher):
+    """The whole scorer with weights by hand."""
+
+    card = _card(
+        "sasgeo_hand",
+        "SASGeo with the paper's weights by hand",
+        "Eqs. 5, 7-9, 11-14",
+        "prior, decay and lambdas of Eqs. 5 and 7 from the taxonomy",
+        _GRAPH.format(how="set by hand"),
+        _SILENT,
+    )
+    switches = Switches(weights="hand")
+
+
+class SasgeoDistinct(LearningMatcher):
+    """The whole scorer with Eq. 6."""
+
+    card = _card(
+        "sasgeo_distinct",
+        "SASGeo with distinctiveness",
+        "Eqs. 5-9, 11-14",
+        _FITTED,
+        "cells weigh by -log of the share of the map's configurations that are of their kind (Eq. 6)",
+        _GRAPH.format(how="learnt"),
+        _SILENT,
+        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+    )
+    switches = Switches(is_distinctive=True)
+
+
+class SasgeoNoGraph(LearningMatcher):
+    """The whole scorer but its graph."""
+
+    card = _card(
+        "sasgeo_no_graph",
+        "SASGeo without graph",
+        "Eqs. 5, 7-8, 12-14",
+        _FITTED,
+        _SILENT,
+        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+    )
+    switches = Switches(has_graph=False)

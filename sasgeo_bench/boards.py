@@ -23,7 +23,8 @@ from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, ver
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
-from sasgeo_bench.report.rejection import OWN, judge, own_word, rules_of, why_not
+from sasgeo_bench.report.protection import protection_frame
+from sasgeo_bench.report.rejection import OWN, judge, own_word, remarks_of, rules_of, why_not
 from sasgeo_bench.report.rows import to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
@@ -31,7 +32,7 @@ from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.boardfile import Extra, check_board, write_board
+from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, write_board
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
@@ -90,7 +91,10 @@ class ScoreRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard."""
+    """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
+
+    `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
+    """
 
     entries: tuple[Entry, ...]
     scores: dict[str, pd.DataFrame]
@@ -99,6 +103,8 @@ class Board:
     findings: tuple[Finding, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     tasks: tuple[dict[str, Any], ...] = field(default=())
+    remarks: tuple[str, ...] = ()
+    protection: pd.DataFrame = field(default_factory=pd.DataFrame)
 
 
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
@@ -165,6 +171,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
                 is_calibrated = rule.card.is_calibrated
                 rows.append(to_frame(list(integrity_rows(entry.name, name, judged, is_calibrated=is_calibrated))))
         tell(f"{entry.name}: {_in_words(frame)}")
+    remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
     table = with_contestants(figures, {entry.name: (entry.version, entry.hash) for entry in entries})
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
@@ -176,9 +183,29 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         findings=findings,
         verdicts=verdicts,
         tasks=tuple(task.about for task in tasks),
+        remarks=remarks,
+        protection=_protection(scores, predictions, request.split),
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _remarks(all_judged: Mapping[tuple[str, str], pd.DataFrame], tell: Tell) -> tuple[str, ...]:
+    """What rejectors said of their fits; told, too."""
+    judged = ((key, frame) for key, frame in all_judged.items() if key[1] != OWN)
+    said = tuple(f"{name} on {matcher}: {item}" for (matcher, name), frame in judged for item in remarks_of(frame))
+    for remark in said:
+        tell(remark)
+    return said
+
+
+def _protection(
+    scores: Mapping[str, pd.DataFrame], predictions: Mapping[str, Mapping[str, Prediction]], split: Split | None
+) -> pd.DataFrame:
+    """Protection levels of all contestants; empty where none tells any."""
+    frames = [protection_frame(name, frame, predictions[name], split) for name, frame in scores.items()]
+    told = [frame for frame in frames if len(frame)]
+    return pd.concat(told, ignore_index=True) if told else frames[0]
 
 
 def _in_words(scores: pd.DataFrame) -> str:
@@ -343,6 +370,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
         "draws": request.draws,
         "by_region": sorted(request.by_region),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
+        "remarks": list(board.remarks),
         "entries": [
             {
                 "name": entry.name,
@@ -374,6 +402,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
             "scores": scores,
             "contrasts": contrast_frame(board.findings),
             "controls": verdict_frame(board.verdicts),
+            **({PROTECTION: board.protection} if len(board.protection) else {}),
         },
         texts={
             "leaderboard.md": board_markdown(board.table, about, board.findings, board.verdicts),

@@ -15,7 +15,8 @@ from sasgeo_bench.results import one_line, told
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
-BUILT_IN: Final = "sasgeo-baselines"  # the distribution whose names win
+BUILT_IN: Final = "sasgeo-baselines"
+_OURS: Final = ("sasgeo-bench", BUILT_IN)  # the distributions whose names win
 ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
 
 
@@ -38,7 +39,7 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     except Exception as error:
         message = f"an installed package has entry points that cannot be read ({told(error)}): reinstall or remove it"
         raise MatchError(message) from error
-    points = sorted(installed, key=lambda point: (_home(point) != BUILT_IN, _home(point), point.value))
+    points = sorted(installed, key=lambda point: (_home(point) not in _OURS, _home(point), point.value))
     for point in points:
         if group == MATCHERS and point.name == ORACLE:
             message = f"{_home(point)} ({point.value}) is not used: {ORACLE!r} is the name of a control of the runner"

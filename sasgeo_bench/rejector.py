@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import check_name, check_said
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.results import Prediction, one_line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +54,8 @@ class RejectorCard:
 class Rejector(Protocol):
     """A rule over the answers of one matcher; it is made without arguments and sees no query, map or truth.
 
-    Of each answer it sees what the matcher told: candidates with scores, confidence, diagnostics.
+    Of each answer it sees what the matcher told: candidates with scores, confidence, diagnostics. After a fit it may
+    have a `remark`, a text that the board is to say of that fit, as where calibration was too little to learn from.
     """
 
     card: RejectorCard
@@ -66,6 +67,19 @@ class Rejector(Protocol):
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
         """Probability, shape (N,), 0..1, that each answer is a false fix."""
         ...
+
+
+def remark_of(rejector: Rejector) -> str:
+    """What a rejector says of its last fit, in one line; nothing where it has no `remark`.
+
+    Examples
+    --------
+    >>> class Plain:
+    ...     remark = "too few answers"
+    >>> remark_of(Plain())
+    'too few answers'
+    """
+    return one_line(str(getattr(rejector, "remark", "") or ""))
 
 
 def check_p_false(found: object, count: int) -> NDArray[np.float64]:

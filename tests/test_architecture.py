@@ -76,7 +76,10 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "panels": None,
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
-    "sasgeo": ("rates", "temper", "weights", "raster", "graph", "temporal", "joint", "integrity"),
+    "sasgeo": (
+        *("rates", "temper", "weights", "raster", "graph", "temporal", "joint"),
+        *("integrity", "protection", "conformal", "frame", "rejectors"),
+    ),
     "plugins": None,
     "run": (
         *("sandbox", "wire", "serve", "child", "worker", "oracle"),
@@ -84,13 +87,13 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "metrics": (
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
-        *("sequence", "cost", "draws", "intervals", "compare", "power"),
+        *("sequence", "cost", "draws", "intervals", "protection", "compare", "power"),
     ),
     "validate": None,
     "score": None,
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
-        "latex",
+        *("latex", "protection"),
         *("paper", "papertext", "plots", "site"),
     ),
     "boardtasks": None,

@@ -239,6 +239,33 @@ def test_a_rejector_that_is_not_applied_says_why(out, split):
     assert why_not(half) == "no place that may calibrate another one has an answer"
 
 
+def test_what_a_rejector_remarks_of_its_fits_is_told_and_kept(out, tmp_path, split):
+    submission(out, tmp_path / "mine.parquet")
+    rejectors = ["sasgeo_bench.sasgeo.rejectors:SasgeoLogistic", f"{__name__}:Doubt"]
+    board, lines = told_by(out, tmp_path / "mine.parquet", rejectors=rejectors, split=split)
+    said = [line for line in lines if "ranked by margin" in line]
+    assert said == list(board.remarks)
+    assert said[0].startswith("sasgeo_logistic on mine: 0 of ")  # the answers are right, all of them
+    assert said[0].endswith(" judged so)")
+    assert read_board(out / "boards" / "mine")[0]["remarks"] == said
+
+
+def test_protection_levels_are_counted_where_answers_tell_them(out, tmp_path, split):
+    levels = {"sigma_m": 2.0, "hpl_gauss_0.01_m": 6.0}
+    submission(out, tmp_path / "mine.parquet", change=lambda row, _: replace(row, diagnostics=levels))
+    board = board_of(out, tmp_path / "mine.parquet", split=split)
+    assert set(board.protection["method"]) == {"gauss", "conformal"}
+    told = board.protection[board.protection["method"] == "gauss"]
+    assert (told["n"] > 0).all()
+    assert (told["misleading"] == 0.0).all()  # the submission knows the truth
+    folder = out / "boards" / "mine"
+    assert pq.read_table(folder / "protection.parquet").num_rows == len(board.protection)
+    assert len(pd.read_csv(folder / "protection.csv")) == len(board.protection)
+    submission(out, tmp_path / "mine.parquet")  # the same without: the tables go
+    assert board_of(out, tmp_path / "mine.parquet", split=split).protection.empty
+    assert not list(folder.glob("protection.*"))
+
+
 def test_the_own_word_of_a_matcher_stands_beside_its_rejectors_and_needs_no_split(out, tmp_path, split):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, tmp_path / "mine.parquet")

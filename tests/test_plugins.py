@@ -144,17 +144,18 @@ def test_a_matcher_is_made_by_its_name_and_listed_with_where_it_comes_from(own) 
     assert list(points) == sorted(points)
 
 
-def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install) -> None:
+@pytest.mark.parametrize("ours", ["sasgeo-bench", BUILT_IN])
+def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, ours) -> None:
     # By name alone the outsider would come first, by the place on the import path too.
-    install(BUILT_IN, {"fft_vote": "built_in:Sound"}, built_in=SOUND)
-    install("an-outsider", {"fft_vote": "outside:Sound"}, outside=SOUND)
-    with pytest.warns(UserWarning, match="two plugins are named 'fft_vote'") as told:
+    install(ours, {"shared": "built_in:Sound"}, built_in=SOUND)
+    install("an-outsider", {"shared": "outside:Sound"}, outside=SOUND)
+    with pytest.warns(UserWarning, match="two plugins are named 'shared'") as told:
         points = list_entry_points()
-    assert points["fft_vote"].value == "built_in:Sound"
+    assert points["shared"].value == "built_in:Sound"
     (said,) = (str(item.message) for item in told)
-    assert f"{BUILT_IN} is used, an-outsider (outside:Sound) is not" in said
+    assert f"{ours} is used, an-outsider (outside:Sound) is not" in said
     with pytest.warns(UserWarning, match="two plugins"):
-        assert type(load_matcher("fft_vote")).__module__ == "built_in"
+        assert type(load_matcher("shared")).__module__ == "built_in"
 
 
 @pytest.mark.parametrize("order", [("b-second", "a-first"), ("a-first", "b-second")])

@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError
+from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.metrics.decisions import Answers, accept
 from sasgeo_bench.metrics.integrity import choose_threshold
 from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.rejector import Rejector, RejectorCard, check_p_false
+from sasgeo_bench.rejector import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.results import Prediction, told
 from sasgeo_bench.score import NOT_APPLICABLE
 from sasgeo_bench.split import Split
@@ -133,7 +133,7 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
     -------
     pandas.DataFrame
         The rows that were tested, with the columns `p_right` (NaN without an answer), `accepted_<risk>` for each of
-        `RISKS`, and `is_own_calibration`.
+        `RISKS`, `is_own_calibration`, and `remark`, what the rejector said of its fit.
     """
     frames = []
     usable = scores[scores["status"] != NOT_APPLICABLE]
@@ -142,7 +142,21 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
-    return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS), "is_own_calibration"])
+    return _together(frames, [*scores.columns, "p_right", "remark", *map(_accepted, RISKS), "is_own_calibration"])
+
+
+def remarks_of(judged: pd.DataFrame) -> list[str]:
+    """What a rejector said of its fits, each remark once, with how many answers it was said of.
+
+    Examples
+    --------
+    >>> remarks_of(pd.DataFrame({"remark": ["", "too few", "too few"], "is_answered": [True, True, False]}))
+    ['too few (1 answer judged so)']
+    """
+    counts = judged.loc[judged["is_answered"].astype(bool) & (judged["remark"] != ""), "remark"].value_counts(
+        sort=False
+    )
+    return [f"{remark} ({counted(int(count), 'answer')} judged so)" for remark, count in sorted(counts.items())]
 
 
 def why_not(scores: pd.DataFrame) -> str:
@@ -220,7 +234,8 @@ def _accepted(risk: float) -> str:
 def _judged(
     test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
 ) -> pd.DataFrame:
-    asked = test.assign(p_right=1.0 - _fit_and_say(make, calibration, test, predictions))
+    p_false, remark = _fit_and_say(make, calibration, test, predictions)
+    asked = test.assign(p_right=1.0 - p_false, remark=remark)
     known = calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
     return asked.assign(**_accepted_rows(known, asked))
 
@@ -235,18 +250,20 @@ def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, 
     """Probabilities on calibration blocks, each by a fit on the other ones; of a single block by its own fit."""
     names = sorted(set(calibration["block"]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
-        return _fit_and_say(make, calibration, calibration, predictions)
+        return _fit_and_say(make, calibration, calibration, predictions)[0]
     fold = calibration["block"].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
     found = np.full(len(calibration), np.nan)
     for part in sorted(set(fold)):
         rest, mine = calibration[fold != part], calibration[fold == part]
         if rest["is_answered"].any():
-            found[fold == part] = _fit_and_say(make, rest, mine, predictions)
+            found[fold == part] = _fit_and_say(make, rest, mine, predictions)[0]
     return found
 
 
-def _fit_and_say(make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
-    """Fit on the answers of some rows; say of others. NaN where there is no answer."""
+def _fit_and_say(
+    make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictions: Mapping[str, Prediction]
+) -> tuple[Floats, str]:
+    """Fit on the answers of some rows; say of others, NaN where there is no answer. And what it remarks of the fit."""
     rejector = make()
     answered = known[known["is_answered"].to_numpy(bool)]
     found = np.full(len(asked), np.nan)
@@ -256,10 +273,11 @@ def _fit_and_say(make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictio
         rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
         if some:
             found[is_answered] = check_p_false(rejector.p_false(some), len(some))
+        remark = remark_of(rejector)
     except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
         message = f"rejector {rejector.card.name!r} failed ({told(error)}): mend it, or leave it out"
         raise MatchError(message) from error
-    return found
+    return found, remark
 
 
 def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Sequence[Prediction]:

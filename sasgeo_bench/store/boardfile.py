@@ -16,13 +16,16 @@ from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 
 LEADERBOARD: Final = "leaderboard"
+PROTECTION: Final = "protection"
 SCORES: Final = "scores"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
+_AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a spreadsheet
 _VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
 _KNOWN: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
     *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
+    *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
     *(FIGURES, "site"),
 )
@@ -62,7 +65,7 @@ def write_board(
     folder : Path
         out/boards/<name>; an older board of the same scorer version there is replaced.
     tables : mapping of str to pandas.DataFrame
-        Each becomes <name>.parquet; "leaderboard" also a csv.
+        Each becomes <name>.parquet; "leaderboard" and "protection" also a csv.
     texts : mapping of str to str
         File name -> text.
     about : mapping
@@ -84,7 +87,8 @@ def write_board(
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
             for part in (Extra(tables=tables, texts=texts), *extras):
                 _write_part(scratch, part, said)
-            tables[LEADERBOARD].to_csv(scratch / f"{LEADERBOARD}.csv", index=False, lineterminator="\n")
+            for name in (one for one in _AS_CSV if one in tables):
+                tables[name].to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
             (scratch / BOARD).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     except SasgeoError:
         raise

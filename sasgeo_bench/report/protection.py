@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that say whether protection levels hold: a Stanford diagram counted for each method, risk and alert limit."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.metrics.base import Bools, Floats
+from sasgeo_bench.metrics.intervals import effective_count
+from sasgeo_bench.metrics.protection import StanfordCounts, conformal_factor, stanford_counts, statement
+from sasgeo_bench.report.rejection import turns
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.sasgeo.protection import METHODS, RISKS, SCALE, level_name
+from sasgeo_bench.score import FIX_M, NOT_APPLICABLE
+from sasgeo_bench.split import Split
+
+ALERT_LIMITS_M: Final = (10.0, FIX_M, 50.0)
+CONFORMAL: Final = "conformal"  # the method whose levels are fitted here
+_AREAS: Final = ("available", "unavailable", "misleading", "hazardous", "exceeded")
+COLUMNS: Final = (
+    *("matcher", "prior_group", "method", "risk", "alert_limit_m", "n", "sites"),
+    *(f"{area}{end}" for area in _AREAS for end in ("", "_lo", "_hi")),
+    "supports",
+)
+
+
+def protection_frame(
+    matcher: str, scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
+) -> pd.DataFrame:
+    """How the protection levels of one matcher fared, all suites of localization together.
+
+    Parameters
+    ----------
+    matcher : str
+        Its name.
+    scores : pandas.DataFrame
+        Its scored rows.
+    predictions : mapping of str to Prediction
+        The same answers by query id, with levels among their diagnostics (`sasgeo.protection.PROTECTION`).
+    split : Split, optional
+        Says which places calibrate conformal levels; without, there are none. Of a hold-out split the test part counts.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for each prior group, method, risk and alert limit, columns those of `COLUMNS`; none where no answer tells
+        a level. Shares are of all queries, an answer without a level is unavailable, one where the place is absent has
+        an infinite error. Intervals are Wilson's of as many trials as there are sites. `supports` says in words what
+        misleading ones among the available support.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.score import score_task
+    >>> len(protection_frame("mine", score_task([], [], {}), {}))
+    0
+    """
+    usable = scores[(scores["status"] != NOT_APPLICABLE) & (scores["track"] == "localization")]
+    rows = [
+        {"matcher": matcher, "prior_group": prior_group, **row}
+        for prior_group, group in usable.groupby("prior_group", sort=True)
+        for row in _rows(group, predictions, split)
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _rows(group: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None) -> Iterator[dict[str, Any]]:
+    """Rows of one prior group."""
+    is_holdout = split is not None and split.spec.kind == "holdout"
+    is_tested = (group["part"] == "test").to_numpy(bool) if is_holdout else np.ones(len(group), dtype=bool)
+    error_m = _errors_m(group)
+    for risk in RISKS:
+        told = {method: _told(group, predictions, level_name(method, risk)) for method in METHODS}
+        for method, level_m in told.items():
+            if np.isfinite(level_m).any():
+                yield from _counted(method, risk, level_m[is_tested], error_m[is_tested], group[is_tested])
+        scale_m = _told(group, predictions, SCALE)
+        if split is not None and np.isfinite(scale_m).any():
+            level_m, is_fitted = _conformal(group, split, scale_m, error_m, risk)
+            yield from _counted(CONFORMAL, risk, level_m[is_fitted], error_m[is_fitted], group[is_fitted])
+
+
+def _errors_m(group: pd.DataFrame) -> Floats:
+    """Error of each query; infinite without an answer, and for an answer where nothing is right."""
+    error_m = group["position_error_m"].to_numpy(float)
+    return np.where(np.isnan(error_m), np.inf, error_m)
+
+
+def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
+    """A level or scale that each answer tells; infinite where there is none, or what is told cannot be one."""
+    answered = zip(group["query_id"], group["is_answered"], strict=True)
+    told = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
+    values = np.array(told, dtype=np.float64)
+    return np.asarray(np.where(values > 0, values, np.inf))
+
+
+def _conformal(
+    group: pd.DataFrame, split: Split, scale_m: Floats, error_m: Floats, risk: float
+) -> tuple[Floats, Bools]:
+    """Levels by a factor that is fitted on other places, and which queries have one that could be fitted."""
+    level_m, is_fitted = np.full(len(group), np.inf), np.zeros(len(group), dtype=bool)
+    for turn in turns(group, split):
+        known = turn.calibration & np.isfinite(scale_m)
+        if known.any():
+            is_fitted |= turn.test
+            level_m[turn.test] = conformal_factor(error_m[known], scale_m[known], risk) * scale_m[turn.test]
+    return level_m, is_fitted
+
+
+def _counted(
+    method: str, risk: float, level_m: Floats, error_m: Floats, part: pd.DataFrame
+) -> Iterator[dict[str, Any]]:
+    """A row for each alert limit; none where nothing was tested."""
+    if not len(part):
+        return
+    sites = effective_count(np.unique(part["pair_id"], return_inverse=True)[1])
+    for limit_m in ALERT_LIMITS_M:
+        counts = stanford_counts(level_m, error_m, limit_m, trials=sites)
+        row = {"method": method, "risk": risk, "alert_limit_m": limit_m, "n": len(part), "sites": sites}
+        yield row | _shares(counts) | {"supports": _supports(counts, risk)}
+
+
+def _shares(counts: StanfordCounts) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for area in _AREAS:
+        interval = getattr(counts, area)
+        found |= {area: interval.value, f"{area}_lo": interval.lo, f"{area}_hi": interval.hi}
+    return found
+
+
+def _supports(counts: StanfordCounts, risk: float) -> str:
+    """What the misleading ones among the available support, both counted in sites."""
+    available = counts.available.value * counts.trials
+    return statement(min(counts.misleading.value * counts.trials, available), available, risk=risk)

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an answer tells of its own soundness: the evidence E of Eqs. 12-14 of the SASGeo paper, by frozen names.
+
+A matcher puts these into the diagnostics of its answers; rejectors read them there. All say the same of any map: none
+is in the units of one matcher's score.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.search.plan import Null, posterior
+
+APART_M: Final = 25.0  # the widest tolerance of the benchmark: what lies nearer is the same answer
+RIVAL_SHARE: Final = 0.05  # of the chosen mode's mass, from which on another one counts as a rival
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Diagnostic:
+    """A number that an answer may tell.
+
+    Parameters
+    ----------
+    name : str
+        Key in the diagnostics of an answer.
+    unit : str
+        As in "m", "nat"; "1" where there is none.
+    meaning : str
+        What it is, in one line.
+    is_wide : bool
+        Whether it spans orders of magnitude, so that a model takes its inverse hyperbolic sine.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    is_wide: bool = False
+
+
+EVIDENCE: Final = (
+    Diagnostic(
+        name="margin_nats",
+        unit="nat",
+        meaning="score of the chosen mode less that of the best one outside the suppression radius of 25 m, or less "
+        "that of none being right where there is no such mode",
+        is_wide=True,
+    ),
+    Diagnostic(
+        name="posterior_entropy_nats",
+        unit="nat",
+        meaning="entropy of the posterior over the modes and none of them being right",
+    ),
+    Diagnostic(
+        name="modes_above",
+        unit="1",
+        meaning="how many modes there are: the chosen one, and those outside the suppression radius with at least 5 % "
+        "of its posterior mass",
+    ),
+    Diagnostic(
+        name="spread_m",
+        unit="m",
+        meaning="root mean square distance of the modes from their mean place, weighted by posterior mass",
+        is_wide=True,
+    ),
+    Diagnostic(
+        name="null_z",
+        unit="1",
+        meaning="how far the best coarse score stands above those of all places, in their standard deviations",
+    ),
+    Diagnostic(
+        name="class_agreement",
+        unit="1",
+        meaning="of all that classes say about chosen mode against rival (or against nothing, without a rival), the "
+        "share that speaks for the chosen one",
+    ),
+    Diagnostic(
+        name="graph_consistency",
+        unit="1",
+        meaning="share of the nodes and edges seen that find their like in the map's graph at the chosen mode",
+    ),
+    Diagnostic(
+        name="unknown_share", unit="1", meaning="share of the view that is unknown; an answer of which all is, is none"
+    ),
+    Diagnostic(
+        name="information_nats",
+        unit="nat",
+        meaning="what the known cells can tell: cells by class, times mutual information with a map of that age, times "
+        "the class's exponent",
+        is_wide=True,
+    ),
+    Diagnostic(
+        name="map_age_years", unit="yr", meaning="from the date of the map to that of the view; 0 for a younger map"
+    ),
+    Diagnostic(
+        name="vio_mahalanobis",
+        unit="1",
+        meaning="Mahalanobis norm of the step from the last fix against odometry; of single views there is none",
+        is_wide=True,
+    ),
+)
+EVIDENCE_NAMES: Final = tuple(item.name for item in EVIDENCE)
+_TOLD: Final = frozenset(
+    {"graph_consistency", "unknown_share", "information_nats", "map_age_years", "vio_mahalanobis"}
+)  # no function of the modes: the matcher has to say them
+
+
+@dataclass(frozen=True, kw_only=True)
+class Modes:
+    """Modes of one search, the chosen one first, and what each class says of each.
+
+    Parameters
+    ----------
+    positions_m : ndarray of float, shape (M, 2)
+        Easting and northing.
+    by_class : ndarray of float, shape (M, C)
+        Tempered scores in nats, whose sum over classes is the score of the mode; whatever else makes up the score, as
+        a graph does, is one more class.
+    none_nats : float
+        Score of none of them being right.
+    sigma_m : float
+        Standard deviation of a refined position along either axis, from the curvature of the score or measured on
+        training blocks.
+
+    Raises
+    ------
+    ShapeError
+        If there is no mode, shapes differ, a number is not finite, or `sigma_m` is not positive.
+
+    Examples
+    --------
+    >>> near = Modes(positions_m=np.array([[0.0, 0.0], [60.0, 80.0]]), by_class=np.array([[3.0], [0.0]]), sigma_m=2.0)
+    >>> near.masses.round(2).tolist(), near.away_m.tolist()
+    ([0.91, 0.05, 0.05], [0.0, 100.0])
+    """
+
+    positions_m: NDArray[np.float64]
+    by_class: NDArray[np.float64]
+    sigma_m: float
+    none_nats: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no list of modes."""
+        count = len(self.positions_m)
+        shapes = (np.shape(self.positions_m), np.shape(self.by_class)[:1])
+        if not count or shapes != ((count, 2), (count,)) or np.ndim(self.by_class) != 2:  # noqa: PLR2004 - (M, C)
+            message = (
+                f"positions_m has shape {np.shape(self.positions_m)} and by_class {np.shape(self.by_class)}, expected "
+                "(M, 2) and (M, C) with at least one mode: an answer without a mode is withheld"
+            )
+            raise ShapeError(message)
+        if not (np.isfinite(self.positions_m).all() and np.isfinite(self.by_class).all()):
+            message = "positions_m or by_class holds a number that is not finite: leave that mode or class out"
+            raise ShapeError(message)
+        if not (np.isfinite(self.none_nats) and 0 < self.sigma_m < np.inf):
+            message = (
+                f"none_nats is {self.none_nats!r}, sigma_m {self.sigma_m!r}, expected finite, and sigma_m positive"
+            )
+            raise ShapeError(message)
+
+    @cached_property
+    def scores(self) -> NDArray[np.float64]:
+        """Score of each mode, nats, shape (M,)."""
+        return np.asarray(self.by_class.sum(axis=1))
+
+    @cached_property
+    def masses(self) -> NDArray[np.float64]:
+        """Posterior probability of each mode and, last, of none, shape (M + 1,)."""
+        return posterior(self.scores.tolist(), temper=1.0, null_score=self.none_nats)
+
+    @cached_property
+    def away_m(self) -> NDArray[np.float64]:
+        """Distance of each mode from the chosen one, metres, shape (M,)."""
+        return np.asarray(np.hypot(*(self.positions_m - self.positions_m[0]).T))
+
+
+def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None) -> dict[str, float]:
+    """Everything of `EVIDENCE` that can be said of an answer; what cannot is left out.
+
+    Parameters
+    ----------
+    modes : Modes
+        Of the search.
+    null : Null, optional
+        Coarse scores of all places.
+    told : float or None
+        What is no function of the modes: `graph_consistency`, `unknown_share`, `information_nats`, `map_age_years`,
+        `vio_mahalanobis`. None and NaN are left out.
+
+    Returns
+    -------
+    dict of str to float
+        Finite numbers by the names of `EVIDENCE`, in that order.
+
+    Raises
+    ------
+    ShapeError
+        If something is told that has no name there.
+
+    Examples
+    --------
+    >>> found = evidence_of(
+    ...     Modes(
+    ...         positions_m=np.array([[0.0, 0.0], [10.0, 0.0], [60.0, 80.0]]),
+    ...         by_class=np.array([[4.0, 1.0], [4.0, 0.5], [0.0, 2.0]]),
+    ...         sigma_m=2.0,
+    ...     ),
+    ...     unknown_share=0.25,
+    ... )
+    >>> found["margin_nats"], found["class_agreement"], found["modes_above"], found["unknown_share"]
+    (3.0, 0.8, 1.0, 0.25)
+    """
+    foreign = next((name for name in told if name not in _TOLD), None)
+    if foreign is not None:
+        message = f"{foreign!r} is nothing a matcher may tell besides its modes, known are {', '.join(sorted(_TOLD))}"
+        raise ShapeError(message)
+    rivals = np.flatnonzero(modes.away_m >= APART_M)
+    rival = rivals[np.argmax(modes.scores[rivals])] if len(rivals) else None
+    against = modes.none_nats if rival is None else modes.scores[rival]
+    shares = modes.masses[:-1] / modes.masses[:-1].sum()
+    middle_m = shares @ modes.positions_m
+    found: dict[str, float | None] = {
+        "margin_nats": modes.scores[0] - against,
+        "posterior_entropy_nats": -(modes.masses * np.log(np.maximum(modes.masses, np.finfo(float).tiny))).sum(),
+        "modes_above": 1 + (modes.masses[rivals] >= RIVAL_SHARE * modes.masses[0]).sum(),
+        "spread_m": np.sqrt(shares @ ((modes.positions_m - middle_m) ** 2).sum(axis=1)),
+        "null_z": None if null is None or not null.deviation > 0 else (null.best - null.mean) / null.deviation,
+        "class_agreement": _agreement(modes.by_class[0] - (0.0 if rival is None else modes.by_class[rival])),
+        **told,
+    }
+    known = {name: found.get(name) for name in EVIDENCE_NAMES}
+    return {name: float(value) for name, value in known.items() if value is not None and np.isfinite(value)}
+
+
+def _agreement(leads: NDArray[np.float64]) -> float | None:
+    """Share of what is said that speaks for; None where nothing is said."""
+    said = np.abs(leads).sum()
+    return float(leads[leads > 0].sum() / said) if said > 0 else None

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`sasgeo_logistic`, `sasgeo_boosted`: P(false fix | evidence) of Eq. 14, fitted on calibration blocks."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from sklearn.ensemble import GradientBoostingClassifier  # type: ignore[import-untyped, unused-ignore]
+from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
+
+from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.sasgeo.conformal import upper_rate
+from sasgeo_bench.sasgeo.frame import Frame, Rows, features, is_none, lead
+
+_DECIMALS: Final = 12  # of a probability: the last digits of a fit hang on where in memory arrays lie
+
+FEW: Final = 5  # fewer answers of a kind, right or false, teach no model which evidence tells them apart
+_FOLDS: Final = 4
+_PER_TREE: Final = 500  # answers that a tree sees at most: more cost time and gain nothing at this depth
+
+
+class Model(Protocol):
+    """Rows of features without gaps -> log-odds of a false fix."""
+
+    def log_odds(self, rows: Rows) -> NDArray[np.float64]:
+        """Log-odds, shape (N,), of rows of shape (N, F)."""
+        ...
+
+
+class _Fitted(ABC):
+    """What both rules share: who is learnt from, and what is done where a fit is not possible."""
+
+    card: RejectorCard
+
+    def __init__(self) -> None:
+        self.remark = ""
+        self._rule: _Learnt | Counted | None = None
+
+    @abstractmethod
+    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
+        """Fit the model proper."""
+
+    def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
+        """Learn from answers of calibration blocks; withheld ones and views wholly unknown teach nothing."""
+        at = [index for index, item in enumerate(predictions) if not is_none(item)]
+        answers = [predictions[index] for index in at]
+        truth = np.asarray(is_false, dtype=bool)[at]
+        false = int(truth.sum())
+        self.remark = ""
+        if min(false, len(truth) - false) < FEW:
+            self._rule = Counted.of(np.array([lead(item) for item in answers]), truth)
+            self.remark = (
+                f"{false} of {len(truth)} calibration answers are false, fewer than {FEW} of a kind teach no model: "
+                "ranked by margin, with no more claimed than the counts carry"
+            )
+        else:
+            raw = features(answers)
+            frame = Frame.of(raw)
+            self._rule = _Learnt(frame=frame, model=self.learn(frame.filled(raw), truth), answers=len(truth))
+
+    def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
+        """Probability of a false fix, shape (N,); 1 where there is no answer."""
+        if self._rule is None:
+            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
+            raise RuntimeError(message)
+        found = np.ones(len(predictions))
+        at = [index for index, item in enumerate(predictions) if not is_none(item)]
+        if at:
+            found[at] = self._rule.p_false([predictions[index] for index in at]).round(_DECIMALS)
+        return found
+
+
+_LIMITS: Final = (
+    "fitted for one matcher; as good as calibration is like the test; takes answers for independent, those of one "
+    "block are not"
+)
+_OURS: Final = (
+    "Evidence by the names of sasgeo.integrity.EVIDENCE, beside the lead over the best candidate 25 m away and the "
+    "matcher's confidence, wide ones by their inverse hyperbolic sine; what is missing or not finite is the median of "
+    "calibration, and a flag; P is drawn towards 1/2 as by one more answer of each kind (Laplace), so n answers never "
+    "say less than 1 / (n + 2); with fewer than 5 false or 5 right answers, the margin's order with Clopper-Pearson's "
+    "upper end of no false one in as many; withheld answers and views of which all is unknown say 1"
+)
+
+
+class SasgeoLogistic(_Fitted):
+    """Logistic regression on the evidence."""
+
+    card = RejectorCard(
+        name="sasgeo_logistic",
+        version="1",
+        title="SASGeo evidence, logistic",
+        source="SASGeo paper (Trukhina and Vashkelis), Section V, Eqs. 12-14",
+        ours=f"scikit-learn's LogisticRegression (C = 1) on standardised features. {_OURS}",
+        licence="Apache-2.0",
+        limits=f"Linear in its features; {_LIMITS}",
+    )
+
+    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
+        """Fit the weights."""
+        return _Logistic.of(rows, is_false)
+
+
+class SasgeoBoosted(_Fitted):
+    """Gradient-boosted trees on the evidence, recalibrated on answers that they did not see."""
+
+    card = RejectorCard(
+        name="sasgeo_boosted",
+        version="1",
+        title="SASGeo evidence, gradient-boosted",
+        source="SASGeo paper (Trukhina and Vashkelis), Section V, Eqs. 12-14; Friedman, Annals of Statistics 2001",
+        ours=(
+            "scikit-learn's GradientBoostingClassifier (60 trees of depth 2, rate 0.08, leaves of 10 answers or more), "
+            "one for each of 4 parts left out; their mean log-odds, by a line fitted on the parts left out (Platt). "
+            f"{_OURS}"
+        ),
+        licence="Apache-2.0",
+        limits=f"Parts are drawn over answers, not over blocks; {_LIMITS}",
+    )
+
+    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
+        """Fit the trees and the line."""
+        return _Boosted.of(rows, is_false)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Learnt:
+    """A frame and the model that was fitted in it on some answers."""
+
+    frame: Frame
+    model: Model
+    answers: int
+
+    def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
+        """Probability of a false fix, shape (N,)."""
+        chance = special.expit(self.model.log_odds(self.frame.filled(features(answers))))
+        return np.asarray((self.answers * chance + 1.0) / (self.answers + 2.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counted:
+    """The margin's order where a model cannot be fitted.
+
+    `margins` are those of calibration, ascending. Where nearly all of calibration was right, an answer that leads by
+    more than m calibration answers did is at most as often false as those, if falseness falls with the margin: at most
+    Clopper-Pearson's upper end of their false ones. Where nearly all was false, the chance of being right is that of
+    one more of each kind at most, and less the less an answer leads.
+    """
+
+    margins: NDArray[np.float64]
+    false: int
+
+    @classmethod
+    def of(cls, margins: NDArray[np.float64], is_false: NDArray[np.bool_]) -> Self:
+        """Count.
+
+        Examples
+        --------
+        >>> clean = Counted.of(np.arange(300.0), np.zeros(300, dtype=bool))
+        >>> clean.chance(np.array([1e9, 299.0, -1.0])).round(3).tolist()
+        [0.01, 0.01, 1.0]
+        """
+        return cls(margins=np.sort(margins), false=int(is_false.sum()))
+
+    def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
+        """Chance of a false fix, shape (N,)."""
+        return self.chance(np.array([lead(item) for item in answers]))
+
+    def chance(self, margins: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Chance of a false fix by margin, shape (N,); never less for a smaller one."""
+        count = len(self.margins)
+        if not count:
+            return np.ones(len(margins))
+        # How many of calibration lead by no more, in between by a straight line so that the order is kept.
+        distinct, first = np.unique(self.margins, return_index=True)
+        passed = np.interp(margins, distinct, np.append(first[1:], count).astype(np.float64), left=0.0)
+        if 2 * self.false > count:
+            return np.asarray(1.0 - passed / count * (count - self.false + 1.0) / (count + 2.0))
+        return np.array([upper_rate(min(self.false, below), below) for below in passed.tolist()])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Logistic:
+    """A weight for each feature."""
+
+    weights: LogisticRegression
+
+    @classmethod
+    def of(cls, rows: Rows, is_false: NDArray[np.bool_]) -> Self:
+        """Fit the weights."""
+        weights = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000)
+        return cls(weights=weights.fit(rows, is_false))
+
+    def log_odds(self, rows: Rows) -> NDArray[np.float64]:
+        """Log-odds of a false fix, shape (N,)."""
+        return np.asarray(self.weights.decision_function(rows), dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Boosted:
+    """Trees that were fitted on different parts, and the line that recalibrates them."""
+
+    trees: tuple[GradientBoostingClassifier, ...]
+    slope: float
+    shift: float
+
+    @classmethod
+    def of(cls, rows: Rows, is_false: NDArray[np.bool_]) -> Self:
+        """Fit the trees on three parts of four, each time others, and the line on the parts they did not see."""
+        fold = np.empty(len(rows), dtype=np.int64)
+        for kind in (False, True):  # each part has its share of the false ones
+            at = np.flatnonzero(is_false == kind)
+            fold[at] = np.arange(len(at)) % _FOLDS
+        trees = tuple(_trees(rows[fold != part], is_false[fold != part]) for part in range(_FOLDS))
+        unseen = np.empty(len(rows))
+        for part, tree in enumerate(trees):
+            unseen[fold == part] = tree.decision_function(rows[fold == part])
+        line = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000).fit(unseen[:, None], is_false)
+        return cls(trees=trees, slope=float(line.coef_[0, 0]), shift=float(line.intercept_[0]))
+
+    def log_odds(self, rows: Rows) -> NDArray[np.float64]:
+        """Log-odds of a false fix, shape (N,)."""
+        said = np.mean([tree.decision_function(rows) for tree in self.trees], axis=0)
+        return np.asarray(self.slope * said + self.shift, dtype=np.float64)
+
+
+def _trees(rows: Rows, is_false: NDArray[np.bool_]) -> GradientBoostingClassifier:
+    trees = GradientBoostingClassifier(
+        n_estimators=60,
+        learning_rate=0.08,
+        max_depth=2,
+        min_samples_leaf=10,
+        subsample=min(1.0, _PER_TREE / len(rows)),
+        random_state=0,
+    )
+    return trees.fit(rows, is_false)

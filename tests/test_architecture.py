@@ -76,7 +76,11 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "panels": None,
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
-    "sasgeo": ("rates", "temper", "weights", "raster", "graph", "temporal", "joint", "integrity"),
+    "sasgeo": (
+        *("rates", "temper", "weights", "raster"),
+        *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
+        *("temporal", "joint", "integrity"),
+    ),
     "plugins": None,
     "run": (
         *("sandbox", "wire", "serve", "child", "worker", "oracle"),

@@ -77,8 +77,10 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
     "sasgeo": (
-        *("rates", "temper", "weights", "raster", "graph", "temporal", "joint"),
-        *("integrity", "protection", "conformal", "frame", "rejectors"),
+        *("rates", "temper", "weights", "raster", "distinct"),
+        *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
+        *("temporal", "joint", "learnt", "arms", "reading", "learning"),
+        *("integrity", "protection", "conformal", "frame", "rejectors", "matchers", "variants"),
     ),
     "plugins": None,
     "run": (

@@ -1,0 +1,327 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes of a map or a view made comparable: kinds by what drew them, places, arms, areas, and what relates them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from sasgeo_bench.angles import bearing_deg, wrap_deg
+from sasgeo_bench.graph import RELATIONS, MapGraph
+from sasgeo_bench.network import LAYERS, ROAD, make_chains, make_network
+from sasgeo_bench.sasgeo.kinds import INDEX, KINDS, PATCHES, ROADS, Drawing
+from sasgeo_bench.shapes import centroids, groups_within
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+MOST_ARMS: Final = 6
+ARM_M: Final = 12.0  # how far along a road its direction is taken: past the curbs of a junction
+BLUR_M: Final = 8.0  # junctions nearer than this are one in a mask: a road's width
+TOUCH_M: Final = 0.5  # outlines nearer than this are one patch in a mask
+_ALONG_WAYS: Final = [RELATIONS.index(name) for name in ("connectivity", "crossing")]
+_TOWARDS_DEG: Final = 45.0
+_PASSING: Final = 2
+_PLAIN_CROSSING: Final = 4  # arms of two roads that cross
+
+
+_IN_A_MASK: Final = {
+    "intersection": "mask intersection",
+    "crossing": "mask intersection",
+    "dead_end": "mask dead_end",
+    "level_crossing": "mask rail crossing",
+    "road_rail_crossing": "mask rail crossing",
+    "road_water_crossing": "mask water crossing",
+    "river_bend": "mask river_bend",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nodes:
+    """Nodes and what relates them.
+
+    Parameters
+    ----------
+    places_m : ndarray of float64, shape (N, 2)
+        Easting and northing of a map, (right, up) of a view.
+    kind : ndarray of int64, shape (N,)
+        Index into `KINDS`.
+    degree : ndarray of int64, shape (N,)
+        Roads that meet; 0 where none do or several junctions are one.
+    area_m2 : ndarray of float64, shape (N,)
+        Of buildings and patches; NaN elsewhere.
+    arms_deg : ndarray of float64, shape (N, MOST_ARMS)
+        Bearings of the roads that leave a junction or an end, NaN behind the last one.
+    pairs, relation : ndarray of int64, shapes (E, 2) and (E,)
+        Edges between nodes, and what they are: index into `graph.RELATIONS`.
+    feature : ndarray of int64, shape (N,)
+        The `osm_id` of what a node is, -1 where that is several things.
+    """
+
+    places_m: Floats
+    kind: Ints
+    degree: Ints
+    area_m2: Floats
+    arms_deg: Floats
+    pairs: Ints
+    relation: Ints
+    feature: Ints
+
+    def __len__(self) -> int:
+        """How many nodes there are."""
+        return len(self.kind)
+
+    @property
+    def radius_m(self) -> Floats:
+        """Of a disc as large as each node, 0 for those without an area; shape (N,)."""
+        return np.asarray(np.nan_to_num(np.sqrt(self.area_m2 / np.pi)))
+
+    def links(self) -> dict[int, set[int]]:
+        """Nodes to which a way leads from each node, by connection or crossing."""
+        found: dict[int, set[int]] = {}
+        for one, two in self.pairs[np.isin(self.relation, _ALONG_WAYS)].tolist():
+            found.setdefault(one, set()).add(two)
+            found.setdefault(two, set()).add(one)
+        return found
+
+    def taken(self, keep: Bools) -> Self:
+        """Some of the nodes, and the edges between them."""
+        new = np.where(keep, np.cumsum(keep) - 1, -1)
+        pairs = new[self.pairs]
+        stays = (pairs >= 0).all(axis=1)
+        return type(self)(
+            places_m=self.places_m[keep],
+            kind=self.kind[keep],
+            degree=self.degree[keep],
+            area_m2=self.area_m2[keep],
+            arms_deg=self.arms_deg[keep],
+            pairs=pairs[stays],
+            relation=self.relation[stays],
+            feature=self.feature[keep],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """All nodes of several sets; no edge runs between two of them.
+
+        Examples
+        --------
+        >>> len(Nodes.joined([nothing(), nothing()]))
+        0
+        """
+        starts = np.cumsum([0, *(len(part) for part in parts)])
+        pairs = [part.pairs + start for part, start in zip(parts, starts[:-1], strict=True)]
+        return cls(
+            places_m=np.concatenate([part.places_m for part in parts]),
+            kind=np.concatenate([part.kind for part in parts]),
+            degree=np.concatenate([part.degree for part in parts]),
+            area_m2=np.concatenate([part.area_m2 for part in parts]),
+            arms_deg=np.concatenate([part.arms_deg for part in parts]),
+            pairs=np.concatenate(pairs),
+            relation=np.concatenate([part.relation for part in parts]),
+            feature=np.concatenate([part.feature for part in parts]),
+        )
+
+
+def nothing() -> Nodes:
+    """No nodes.
+
+    Examples
+    --------
+    >>> nothing().places_m.shape
+    (0, 2)
+    """
+    none = np.zeros(0, dtype=np.int64)
+    return Nodes(
+        places_m=np.zeros((0, 2)),
+        kind=none,
+        degree=none,
+        area_m2=np.zeros(0),
+        arms_deg=np.zeros((0, MOST_ARMS)),
+        pairs=np.zeros((0, 2), dtype=np.int64),
+        relation=none,
+        feature=none,
+    )
+
+
+def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> Nodes:
+    """Nodes of a graph as vectors show them, or as a mask would.
+
+    In a mask roads that cross meet, junctions a road's width apart are one, and houses come as `patches_of`.
+
+    Parameters
+    ----------
+    graph : MapGraph
+        Derived from the features.
+    features : geopandas.GeoDataFrame
+        A feature table: its roads say where the arms of a junction lead.
+    drawing : {"vectors", "mask"}
+        Which of the two.
+    """
+    table = graph.nodes
+    names = table["kind"].to_numpy(dtype=object)
+    on_road = table["class"].isin(ROADS).to_numpy()
+    names = np.where((names == "crossing") & ~on_road, "", names)  # a railway over a river says little
+    renamed = _IN_A_MASK if drawing == "mask" else {kind.name: kind.name for kind in KINDS if kind.drawing == drawing}
+    kind = np.array([INDEX[renamed[name]] if name in renamed else -1 for name in names], dtype=np.int64)
+    places_m = np.asarray(shapely.get_coordinates(table.geometry.to_numpy())).reshape(-1, 2)
+    pairs = graph.edges[["source", "target"]].to_numpy(dtype=np.int64)
+    code = {name: at for at, name in enumerate(RELATIONS)}
+    relation = np.array([code[name] for name in graph.edges["relation"]], dtype=np.int64)
+    found = Nodes(
+        places_m=places_m,
+        kind=kind,
+        degree=np.where(names == "crossing", _PLAIN_CROSSING, table["degree"].to_numpy(dtype=np.int64)),
+        area_m2=np.where(names == "building", table["area_m2"].to_numpy(dtype=np.float64), np.nan),
+        arms_deg=arms_of(features, places_m),
+        pairs=pairs,
+        relation=relation,
+        feature=table["osm_id"].to_numpy(dtype=np.int64),
+    ).taken(kind >= 0)
+    return _blurred(found) if drawing == "mask" else found
+
+
+def _blurred(nodes: Nodes) -> Nodes:
+    """Make one node of those of one kind that lie within a road's width."""
+    near = cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
+    near = near[nodes.kind[near[:, 0]] == nodes.kind[near[:, 1]]]
+    links = coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
+    group = nodes.kind
+    if len(nodes):
+        group = np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+    size = np.bincount(group)
+    first = np.full(len(size), len(nodes))
+    np.minimum.at(first, group, np.arange(len(nodes)))
+    pairs = group[nodes.pairs]
+    apart = pairs[:, 0] != pairs[:, 1]
+    middle = [np.bincount(group, weights=part) / size for part in nodes.places_m.T]
+    arms_deg = _outer_arms(nodes, near)
+    row, arm = np.nonzero(np.isfinite(arms_deg))
+    outer = _by_row(group[row], arms_deg[row, arm], len(size))
+    has_arms = np.bincount(group, weights=np.isfinite(nodes.arms_deg).any(axis=1), minlength=len(size)) == size
+    count = np.where(has_arms, np.isfinite(outer).sum(axis=1), 0)
+    return Nodes(
+        places_m=np.column_stack(middle) if len(nodes) else nodes.places_m,
+        kind=nodes.kind[first],
+        degree=np.where(size == 1, nodes.degree[first], count),
+        area_m2=nodes.area_m2[first],
+        arms_deg=np.where(has_arms[:, None], outer, np.nan),
+        pairs=pairs[apart],
+        relation=nodes.relation[apart],
+        feature=np.where(size == 1, nodes.feature[first], -1),
+    )
+
+
+def _outer_arms(nodes: Nodes, near: Ints) -> Floats:
+    """Arms of nodes but those that lead to one of the other nodes near them."""
+    arms_deg = nodes.arms_deg.copy()
+    for one, two in (near.T, near[:, ::-1].T):
+        towards_deg = bearing_deg(*(nodes.places_m[two] - nodes.places_m[one]).T)
+        leads_there = np.abs(wrap_deg(arms_deg[one] - towards_deg[:, None])) < _TOWARDS_DEG
+        row, arm = np.nonzero(leads_there)
+        arms_deg[one[row], arm] = np.nan
+    return arms_deg
+
+
+def _by_row(row: Ints, bearing: Floats, count: int) -> Floats:
+    """Bearings of each row side by side, shape (count, MOST_ARMS), NaN behind the last one."""
+    order = np.argsort(row, kind="stable")
+    row, bearing = row[order], bearing[order]
+    turn = np.arange(len(row)) - np.searchsorted(row, row)
+    table = np.full((count, MOST_ARMS), np.nan)
+    table[row[turn < MOST_ARMS], turn[turn < MOST_ARMS]] = bearing[turn < MOST_ARMS]
+    return table
+
+
+def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
+    """Bearings of the roads that leave places where a road begins, ends or forks.
+
+    Parameters
+    ----------
+    features : geopandas.GeoDataFrame
+        A feature table.
+    places_m : ndarray of float, shape (N, 2)
+        In its frame.
+
+    Returns
+    -------
+    ndarray of float, shape (N, MOST_ARMS)
+        Degrees in [0, 360), clockwise from the frame's second axis, NaN behind the last one.
+
+    Examples
+    --------
+    >>> ways = gpd.GeoDataFrame(
+    ...     {"class": ["road_minor"] * 2, "is_visible": True},
+    ...     geometry=shapely.from_wkt(["LINESTRING (0 0, 50 0, 90 0)", "LINESTRING (50 0, 50 30)"]),
+    ... )
+    >>> sorted(arms_of(ways, np.array([(50.0, 0.0)]))[0, :3].tolist())
+    [0.0, 90.0, 270.0]
+    """
+    arms = np.full((len(places_m), MOST_ARMS), np.nan)
+    network = make_network(features[features["class"].isin(list(LAYERS)).to_numpy()])
+    degree = network.degree(ROAD)
+    chains = make_chains(network, ROAD, is_break=(degree > 0) & (degree != _PASSING))
+    if not len(chains.length_m) or not len(places_m):
+        return arms
+    line = np.repeat(np.arange(len(chains.length_m)), np.diff(chains.first))
+    ways = shapely.linestrings(chains.en_m, indices=line)
+    along_m = np.minimum(ARM_M, chains.length_m / 2)
+    points = (
+        shapely.line_interpolate_point(ways, along_m),
+        shapely.line_interpolate_point(ways, chains.length_m - along_m),
+    )
+    vertex = chains.tips.T.ravel()
+    away_m = np.concatenate([shapely.get_coordinates(part) for part in points]) - network.vertices[vertex]
+    table = _by_row(
+        vertex, bearing_deg(*away_m.T), len(network.vertices) + 1
+    )  # the last row: places that are no vertex
+    return np.asarray(table[network.lookup(places_m)])
+
+
+def patches_of(features: gpd.GeoDataFrame) -> Nodes:
+    """Buildings and areas as a mask shows them: what touches and is of one class is one.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.suites.vectors import as_features, vector_table
+    >>> row = [("building", 0, False, shapely.box(at, 0, at + 9, 9)) for at in (0, 9, 50)]
+    >>> patches_of(as_features(vector_table(row))).area_m2.tolist()
+    [162.0, 81.0]
+    """
+    names, seen = features["class"].to_numpy(dtype=object), features["is_visible"].to_numpy(dtype=bool)
+    all_shapes = np.asarray(features.geometry.array)
+    is_area = seen & (shapely.get_dimensions(all_shapes) == 2) & (shapely.area(all_shapes) > 0)  # noqa: PLR2004
+    parts = []
+    for name in PATCHES:
+        chosen = np.flatnonzero(is_area & (names == name))
+        if not len(chosen):
+            continue
+        shapes = all_shapes[chosen]
+        group = groups_within(shapes, TOUCH_M)
+        area_m2: Floats = np.bincount(group, weights=shapely.area(shapes)).astype(np.float64)
+        weight = shapely.area(shapes) / area_m2[group]
+        middle = [np.bincount(group, weights=weight * part) for part in centroids(shapes).T]
+        some = nothing()
+        count, is_one = len(area_m2), np.bincount(group) == 1
+        last = np.full(count, -1)
+        last[group] = features["osm_id"].to_numpy(dtype=np.int64)[chosen]
+        parts.append(
+            Nodes(
+                places_m=np.column_stack(middle),
+                kind=np.full(count, INDEX[f"{name} patch"]),
+                degree=np.zeros(count, dtype=np.int64),
+                area_m2=area_m2,
+                arms_deg=np.full((count, MOST_ARMS), np.nan),
+                pairs=some.pairs,
+                relation=some.relation,
+                feature=np.where(is_one, last, -1),
+            )
+        )
+    return Nodes.joined([nothing(), *parts])

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses proposed by pairs of junctions, for unknown heading and scale: two junctions with their arms give both."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
+from sasgeo_bench.sasgeo.observed import ObservedGraph
+from sasgeo_bench.sasgeo.pairs import JUNCTIONS, JunctionPairs
+
+APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones tell no heading, farther ones are seldom both in a view
+SLACK_M: Final = 4.0  # of their distance, either way
+MOST_PAIRS: Final = 150  # of a view, the longest: they tell the heading best
+_PLACE_M, _YAW_DEG, _LOG_SCALE = 12.0, 8.0, 0.08  # votes nearer than this are for one pose
+_ROUNDS: Final = 2
+_TRIED: Final = 10  # cells of votes that are looked at, for each pose that is asked for
+_SIGMAS: Final = 3.0
+_REACH: Final = 1.0 + 1e-6  # some votes are always as near to their mean as to what they were gathered around
+
+
+class Proposal(NamedTuple):
+    """A pose and its votes: the sum, over pairs of junctions that agree, of how rare each of them is, nats."""
+
+    pose: Pose
+    votes: float
+
+
+def proposals(
+    seen: ObservedGraph,
+    mapped: MappedGraph,
+    *,
+    count: int,
+    scales: tuple[float, float] = (1.0, 1.0),
+    prior: Prior | None = None,
+) -> list[Proposal]:
+    """Propose poses from pairs of junctions whose arms agree.
+
+    Each pair of the view is looked up among those of the map: as long, within the scales, and with arms towards the
+    same sides. A hit gives one pose in closed form and votes for it, the more the fewer pairs of that length agree.
+
+    Parameters
+    ----------
+    seen : ObservedGraph
+        The view.
+    mapped : MappedGraph
+        The map.
+    count : int
+        Poses at most.
+    scales : tuple of float
+        Least and greatest scale of the view.
+    prior : Prior, optional
+        Poses outside of its disc, or beyond three sigma of its heading, are not proposed.
+
+    Returns
+    -------
+    list of Proposal
+        The most votes first; empty where the view shows no two junctions.
+
+    Raises
+    ------
+    ConfigError
+        If the scales are no range.
+
+    Examples
+    --------
+    Three streets of a map, seen with another heading and from elsewhere:
+
+    >>> import shapely
+    >>> from sasgeo_bench.evidence import Evidence
+    >>> from sasgeo_bench.graph import build_graph
+    >>> from sasgeo_bench.grid import Grid
+    >>> from sasgeo_bench.pose import inverse
+    >>> from sasgeo_bench.suites.vectors import as_features, vector_table
+    >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
+    >>> lines = shapely.from_wkt(ways)
+    >>> grid = Grid(epsg=32632, west_m=-96.0, north_m=96.0, cell_size_m=2.0, rows=96, cols=96)
+    >>> features = as_features(vector_table([("road_minor", 0, False, line) for line in lines]))
+    >>> known = np.ones(grid.shape, dtype=bool)
+    >>> mapped = MappedGraph.make(build_graph(features), features, known=known, grid=grid)
+    >>> local = shapely.transform(lines, inverse(Pose(easting_m=5.0, northing_m=7.0, yaw_deg=50.0)).to_map)
+    >>> view = Evidence(classes=("road_minor",), cells=np.zeros((1, 96, 96), dtype=np.uint8), cell_size_m=2.0)
+    >>> seen = ObservedGraph.make(view, vector_table([("road_minor", 0, False, line) for line in local]))
+    >>> round(proposals(seen, mapped, count=1)[0].pose.yaw_deg)
+    50
+    """
+    if not 0 < scales[0] <= scales[1] < math.inf:
+        message = f"scales are the least and the greatest scale, both positive and finite, got {scales!r}"
+        raise ConfigError(message)
+    cast = np.concatenate([np.zeros((0, 6)), *(_votes(seen.nodes, mapped, kind, scales) for kind in JUNCTIONS)])
+    if prior is not None:
+        cast = cast[_may_be(cast, prior)]
+    return _counted(cast, count) if len(cast) and count > 0 else []
+
+
+def _votes(nodes: Nodes, mapped: MappedGraph, kind: int, scales: tuple[float, float]) -> Floats:
+    """Easting, northing, yaw, scale, weight and number of the view's pair, a row for each hit, shape (V, 6)."""
+    ours, found = JunctionPairs.of(nodes, kind, apart_m=APART_M), [np.zeros((0, 6))]
+    for theirs in mapped.junction_pairs[kind]:
+        low, high = (
+            np.searchsorted(theirs.length_m, ours.length_m * scale + slack_m)
+            for scale, slack_m in zip(scales, (-SLACK_M, SLACK_M), strict=True)
+        )
+        for number in range(max(0, len(ours.length_m) - MOST_PAIRS), len(ours.length_m)):
+            first, last = int(low[number]), int(high[number])
+            hits = theirs.like(ours.arms[number], first, last)
+            if len(hits):
+                poses = _similarities(nodes, ours, number, mapped, theirs, hits, scales)
+                rarity = math.log((last - first + 1) / len(hits))  # more than 0: no pair is worth nothing
+                about = np.broadcast_to([rarity, number], (len(hits), 2))
+                found.append(np.column_stack((poses, about)))
+    return np.concatenate(found)
+
+
+def _similarities(
+    nodes: Nodes,
+    ours: JunctionPairs,
+    number: int,
+    mapped: MappedGraph,
+    theirs: JunctionPairs,
+    hits: Ints,
+    scales: tuple[float, float],
+) -> Floats:
+    """Easting, northing, yaw and scale that take one pair of the view to each of some of the map, shape (H, 4)."""
+    yaw_deg = theirs.bearing_deg[hits] - ours.bearing_deg[number]
+    scale = np.clip(theirs.length_m[hits] / ours.length_m[number], *scales)
+    right_m, up_m = nodes.places_m[ours.ends[number]].mean(axis=0)
+    sine, cosine = np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg))
+    turned_m = np.column_stack((cosine * right_m + sine * up_m, cosine * up_m - sine * right_m))
+    middle_m = mapped.nodes.places_m[theirs.ends[hits]].mean(axis=1) - scale[:, None] * turned_m
+    return np.column_stack((middle_m, yaw_deg, scale))
+
+
+def _may_be(cast: Floats, prior: Prior) -> Bools:
+    """Whether poses are where a prior allows them."""
+    fits = np.ones(len(cast), dtype=bool)
+    if prior.center_m is not None and prior.radius_m is not None:
+        fits &= np.hypot(*(cast[:, :2] - prior.center_m).T) <= prior.radius_m + _PLACE_M
+    if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
+        fits &= np.abs(wrap_deg(cast[:, 2] - prior.yaw_deg)) <= _SIGMAS * prior.yaw_sigma_deg
+    return fits
+
+
+def _counted(cast: Floats, count: int) -> list[Proposal]:
+    """Poses that many votes agree on, the most first, no two for one place and heading."""
+    at = _spread(cast)
+    tree = cKDTree(at)
+    found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, _TRIED * count)]
+    kept: list[tuple[Proposal, Floats]] = []
+    for proposal, place in sorted(found, key=lambda item: -item[0].votes):
+        if all(np.linalg.norm(place - other) > 2 * _REACH for _, other in kept):
+            kept.append((proposal, place))
+    return [proposal for proposal, _ in kept[:count]]
+
+
+def _spread(cast: Floats) -> Floats:
+    """Votes as points in which two for one pose are at most 1 apart, and a whole turn is none, shape (V, 5)."""
+    turn = np.radians(cast[:, 2:3])
+    return np.column_stack(
+        (
+            cast[:, :2] / _PLACE_M,
+            np.concatenate((np.cos(turn), np.sin(turn)), axis=1) / math.radians(_YAW_DEG),
+            np.log(cast[:, 3]) / _LOG_SCALE,
+        )
+    )
+
+
+def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
+    """Middles of the cells with the most votes, shape (S, 5)."""
+    _, cell = np.unique(np.floor(at).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    weight = np.bincount(cell, weights=cast[:, 4])
+    middle = np.column_stack([np.bincount(cell, weights=part) for part in at.T]) / np.bincount(cell)[:, None]
+    return np.asarray(middle[np.argsort(-weight, kind="stable")[:most]])
+
+
+def _gathered(cast: Floats, at: Floats, tree: cKDTree, start: Floats) -> tuple[Proposal, Floats]:
+    """The pose that the votes around a point are for, and where it lies; a pair of the view votes for it once."""
+    place = at[tree.query(start)[1]]
+    for _ in range(_ROUNDS):
+        near = np.array(sorted(tree.query_ball_point(place, _REACH)), dtype=np.int64)
+        some = cast[near]
+        place = np.average(at[near], axis=0, weights=some[:, 4])
+    east_m, north_m = (place[:2] * _PLACE_M).tolist()
+    yaw_deg = math.degrees(math.atan2(place[3], place[2]))
+    best = np.zeros(int(some[:, 5].max()) + 1)
+    np.maximum.at(best, some[:, 5].astype(np.int64), some[:, 4])
+    pose = Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaw_deg, scale=math.exp(place[4] * _LOG_SCALE))
+    return Proposal(pose=pose, votes=float(best.sum())), place

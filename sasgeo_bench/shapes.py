@@ -211,7 +211,8 @@ def _strict_pairs(en_m: Floats) -> Ints:
     base = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2).reshape(-1, PLANE))
     arms = en_m[base] - en_m[tip][:, None]
     twice_area = np.abs(arms[:, 0, 0] * arms[:, 1, 1] - arms[:, 0, 1] * arms[:, 1, 0])
-    cotangent = (arms[:, 0] * arms[:, 1]).sum(axis=1) / np.maximum(twice_area, np.finfo(float).tiny)
+    with np.errstate(over="ignore"):  # the cotangent of a flat corner is infinite
+        cotangent = (arms[:, 0] * arms[:, 1]).sum(axis=1) / np.maximum(twice_area, np.finfo(float).tiny)
     _, first, edge, uses = np.unique(
         base[:, 0] * len(en_m) + base[:, 1], return_index=True, return_inverse=True, return_counts=True
     )

@@ -93,3 +93,9 @@ def test_shapes_that_overlap_or_share_a_corner_touch() -> None:
 def test_a_shape_without_a_rectangle_has_no_long_side() -> None:
     shapes = np.array([shapely.box(0, 0, 9, 3), shapely.Polygon()])
     np.testing.assert_allclose(np.abs(long_sides(shapes)), [[9, 0], [np.nan, np.nan]], atol=1e-9)
+
+
+def test_neighbours_in_a_row_beside_others_make_flat_triangles_and_no_noise():
+    row = [(-25.0, -36.0), (-28.5, -31.5), (-31.3, -27.9), (-32.0, -27.0)]
+    pairs = delaunay_pairs(np.array([*row, (18.0, -41.0), (54.0, 0.0), (-55.0, 46.0)]), 200.0).tolist()
+    assert all(pair in pairs for pair in ([0, 1], [1, 2], [2, 3]))

@@ -20,7 +20,7 @@ class Good:
 
     card = MatcherCard(name="good", tracks=BOTH, **SAID)
 
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         west_m, south_m, east_m, north_m = region.grid.bounds_m
         self.middle_m = ((west_m + east_m) / 2, (south_m + north_m) / 2)
 
@@ -54,7 +54,7 @@ class NoCard(Good):
 
 
 class RaisesInPrepare(Good):
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         message = "no index today"
         raise ValueError(message)
 

@@ -87,9 +87,10 @@ def out(built, tmp_path):
 
 @pytest.fixture(scope="module")
 def split():
-    grids = {town: read_region_file(find_region_file(town)).grid() for town in TOWNS}
+    halves = dict.fromkeys(TOWNS, "a") | dict.fromkeys(("town-old-town", "town-industrial"), "b")
+    grids = {town: read_region_file(find_region_file(town)).grid() for town in halves}
     spec = read_split_file(find_split_file("crossfit"))
-    places = [{"name": f"place-{town}", "regions": [town]} for town in TOWNS]
+    places = [{"name": f"place-{town}", "regions": [town], "half": half} for town, half in halves.items()]
     said = {"id": "towns", "title": "Towns", "kind": "crossfit", "buffer_m": 0.0, "reach_m": spec.reach_m}
     return make_split(SplitFile.model_validate(said | {"place": places}), grids)
 

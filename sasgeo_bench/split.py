@@ -224,7 +224,9 @@ class Split:
             lines.append(f"  {part:12s} {place.name:18s} {blocks}  {regions}")
         near = nearest_pair(self)
         if self.half_of:
-            lines.append("  each place is tested in its own fold: the rest of its half calibrates, the other half trains")
+            lines.append(
+                "  each place is tested in its own fold: the rest of its half calibrates, the other half trains"
+            )
         if near is not None:
             lines.append(f"  nearest blocks of two parts: {near.first} and {near.second}, {near.gap_m:,.0f} m")
         return "\n".join(lines)

@@ -123,7 +123,7 @@ def test_a_split_file_with_a_fault_is_refused(text, fault):
         ([TWO[0], TWO[1] | {"regions": ["a"]}], "holdout", "region 'a' is listed twice"),
         ([TWO[0], {"name": "b", "regions": ["b"]}], "holdout", "needs a part"),
         (TWO, "crossfit", "must not say a part"),
-        (halved("aabb")[:3] + [{"name": "d", "regions": ["d"]}], "crossfit", "place 'd' needs a half, \"a\" or \"b\""),
+        ([*halved("aabb")[:3], {"name": "d", "regions": ["d"]}], "crossfit", 'place \'d\' needs a half, "a" or "b"'),
         (halved("aaab"), "crossfit", "half 'b' needs two places at least: one is tested, and another one calibrates"),
         ([TWO[0], TWO[1] | {"half": "a"}], "holdout", "place 'b' must not say a half in a hold-out"),
         ([TWO[0], {"name": "b", "part": "test"}], "holdout", "needs regions or blocks"),
@@ -213,7 +213,9 @@ def test_adding_a_place_to_a_cross_fit_leaves_what_the_others_are_for(halves):
     grids = {name: grid(west_m=500_000.0 + 20_000 * at) for at, name in enumerate("abcdefg")}
     small, large = (make_split(spec(halved(letters), "crossfit"), grids) for letters in (halves, [*halves, "a"]))
     for before, after in zip(small.folds, large.folds, strict=False):
-        assert after.part_of == before.part_of | {"g": "calibration" if small.half_of[before.held_out] == "a" else "train"}
+        assert after.part_of == before.part_of | {
+            "g": "calibration" if small.half_of[before.held_out] == "a" else "train"
+        }
 
 
 def test_places_of_a_region_are_those_that_hold_its_blocks(crossfit):

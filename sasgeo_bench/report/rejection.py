@@ -80,7 +80,7 @@ class Turn:
     """One use of a split: which rows are scored, and which calibrate.
 
     `is_own` is False where none of the fold's own calibration places is on the board, so that all the other places
-    calibrate; not so for a matcher that learns, whose answers on these others come from what it learnt on the test place.
+    calibrate. Not so for a matcher that learns: its answers on these others come from what the test place taught it.
     """
 
     test: Bools

@@ -59,7 +59,12 @@ class Server:
         if message["kind"] == "load":
             self.matcher = load_matcher(self.spec)
             learns = isinstance(self.matcher, Learner)
-            return {"status": "ok", "card": asdict(self.matcher.card), "code": code_hash(self.matcher), "learns": learns}
+            return {
+                "status": "ok",
+                "card": asdict(self.matcher.card),
+                "code": code_hash(self.matcher),
+                "learns": learns,
+            }
         if self.matcher is None:
             self.matcher = load_matcher(self.spec)
         if message["kind"] == "learn":

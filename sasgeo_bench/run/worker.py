@@ -68,8 +68,8 @@ class Reach:
 class Reply:
     """What came of a question: a status, a line that says why, seconds and processor seconds inside, the answer.
 
-    Of a plugin that was loaded: its card, a hash of its code, and whether it has a `learn`; of a map: by how much memory
-    grew; of a lesson: what was learnt.
+    Of a plugin that was loaded: its card, a hash of its code, and whether it has a `learn`; of a map: by how much
+    memory grew; of a lesson: what was learnt.
     """
 
     status: Status

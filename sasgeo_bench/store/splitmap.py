@@ -63,7 +63,7 @@ def write_split_map(path: Path, split: Split) -> None:
     note = "blocks of about 1 km; the bar is 1 km; panels are not to one scale"
     figure.text(0.01, 1 - 0.45 / height, note, va="top", fontsize=9, color="#444444")
     parts = sorted({colour_of(split, place) for place in split.blocks}, key=list(COLOURS).index)
-    names = {half: f"half {half}: test, calibration; train for the other" for half in HALVES}
+    names: dict[str, str] = {half: f"half {half}: test, calibration; train for the other" for half in HALVES}
     handles = [Patch(facecolor=COLOURS[part], label=names.get(part, part)) for part in parts]
     figure.legend(handles=handles, loc="upper right", frameon=False, fontsize=9, ncols=len(handles))
     figure.text(0.01, 0.06 / height, ATTRIBUTION, fontsize=8)

@@ -36,7 +36,11 @@ def split_of(kind):
         name: Grid(epsg=32632, west_m=5e5 + 1e5 * at, north_m=5.2e6, cell_size_m=1.0, rows=1000, cols=1000)
         for at, name in enumerate(names)
     }
-    parts = [{"part": part} for part in ("calibration", "test")] if kind == "holdout" else [{"half": half} for half in "aabb"]
+    parts = (
+        [{"part": part} for part in ("calibration", "test")]
+        if kind == "holdout"
+        else [{"half": half} for half in "aabb"]
+    )
     places = [{"name": name, "regions": [name]} | part for name, part in zip(names, parts, strict=True)]
     said = {"id": "two", "title": "Two", "kind": kind, "buffer_m": 0.0, "place": places}
     return make_split(SplitFile.model_validate(said), grids)

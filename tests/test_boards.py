@@ -522,6 +522,7 @@ def test_what_is_named_twice_counts_once(out, tmp_path):
         ({"region": ""}, "region is ''"),
         ({"queries_sha256": {}}, "queries_sha256 is {}"),
         ({"cpu_s": "long"}, "cpu_s of a run is 'long', expected a number"),
+        ({"learned": {"key": "x"}}, r"learned is \{'key': 'x'\}, expected key, file, trained_on and pairs"),
     ],
 )
 def test_a_run_that_does_not_say_whose_it_is_gets_one_line(out, changes, words):

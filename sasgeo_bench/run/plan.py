@@ -171,7 +171,7 @@ class RunPlan:
 def _state(parts: Sequence[RunPart]) -> str:
     """How far some tasks are."""
     left, done, aside = (sum(column) for column in zip(*((len(x.left), x.done, x.aside) for x in parts), strict=True))
-    others = f", {counted(aside, 'answer')} to other queries or of other learning set aside" if aside else ""
+    others = f", {counted(aside, 'answer')} to other queries set aside" if aside else ""
     return f"{counted(left, 'query', 'queries')} left, {done} done{others}"
 
 

@@ -60,7 +60,7 @@ def made_up_split() -> Split:
         )
         for at in range(PLACES)
     }
-    places = [{"name": name, "regions": [name]} for name in grids]
+    places = [{"name": name, "regions": [name], "half": "ab"[at % 2]} for at, name in enumerate(grids)]
     said = {"id": "made-up", "title": "Made up", "kind": "crossfit", "buffer_m": 0.0, "place": places}
     return make_split(SplitFile.model_validate(said), grids)
 

@@ -4,7 +4,7 @@
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +33,7 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, write_board
+from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.validate import validate
 
 Tell = Callable[[str], None]
@@ -158,15 +159,16 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     for entry in entries:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
-        own = own_word(frame, request.split)
+        is_taught = bool(_learned(entry))
+        own = own_word(frame, request.split, is_taught=is_taught)
         if len(own):
             all_judged[entry.name, OWN] = own
             rows.append(to_frame(list(integrity_rows(entry.name, OWN, own))))
         for name, rule in rules.items():
-            judged = judge(frame, predictions[entry.name], rule.make, rule.split)
+            judged = judge(frame, predictions[entry.name], rule.make, rule.split, is_taught=is_taught)
             all_judged[entry.name, name] = judged
             if not len(judged):
-                tell(f"{name} on {entry.name}: not applied, {why_not(frame)}")
+                tell(f"{name} on {entry.name}: not applied, {why_not(frame, is_taught=is_taught)}")
             if len(judged):
                 is_calibrated = rule.card.is_calibrated
                 rows.append(to_frame(list(integrity_rows(entry.name, name, judged, is_calibrated=is_calibrated))))
@@ -379,6 +381,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
                 "how": entry.how,
                 "card": entry.runs[0]["matcher"] if entry.runs else None,
                 "isolation": entry.runs[0].get("isolation") if entry.runs else None,
+                "learned": _learned(entry),
             }
             for entry in board.entries
         ],
@@ -411,6 +414,17 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
         about=about,
         extras=extras,
     )
+
+
+def _learned(entry: Entry) -> list[dict[str, Any]]:
+    """What a contestant has learnt: each text once, where it comes from, and the tasks that were asked under it."""
+    found: dict[str, dict[str, Any]] = {}
+    for about in entry.runs:
+        said = LearnedSaid.of(about)
+        if said is not None:
+            one = found.setdefault(said.key, {**asdict(said), "trained_on": list(said.trained_on), "asked": []})
+            one["asked"].append(f"{about['suite']}/{about['region']}")
+    return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
 
 def _libraries() -> dict[str, str]:

@@ -13,6 +13,7 @@ from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store import rundir
+from sasgeo_bench.store.learnedfile import LearnedSaid
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 REPRODUCED: Final = "reproduced"
@@ -130,6 +131,7 @@ def _read_run(path: Path) -> dict[str, Any]:
     try:
         check_name(str(said["matcher.name"]))
         run_cost(about)
+        LearnedSaid.of(about)
     except (MatchError, MetricError) as error:
         fault = fault or str(error)
     if fault is not None:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors users meet: every one is a `SasgeoError` and fits on one line that names the fault and the mend."""
 
+from collections.abc import Sequence
+
 
 def counted(count: int, one: str, many: str = "") -> str:
     """How many of something, as a line says it; the plural is `one` with an s unless it is given.
@@ -11,6 +13,18 @@ def counted(count: int, one: str, many: str = "") -> str:
     ('1 block', '2 blocks', '0 queries')
     """
     return f"{count} {one if count == 1 else many or one + 's'}"
+
+
+def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
+    """How many of something, and the first of them by name.
+
+    Examples
+    --------
+    >>> named(["monaco", "porto"], "place"), named(list("abcd"), "task", most=2)
+    ('2 places (monaco, porto)', '4 tasks (a, b, ...)')
+    """
+    more = ", ..." if len(names) > most else ""
+    return f"{counted(len(names), one)} ({', '.join(names[:most])}{more})"
 
 
 class SasgeoError(Exception):

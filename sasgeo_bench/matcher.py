@@ -16,6 +16,7 @@ NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_CANDIDATES: Final = 1000  # of one answer
 MOST_DIAGNOSTICS: Final = 64
 MOST_SAID: Final = 4000  # characters of a field of a card
+MOST_LEARNED_BYTES: Final = 2**20  # of what a matcher has learnt, as UTF-8
 SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
 
 
@@ -129,7 +130,16 @@ WITHHELD: Final = Match(poses=(), scores=(), confidence=0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Training:
-    """What a matcher may learn from: maps, queries and truths of the training blocks of a split."""
+    """What a matcher may learn from: maps, queries and truths of places that it is not asked about.
+
+    Parameters
+    ----------
+    regions : mapping of str to Region
+        Maps by the name that queries have in `region`. In a run each is read when it is asked for and only a few are
+        kept: take the pairs in their order, which leaves those on one map together.
+    pairs : sequence of (Query, Truth)
+        Both tracks, and queries whose place is absent (`truth.is_present` is False, or there is no pose) among them.
+    """
 
     regions: Mapping[str, Region]
     pairs: Sequence[tuple[Query, Truth]]
@@ -141,13 +151,54 @@ class Matcher(Protocol):
 
     card: MatcherCard
 
-    def prepare(self, region: Region, training: Training | None) -> None:
-        """Index a map; called once for each map, timed apart."""
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Index a map; called once for each map, timed apart. `learned` is what `learn` said, None without one."""
         ...
 
     def match(self, query: Query, *, top_k: int) -> Match:
         """Answer a query on the map prepared last, with at most `top_k` poses."""
         ...
+
+
+@runtime_checkable
+class Learner(Matcher, Protocol):
+    """A matcher that learns, once for each set of training places and in a process of its own.
+
+    All that is learnt is a text, which the runner keeps and hands to every `prepare`; the same training gives the same
+    text. Where nothing could be learnt `prepare` gets None: a matcher that then cannot answer needs "training" on its
+    card.
+    """
+
+    def learn(self, training: Training) -> str:
+        """Say what is to be known from now on, as JSON or any other text of at most `MOST_LEARNED_BYTES`."""
+        ...
+
+
+def check_learned(learned: object) -> str:
+    """Hold what a matcher has learnt to what can be kept.
+
+    Raises
+    ------
+    MatchError
+        With found and expected, if it is no text, too long, or cannot be written as UTF-8.
+
+    Examples
+    --------
+    >>> check_learned('{"bias_m": 3.5}')
+    '{"bias_m": 3.5}'
+    """
+    if not isinstance(learned, str):
+        message = f"learn() returned {type(learned).__name__}, expected a text: write it as JSON, say"
+        raise MatchError(message)
+    try:
+        size = len(learned.encode())
+    except UnicodeEncodeError as error:
+        message = "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
+        raise MatchError(message) from error
+    if size > MOST_LEARNED_BYTES:
+        message = f"learn() returned {size} bytes, expected at most {MOST_LEARNED_BYTES}"
+        raise MatchError(message)
+    return learned
 
 
 def check_match(match: object, query: Query, *, top_k: int) -> Match:
@@ -264,10 +315,11 @@ def _diagnostics(given: object) -> dict[str, float]:
     return {str(name): _number(value, f"diagnostics[{str(name)!r}]") for name, value in given.items()}
 
 
-def lacks(card: MatcherCard, query: Query) -> str | None:
+def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | None:
     """Why a query is not applicable to a matcher, or None if it is.
 
-    A disc, a heading or vectors that a card needs and a query lacks are named; so is a track it does not answer.
+    A disc, a heading or vectors that a card needs and a query lacks are named; so is a track it does not answer, and
+    training where there was nothing to learn from.
     """
     if query.track not in card.tracks:
         return f"track {query.track}"
@@ -277,6 +329,6 @@ def lacks(card: MatcherCard, query: Query) -> str | None:
         "scale": True,
         "vectors": query.vectors is not None,
         "image": False,
-        "training": False,
+        "training": is_taught,
     }
     return next((f"no {need}" for need in card.needs if not has[need]), None)

@@ -3,7 +3,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -18,9 +18,11 @@ from sasgeo_bench.plugins import check_names
 from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.request import Request, Wanted, plan_requests
-from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.lesson import base_of
+from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
+from sasgeo_bench.split import HALVES, Half
 from sasgeo_bench.store import rundir
 from sasgeo_bench.tasks import ensure_tasks, is_of_region, made_tasks, why_to_draw
 
@@ -58,6 +60,11 @@ class PipelinePlan:
         stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
         lines = [f"{self.spec.id}: {self.spec.title}"]
         lines += [line for stage in stages for line in stage.lines()]
+        if self.spec.learning is not None:
+            suites, most = ", ".join(self.spec.learning.suites), self.spec.learning.most
+            lines.append(
+                f"  learning: each half is asked after learning from the other ({suites}, at most {most} queries)"
+            )
         lines += _run_lines(self, stages, controls)
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
         lines.append(f"  board: {board_folder(self)}")
@@ -142,14 +149,16 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
     asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
     lines, all_done, all_left, all_behind = [], 0, 0, 0
     for spec, mine in asked:
-        planned = plan_run(_run_request(plan, spec, [task for stage in mine for made in stage.made for task in made]))
-        left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
+        goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
+        left, done = _count(goes)
+        planned = goes[0].plan
         lacking = [item for stage in mine for item in stage.lacking]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
         more = f", and what is drawn; {behind} answered there before" if lacking else ""
         where = " (controls alone)" if mine == [controls] and len(stages) > 1 else ""
         lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
+        lines += [f"      {go.name}: {line}" for go in goes for line in go.lines()]
         all_done, all_left, all_behind = all_done + done, all_left + left, all_behind + behind
     lines.insert(0, f"  run: {counted(len(asked), 'matcher')}, {all_done} answered, {all_left} to ask")
     if all_behind:
@@ -224,6 +233,9 @@ def plan_pipeline(
     if spec.task and not requests:
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)
+    if spec.learning is not None and not requests[0].split.half_of:
+        message = f"[learning] needs halves, and split {spec.split!r} is a hold-out: name a cross-fit, or leave it out"
+        raise ConfigError(message)
     controls = Wanted(
         suites=(CONTROLS,),
         regions=CONTROL_REGIONS,
@@ -296,11 +308,68 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
 
 def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress: Progress | None) -> list[Path]:
     """Folders of the runs of one matcher, after whatever had no row was asked."""
-    planned = plan_run(_run_request(plan, spec, tasks))
-    left, done = sum(len(part.left) for part in planned.parts), sum(part.done for part in planned.parts)
-    tell(f"{spec}: {left} queries to ask, {done} answered before")
-    run(planned, tell=tell if left else _silent, progress=progress)
-    return [part.folder for part in planned.parts]
+    folders: list[Path] = []
+    for go in _plan_goes(plan, spec, tasks):
+        left, done = _count([go])
+        label = f"{spec}, {go.name}" if go.name else spec
+        tell(f"{label}: {left} queries to ask, {done} answered before")
+        for line in () if go.plan.lesson is not None else go.lines():
+            tell(f"{label}: {line}")
+        run(go.plan, tell=tell if left else _silent, progress=progress)
+        folders += [part.folder for part in go.plan.parts]
+    return folders
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Go:
+    """One run of a matcher; one that learns has one for each half, and its name says which."""
+
+    name: str
+    plan: RunPlan
+
+    def lines(self) -> list[str]:
+        """What is learnt for it."""
+        if self.name and self.plan.lesson is None:
+            return ["nothing to learn from, asked untaught"]
+        return self.plan.lesson_lines()
+
+
+def _count(goes: Sequence[_Go]) -> tuple[int, int]:
+    """Queries to ask, and those that are answered."""
+    parts = [part for go in goes for part in go.plan.parts]
+    return sum(len(part.left) for part in parts), sum(part.done for part in parts)
+
+
+def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
+    """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other."""
+    whole = plan_run(_run_request(plan, spec, list(tasks)))
+    learning = plan.spec.learning
+    if learning is None or not whole.learns or not tasks:
+        return [_Go(name="", plan=whole)]
+    halves = {task: _half_of(plan, task) for task in tasks}
+    goes = []
+    for half in (*HALVES, None):
+        asked = [task for task in tasks if halves[task] == half]
+        train = [
+            task
+            for task in tasks
+            if task.parent.name in learning.suites and None not in {half, halves[task]} and halves[task] != half
+        ]
+        request = replace(
+            whole.request, tasks=asked, train=train, most_trained=learning.most, split=plan.requests[0].split
+        )
+        if asked:
+            goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
+    return goes
+
+
+def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
+    """The half of a task's region, in the pipeline's split or else in that of the controls; None for the paper's."""
+    region = base_of(task.name)
+    for request in (*plan.requests[:1], *plan.controls[:1]):
+        for place in request.split.places_in(region):
+            return request.split.half_of.get(place)
+    return None
 
 
 def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest:

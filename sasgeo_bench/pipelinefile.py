@@ -49,6 +49,19 @@ class PaperSpec(Document):
     trials: Annotated[int, Field(ge=1, le=10_000)] = 220
 
 
+class LearningSpec(Document):
+    """What matchers that have a `learn` learn from: queries of these suites, at most so many, on the other half.
+
+    Examples
+    --------
+    >>> LearningSpec(suites=["clean"]).most
+    200
+    """
+
+    suites: Annotated[list[str], Field(min_length=1)]
+    most: Annotated[int, Field(ge=1, le=2000)] = 200
+
+
 class PipelineFile(Document):
     """What a pipeline file says: suites on regions of a split, the paper's experiment, or both.
 
@@ -66,6 +79,7 @@ class PipelineFile(Document):
     seed: int = 0
     task: list[TaskSpec] = []
     paper: PaperSpec | None = None
+    learning: LearningSpec | None = None
     matchers: Annotated[list[str], Field(min_length=1)]
     rejectors: list[str] = []
     contrast: list[ContrastSpec] = []
@@ -76,7 +90,9 @@ class PipelineFile(Document):
     @property
     def sha256(self) -> str:
         """Hash of all that it says, defaults among it, as `board.json` names it."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+        # Files without the table keep the hash that boards were made under before there was one.
+        left_out = {"learning"} if self.learning is None else None
+        return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()
 
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:
@@ -103,6 +119,7 @@ class PipelineFile(Document):
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
             ("contrast", [item.name for item in self.contrast]),
+            ("suite to learn from", [] if self.learning is None else self.learning.suites),
             ("seed", [] if self.paper is None else [str(seed) for seed in self.paper.seeds]),
         ):
             twice = sorted({name for name in listed if listed.count(name) > 1})
@@ -111,6 +128,11 @@ class PipelineFile(Document):
                 raise ValueError(message)
         if CONTROLS in suites:
             message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
+            raise ValueError(message)
+        drawn = [name for task in self.task for name in task.suites]
+        lost = next((name for name in (self.learning.suites if self.learning else ()) if name not in drawn), None)
+        if lost is not None:
+            message = f"learning names the suite {lost!r}, which no [[task]] draws: add it there, or leave it out"
             raise ValueError(message)
         _check_apart(self.contrast)
         for item in self.contrast:

@@ -70,8 +70,8 @@ class {cls}:
         limits="looks at a coarse lattice of places, with the heading of the prior alone",
     )
 
-    def prepare(self, region: Region, training: object | None) -> None:
-        """Keep the map; called once for each one."""
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Keep the map; called once for each one. `learned` is what a `learn` of its own would have said."""
         self.region = region
         self.layers = LayerBits.of(region.layers)
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which blocks are train, calibration and test; parts that come too near each other are refused, in metres."""
 
-import hashlib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -20,22 +19,25 @@ from sasgeo_bench.tomlfile import Document
 
 Part = Literal["train", "calibration", "test"]
 PARTS: Final[tuple[Part, ...]] = ("train", "calibration", "test")
+Half = Literal["a", "b"]
+HALVES: Final[tuple[Half, ...]] = ("a", "b")
 
 _WGS84: Final = 4326
-_CALIBRATION_SHARE: Final = 1 / 3  # of the places that are not held out, in a cross-fit
+_LEAST_PLACES: Final = 2  # of a half: one is tested, and another one calibrates
 _GEOD: Final = pyproj.Geod(ellps="WGS84")
 
 
 class Place(Document):
     """Regions, or single blocks of them, that always stay together.
 
-    `part` is given in a hold-out split and left out in a cross-fit.
+    A hold-out split says the `part` of each, a cross-fit the `half`; neither says the other's.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     regions: list[str] = []
     blocks: list[str] = []
     part: Part | None = None
+    half: Half | None = None
 
     @model_validator(mode="after")
     def _holds_something(self) -> Self:
@@ -50,7 +52,8 @@ class SplitFile(Document):
 
     Examples
     --------
-    >>> places = [{"name": name, "regions": [name]} for name in ("vaduz", "monaco")]
+    >>> halves = {"vaduz": "a", "eschen": "a", "monaco": "b", "porto": "b"}
+    >>> places = [{"name": name, "regions": [name], "half": half} for name, half in halves.items()]
     >>> spec = {"id": "mine", "title": "Mine", "kind": "crossfit", "buffer_m": 0.0, "place": places}
     >>> SplitFile.model_validate(spec).block_m
     1000.0
@@ -78,7 +81,21 @@ class SplitFile(Document):
         if wrong is not None:
             message = f"place {wrong!r} " + ("needs a part" if needs_part else "must not say a part in a cross-fit")
             raise ValueError(message)
+        self._check_halves()
         return self
+
+    def _check_halves(self) -> None:
+        """Refuse a cross-fit that does not say where to learn and to calibrate, and a hold-out that does."""
+        is_cut = self.kind == "crossfit"
+        wrong = next((place.name for place in self.place if (place.half is not None) != is_cut), None)
+        if wrong is not None:
+            fault = 'needs a half, "a" or "b"' if is_cut else "must not say a half in a hold-out"
+            message = f"place {wrong!r} {fault}"
+            raise ValueError(message)
+        for half in HALVES if is_cut else ():
+            if sum(place.half == half for place in self.place) < _LEAST_PLACES:
+                message = f"half {half!r} needs two places at least: one is tested, and another one calibrates"
+                raise ValueError(message)
 
     @property
     def region_ids(self) -> tuple[str, ...]:
@@ -144,7 +161,11 @@ def blocks_of(region: str, grid: Grid, *, block_m: float = 1000.0) -> tuple[Bloc
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """One way to use a split: every place in one part. `held_out` names the test place of a cross-fit fold."""
+    """One way to use a split: every place in one part.
+
+    `held_out` names the test place of a cross-fit fold. The rest of its half calibrates and the other half trains, so
+    that what is learnt for a place is learnt once for its half, from places that neither test it nor calibrate it.
+    """
 
     held_out: str | None
     part_of: Mapping[str, Part]
@@ -169,6 +190,15 @@ class Split:
         """Block id -> place."""
         return {block.id: place for place, blocks in self.blocks.items() for block in blocks}
 
+    @cached_property
+    def half_of(self) -> Mapping[str, Half]:
+        """Place -> half, of a cross-fit; a hold-out has none."""
+        return {place.name: place.half for place in self.spec.place if place.half is not None}
+
+    def places_in(self, region: str) -> tuple[str, ...]:
+        """Places that hold blocks of a region; none where the split does not speak of it."""
+        return tuple(place for place, blocks in self.blocks.items() if any(block.region == region for block in blocks))
+
     def blocks_in(self, region: str) -> tuple[Block, ...]:
         """Blocks of one region, in the order of their rows."""
         found = [block for blocks in self.blocks.values() for block in blocks if block.region == region]
@@ -188,22 +218,24 @@ class Split:
             f"{self.spec.id}: {self.spec.title} ({self.spec.kind}, at least {self.spec.buffer_m:g} m between parts)"
         ]
         for place in self.spec.place:
-            count, part = len(self.blocks[place.name]), place.part or "test in its own fold"
+            count, part = len(self.blocks[place.name]), place.part or f"half {place.half}"
             regions = ", ".join(dict.fromkeys(block.region for block in self.blocks[place.name]))
             blocks = f"{count:4d} {'block' if count == 1 else 'blocks':6s}"
             lines.append(f"  {part:12s} {place.name:18s} {blocks}  {regions}")
         near = nearest_pair(self)
+        if self.half_of:
+            lines.append(
+                "  each place is tested in its own fold: the rest of its half calibrates, the other half trains"
+            )
         if near is not None:
             lines.append(f"  nearest blocks of two parts: {near.first} and {near.second}, {near.gap_m:,.0f} m")
         return "\n".join(lines)
 
 
 def _fold(spec: SplitFile, held_out: str) -> Fold:
-    """Hold one place out; of the others, a third in a stable random order is for calibration."""
-    others = [place.name for place in spec.place if place.name != held_out]
-    others.sort(key=lambda name: hashlib.sha256(f"{spec.id}/{held_out}/{name}".encode()).digest())
-    count = max(1, round(len(others) * _CALIBRATION_SHARE))
-    parts: dict[str, Part] = {name: "calibration" if at < count else "train" for at, name in enumerate(others)}
+    """Hold one place out: the rest of its half is for calibration, the other half for training."""
+    own = next(place.half for place in spec.place if place.name == held_out)
+    parts: dict[str, Part] = {place.name: "calibration" if place.half == own else "train" for place in spec.place}
     return Fold(held_out=held_out, part_of=parts | {held_out: "test"})
 
 
@@ -277,10 +309,18 @@ def nearest_pair(split: Split, *, within_m: float = math.inf) -> Pair | None:
     In a cross-fit every place is a part of its own. Distances are taken on the real outlines: on the ellipsoid between
     far regions, in the CRS of the first where they are near.
     """
-    groups: dict[tuple[str, str], list[Block]] = {}
+    parts: dict[str, list[Block]] = {}
     for place, blocks in split.blocks.items():
+        parts.setdefault(split.part_of(place), []).extend(blocks)
+    return nearest_blocks(parts, within_m=within_m)
+
+
+def nearest_blocks(parts: Mapping[str, Sequence[Block]], *, within_m: float = math.inf) -> Pair | None:
+    """Find the two blocks of different groups that are nearest to each other; as `nearest_pair` measures it."""
+    groups: dict[tuple[str, str], list[Block]] = {}
+    for part, blocks in parts.items():
         for block in blocks:
-            groups.setdefault((split.part_of(place), block.region), []).append(block)
+            groups.setdefault((part, block.region), []).append(block)
     pairs = sorted(_group_pairs(groups), key=lambda item: item[0])
     best: Pair | None = None
     for least_m, first, second in pairs:

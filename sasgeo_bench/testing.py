@@ -26,6 +26,7 @@ from sasgeo_bench.tasks import make_tasks
 
 TOWN: Final = "town-agricultural"  # the smallest that has room for candidates
 TOP_K: Final = 10
+LEARNS: Final = "learns, the same text twice"  # a row of those that have a learn()
 _SUITES: Final = ("clean", "no-priors")
 _EACH: Final = 2  # queries asked of each kind
 _RADIUS_M: Final = 100.0  # of two discs that do not meet, each so far from the edge of the map:
@@ -146,13 +147,66 @@ def check_matcher(
             yield Check(name="loads, and has a card", outcome="fail", found=loaded.message)
             return
         yield Check(name="loads, and has a card", outcome="pass", found=f"{loaded.card.name} {loaded.card.version}")
-        ready = worker.prepare(place.map_folder)
+        taught = _taught(worker, place) if loaded.learns else None
+        if taught is not None:
+            yield taught.check
+            yield _untaught(worker, loaded.card, place)
+        text, refused = (None, "") if taught is None else (taught.text, taught.refused)
+        ready = worker.prepare(place.map_folder, text)
         seconds = f"{ready.seconds:.2f} s" if ready.seconds is not None else ready.message
         yield Check(name="prepares a map", outcome="pass" if ready.status == "ok" else "fail", found=seconds)
-        kit = _Kit(worker=worker, card=loaded.card, place=place)
+        kit = _Kit(worker=worker, card=loaded.card, place=place, is_taught=text is not None)
         if ready.status == "ok":
             yield from kit.checks()
-        yield _kept(kit.refused or _refusal(ready), before, _listing(place.folder), worker.isolation.get("files", ""))
+        yield _kept(
+            refused or kit.refused or _refusal(ready),
+            before,
+            _listing(place.folder),
+            worker.isolation.get("files", ""),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Taught:
+    """What a matcher has learnt of the tiny place, what it was refused meanwhile, and the row of the table."""
+
+    text: str | None
+    refused: str
+    check: Check
+
+
+def _taught(worker: Worker, place: TinyPlace) -> _Taught:
+    """Have a matcher learn twice, each time in a process of its own."""
+    maps = {place.region.manifest.id: place.map_folder}
+    blobs = [taskrows.query_bytes(query) for query in place.queries]
+    replies = []
+    for _ in range(2):
+        worker.end()
+        replies.append(worker.learn(maps, zip(blobs, place.truths, strict=True)))
+    worker.end()
+    first, second = replies
+    lost = next((reply for reply in replies if reply.learned is None), None)
+    fault = "another text the second time" if lost is None and first.learned != second.learned else ""
+    fault = fault if lost is None else f"{lost.status}: {lost.message}"
+    size = len((first.learned or "").encode())
+    found = fault or f"{size} bytes from {len(blobs)} queries, {first.seconds or 0.0:.2f} s"
+    check = Check(name=LEARNS, outcome="fail" if fault else "pass", found=found)
+    return _Taught(text=first.learned, refused=_refusal(first) or _refusal(second), check=check)
+
+
+def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
+    """Whether a matcher that learns answers where there was nothing to learn from, unless its card says it cannot."""
+    name = "answers without training"
+    if "training" in card.needs:
+        return Check(name=name, outcome="not applicable", found="the card needs training")
+    ready = worker.prepare(place.map_folder)
+    fault = None if ready.status == "ok" else f"{ready.status}: {ready.message}"
+    queries = _one_of_each_track([query for query in place.queries if lacks(card, query) is None])
+    for query in queries if fault is None else ():
+        fault = fault or _fault(worker.match(taskrows.query_bytes(query), top_k=TOP_K), query)
+    worker.end()
+    found = f"learned = None: {fault}" if fault else f"{len(queries)} queries"
+    return Check(name=name, outcome="fail" if fault else "pass", found=found)
 
 
 def _listing(folder: Path) -> dict[str, tuple[int, int]]:
@@ -203,13 +257,14 @@ class _Kit:
     worker: Worker
     card: MatcherCard
     place: TinyPlace
+    is_taught: bool = False
     refused: str = ""
     first: dict[str, Reply] = field(default_factory=dict)
     second: dict[str, Reply] = field(default_factory=dict)
 
     def checks(self) -> Iterator[Check]:
         """Every check in turn."""
-        able = _chosen(query for query in self.place.queries if lacks(self.card, query) is None)
+        able = _chosen(query for query in self.place.queries if self._lacks(query) is None)
         if not able:
             yield Check(name="answers a query", outcome="not applicable", found="the card's needs leave no query")
             return
@@ -228,6 +283,9 @@ class _Kit:
             yield self._over(name, check, queries)
         yield self._order([query for query in sound if self._twice(query) is None])
         yield self._cost(sound)
+
+    def _lacks(self, query: Query) -> str | None:
+        return lacks(self.card, query, is_taught=self.is_taught)
 
     def _ask(self, query: Query, *, top_k: int = TOP_K) -> Reply:
         reply = self.worker.match(taskrows.query_bytes(query), top_k=top_k)
@@ -277,7 +335,7 @@ class _Kit:
             "a heading": replace(prior, yaw_deg=None, yaw_sigma_deg=None),
         }
         asked = [(what, _changed(query, what, prior=less)) for what, less in bare.items() if less != prior]
-        able = [(what, less) for what, less in asked if lacks(self.card, less) is None]
+        able = [(what, less) for what, less in asked if self._lacks(less) is None]
         if not able:
             raise _NotApplicable
         faults = ((what, _fault(self._ask(less), less)) for what, less in able)
@@ -286,7 +344,7 @@ class _Kit:
     def _unknown(self, query: Query) -> str | None:
         unseen = query.evidence.replace(np.full_like(query.evidence.cells, UNKNOWN))
         blind = _changed(query, "unknown", evidence=unseen, vectors=None)
-        if lacks(self.card, blind) is not None:
+        if self._lacks(blind) is not None:
             raise _NotApplicable
         reply = self._ask(blind)
         if reply.status != "ok" or reply.match is None:

@@ -73,6 +73,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     if not files:
         message = f"{path} holds no predictions: name a predictions file, or the folder of a run"
         raise StoreError(message)
+    under = {parent: rundir.asked_in(parent, asked) for parent in {file.parent for file in files} if path.is_dir()}
     unread = 0
     # In a run's folder a query stands twice where it was asked again: the newer row counts.
     for file in reversed(files):
@@ -84,7 +85,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
         unread += bool(differing)
         for row, item in enumerate([] if differing else table.to_pylist()):
             tie = rundir.tie_of(item)
-            is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(asked)
+            is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
             if item["query_id"] not in before and not is_aside:
                 yield from _row_faults(file.name, row, item, queries, seen)
     missing = [] if unread else [name for name in queries if name not in seen]
@@ -103,8 +104,11 @@ def set_aside(path: Path, tasks: Sequence[Path]) -> int:
         If a file cannot be read.
     """
     asked = _asked(tasks)
-    ties = rundir.read_ties(path) if path.is_dir() else []
-    return len({(tie.query_id, tie.asked) for tie in ties if tie.asked and not tie.answers(asked)})
+    found: set[tuple[str, str]] = set()
+    for parent in {part.parent for part in rundir.parts_of(path)} if path.is_dir() else ():
+        under = rundir.asked_in(parent, asked)
+        found |= {(tie.query_id, tie.asked) for tie in rundir.read_ties(parent) if tie.asked and not tie.answers(under)}
+    return len(found)
 
 
 def _asked(tasks: Sequence[Path]) -> dict[str, str]:

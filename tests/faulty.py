@@ -20,7 +20,7 @@ class Good:
 
     card = MatcherCard(name="good", tracks=BOTH, **SAID)
 
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         west_m, south_m, east_m, north_m = region.grid.bounds_m
         self.middle_m = ((west_m + east_m) / 2, (south_m + north_m) / 2)
 
@@ -54,7 +54,7 @@ class NoCard(Good):
 
 
 class RaisesInPrepare(Good):
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         message = "no index today"
         raise ValueError(message)
 
@@ -208,3 +208,36 @@ class WritesToScratch(Good):
     def answer(self, query, top_k):
         (Path.home() / "mine.txt").write_text("here")
         return super().answer(query, top_k)
+
+
+class Learns(Good):
+    """Knows a number afterwards, and does well without."""
+
+    def learn(self, training):
+        return str(len(training.pairs) + len(training.regions))
+
+    def prepare(self, region, learned):
+        super().prepare(region, learned)
+        self.bias = float(learned or 0)
+
+
+class LearnsByChance(Learns):
+    def learn(self, training):
+        return str(int.from_bytes(os.urandom(4), "big"))
+
+
+class LearnsNothing(Learns):
+    def learn(self, training):
+        message = "too hard"
+        raise ValueError(message)
+
+
+class CannotWithout(Learns):
+    """Its card does not say so."""
+
+    def prepare(self, region, learned):
+        super().prepare(region, learned + "0")
+
+
+class SaysItCannotWithout(CannotWithout):
+    card = MatcherCard(name="cannot-without", tracks=BOTH, needs=("training",), **SAID)

@@ -66,7 +66,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "results": None,
     "rejector": None,
     "store": (
-        *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "rundir", "boardfile", "pluginfiles"),
+        *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
+        *("boardfile", "pluginfiles"),
         *("preview", "sheet", "splitmap", "paperplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,
@@ -85,7 +86,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "plugins": None,
     "run": (
         *("sandbox", "wire", "serve", "child", "worker", "oracle"),
-        *("plan", "schedule", "answers", "cluster", "runner"),
+        *("lesson", "plan", "teach", "schedule", "answers", "cluster", "runner"),
     ),
     "metrics": (
         *("base", "ranking", "pose", "decisions", "integrity", "calibration"),

@@ -87,9 +87,10 @@ def out(built, tmp_path):
 
 @pytest.fixture(scope="module")
 def split():
-    grids = {town: read_region_file(find_region_file(town)).grid() for town in TOWNS}
+    halves = dict.fromkeys(TOWNS, "a") | dict.fromkeys(("town-old-town", "town-industrial"), "b")
+    grids = {town: read_region_file(find_region_file(town)).grid() for town in halves}
     spec = read_split_file(find_split_file("crossfit"))
-    places = [{"name": f"place-{town}", "regions": [town]} for town in TOWNS]
+    places = [{"name": f"place-{town}", "regions": [town], "half": half} for town, half in halves.items()]
     said = {"id": "towns", "title": "Towns", "kind": "crossfit", "buffer_m": 0.0, "reach_m": spec.reach_m}
     return make_split(SplitFile.model_validate(said | {"place": places}), grids)
 
@@ -548,6 +549,7 @@ def test_what_is_named_twice_counts_once(out, tmp_path):
         ({"region": ""}, "region is ''"),
         ({"queries_sha256": {}}, "queries_sha256 is {}"),
         ({"cpu_s": "long"}, "cpu_s of a run is 'long', expected a number"),
+        ({"learned": {"key": "x"}}, r"learned is \{'key': 'x'\}, expected key, file, trained_on and pairs"),
     ],
 )
 def test_a_run_that_does_not_say_whose_it_is_gets_one_line(out, changes, words):

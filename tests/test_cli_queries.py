@@ -35,11 +35,11 @@ def town(folder: Path, name: str, **changes: str) -> Path:
     return path
 
 
-def split_file(folder: Path, *names: str, kind: str = "crossfit") -> Path:
+def split_file(folder: Path, *names: str, kind: str = "holdout") -> Path:
     lines = [f'id = "mine"\ntitle = "Mine"\nkind = "{kind}"\nbuffer_m = 0.0']
-    for name, part in zip(names, ["train", "test"] * len(names), strict=False):
+    for at, name in enumerate(names):
         lines.append(f'[[place]]\nname = "{name}"\nregions = ["{name}"]')
-        lines += [f'part = "{part}"'] if kind == "holdout" else []
+        lines.append(f'part = "{("train", "test")[at % 2]}"' if kind == "holdout" else f'half = "{"ab"[at % 2]}"')
     path = folder / "split.toml"
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -320,9 +320,9 @@ def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_p
     path = town(tmp_path / "own", "elsewhere", **{"center_lonlat = [12.25, 49.25]": "center_lonlat = [14.05, 51.35]"})
     build_region(plan_build(read_region_file(path), out=own_out), tell=lambda _: None, with_preview=False)
     for kind in ("holdout", "crossfit"):
-        split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", kind=kind)
+        split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
         code, told, err = program("verify", split, "--regions", path.parent, "--out", own_out)
-        assert (code, err) == (2, "")
+        assert (code, err) == (2, "1 regions are not built and not searched: town-suburb\n")
         (line,) = told.splitlines()
         assert f"{RIVERSIDE}/0-0 and elsewhere/0-0 of different parts hold the same ground: " in line
         assert int(line.split("ground: ")[1].split()[0]) > 50

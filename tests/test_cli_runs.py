@@ -258,6 +258,9 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
             ("--again", "late"),
             "--again must be one of ok, timeout, crash, invalid, refused, not applicable, got 'late'",
         ),
+        (("--learn-s", "0"), "--learn-s must be seconds between 0 and 604800, got 0"),
+        (("--most-trained", "0"), "--most-trained must lie between 1 and 2000, got 0"),
+        (("--train", TASK, "--split", "crosfit"), "there is no split 'crosfit', did you mean 'crossfit'"),
         (("--tasks", "nowhere"), "nowhere holds no task.json: make the queries first"),
         (("--tasks", "out"), "out holds no task.json: make the queries first"),
         (("--out", "a-file"), "cannot be written (Not a directory)"),
@@ -268,6 +271,19 @@ def test_a_run_that_makes_no_sense_gets_one_line_and_nothing_is_written(mistake,
     Path("a-file").write_text("")
     assert told in mistake(*ORACLE, *words)
     assert not (out / "runs").exists()
+
+
+def test_whoever_learns_from_what_is_asked_gets_one_line_and_nothing_is_written(mistake, out) -> None:
+    told = mistake("run", "--matcher", "faulty:Learns", "--tasks", TASK, "--train", out / "tasks" / "no-priors" / TOWN)
+    assert f"is of region '{TOWN}', and so is {TASK}, which is asked: leave one out" in told
+    assert not (out / "runs").exists()
+
+
+def test_a_matcher_that_does_not_learn_says_so(program, out) -> None:
+    del out
+    code, told, err = program(*ORACLE, "--train", TASK, "--dry-run")
+    assert (code, err) == (0, "")
+    assert told.splitlines()[1] == "  does not learn: what there is to learn from is passed over"
 
 
 @pytest.mark.parametrize(

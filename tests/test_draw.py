@@ -29,6 +29,7 @@ from sasgeo_bench.suites.sites import choose_sites
 from sasgeo_bench.twin import Paste, paste
 
 SITES = 45
+PLACES = ("wide", "far", "farther", "farthest")
 UNLIKELY = (
     1e-6  # of a true statement about chance to fail; the draws are seeded, so that a test that holds goes on holding
 )
@@ -218,12 +219,12 @@ def wide(tmp_path_factory) -> Drawer:
     spec = read_region_file(folder / "wide.toml")
     plan = plan_build(spec, out=folder)
     build_region(plan, tell=lambda _: None, with_preview=False)
-    places = [{"name": name, "regions": [name]} for name in ("wide", "far")]
+    places = [{"name": name, "regions": [name], "half": half} for name, half in zip(PLACES, "abab", strict=True)]
     split_file = SplitFile.model_validate(
         {"id": "x", "title": "X", "kind": "crossfit", "buffer_m": 0.0, "place": places}
     )
-    far = replace(plan.grid, north_m=plan.grid.north_m + 50_000)
-    split = make_split(split_file, {"wide": plan.grid, "far": far})
+    grids = {name: replace(plan.grid, north_m=plan.grid.north_m + 50_000 * at) for at, name in enumerate(PLACES)}
+    split = make_split(split_file, grids)
     region = regiondir.read_region(plan.folder)
     state = State.of(region)
     scene = Scene(map=state, world=state, blocks=split.blocks_in("wide"), view_reach_m=360.0, scenes=("urban",))

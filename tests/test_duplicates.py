@@ -147,7 +147,7 @@ def split_of(parts, kind="holdout"):
         for at, name in enumerate(parts)
     }
     places = [
-        {"name": name, "regions": [name]} | ({"part": part} if kind == "holdout" else {})
+        {"name": name, "regions": [name]} | ({"part": part} if kind == "holdout" else {"half": part})
         for name, part in parts.items()
     ]
     spec = SplitFile.model_validate({"id": "x", "title": "X", "kind": kind, "buffer_m": 0.0, "place": places})
@@ -173,7 +173,7 @@ def test_shared_ground_of_two_parts_is_named_by_its_blocks(copies):
 
 def test_one_part_may_hold_the_same_ground_twice_and_a_cross_fit_may_not(copies):
     assert search_split(split_of({"a": "train", "b": "test", "c": "train"}), copies) == ()
-    assert len(search_split(split_of(dict.fromkeys("abc"), kind="crossfit"), copies)) == 1
+    assert len(search_split(split_of(dict(zip("abcd", "aabb", strict=True)), kind="crossfit"), copies)) == 1
 
 
 def test_a_region_that_is_not_built_is_not_searched(copies):

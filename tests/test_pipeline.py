@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline draws, runs and scores; a second time it does only what is not up to date."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -279,6 +280,69 @@ def test_a_wrong_file_of_the_paper_is_refused_in_one_line(old, new, words):
     with pytest.raises(ConfigError, match=words) as error:
         parse_toml(PAPER.replace(old, new), PipelineFile, source="few.toml")
     assert "\n" not in str(error.value)
+
+
+LEARNING = """
+id = "taught"
+title = "Taught"
+split = "crossfit"
+regions = ["town-suburb", "town-agricultural"]
+matchers = ["learners:Counts", "prior_centre"]
+
+[[task]]
+suites = ["clean"]
+sites = 1
+
+[learning]
+suites = ["clean"]
+most = 5
+"""
+
+
+def test_each_half_is_asked_after_learning_from_the_other(tmp_path, monkeypatch, few_controls):  # noqa: ARG001
+    monkeypatch.syspath_prepend(str(Path(__file__).parent / "run"))
+    plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
+    board = run_pipeline(plan, tell=lambda _: None)
+    assert {item.diagnostics["pairs"] for item in board.predictions["counts"].values()} == {5.0}
+    about = json.loads((tmp_path / "boards" / "taught" / "board.json").read_text(encoding="utf-8"))
+    learned = {entry["name"]: entry["learned"] for entry in about["entries"]}
+    assert learned["prior_centre"] == []
+    assert {tuple(one["trained_on"]): one["asked"] for one in learned["counts"]} == {
+        ("town-agricultural",): ["clean/town-suburb", "controls/town-suburb+controls"],
+        ("town-suburb",): ["clean/town-agricultural"],
+    }
+    text = (tmp_path / "boards" / "taught" / "leaderboard.md").read_text(encoding="utf-8")
+    assert "learnt from 5 queries of 1 place (town-suburb)." in text
+    told = plan.to_text().splitlines()
+    assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in told
+    assert "      half a: has learnt from 5 queries of 1 place (town-agricultural)" in told
+    assert "      half b: has learnt from 5 queries of 1 place (town-suburb)" in told
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('["clean"]\nmost', '["season"]\nmost', "learning names the suite 'season', which no"),
+        ('["clean"]\nmost', '["controls"]\nmost', "learning names the suite 'controls', which no"),
+        ('["clean"]\nmost', '["clean", "clean"]\nmost', "suite to learn from 'clean' is listed twice"),
+        ("most = 5", "most = 0", "greater than or equal to 1"),
+        ('"crossfit"', '"holdout"', "needs halves, and split 'holdout' is a hold-out: name a cross-fit, or leave"),
+    ],
+)
+def test_learning_that_makes_no_sense_is_refused_in_one_line(tmp_path, old, new, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        plan_pipeline(
+            parse_toml(LEARNING.replace(old, new), PipelineFile, source="taught.toml"),
+            out=tmp_path,
+            tell=lambda _: None,
+        )
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
+    spec = small()
+    assert "learning" in spec.model_dump()
+    assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude={"learning"}).encode()).hexdigest()
 
 
 def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp_path):

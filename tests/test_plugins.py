@@ -21,7 +21,7 @@ SAID = {"version": "1", "title": "T", "source": "original", "ours": "all", "lice
 class Sound:
     card = MatcherCard(name="sound", tracks=("localization",), **SAID)
 
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         pass
 
     def match(self, query, *, top_k):

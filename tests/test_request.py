@@ -52,13 +52,12 @@ def own_region(folder: Path, *, name: str = "mine", source: str = RIVERSIDE, **c
     return path
 
 
-def own_split(folder: Path, *names: str, kind: str = "crossfit", reach_m: float = 360.0, buffer_m: float = 0.0) -> Path:
+def own_split(folder: Path, *names: str, reach_m: float = 360.0, buffer_m: float = 0.0) -> Path:
     parts = ["train", "test"] * len(names)
-    lines = [f'id = "mine"\ntitle = "Mine"\nkind = "{kind}"\nbuffer_m = {buffer_m:.1f}\nreach_m = {reach_m:.1f}']
+    lines = [f'id = "mine"\ntitle = "Mine"\nkind = "holdout"\nbuffer_m = {buffer_m:.1f}\nreach_m = {reach_m:.1f}']
     for name, part in zip(names, parts, strict=False):
         lines.append(f'[[place]]\nname = "{name}"\nregions = ["{name}"]')
-        if kind == "holdout":
-            lines.append(f'part = "{part}"')
+        lines.append(f'part = "{part}"')
     path = folder / "split.toml"
     path.write_text("\n".join(lines) + "\n")
     return path

@@ -11,7 +11,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import footprint
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.split import PARTS, SplitFile, blocks_of, make_split, nearest_pair
+from sasgeo_bench.split import HALVES, PARTS, SplitFile, blocks_of, make_split, nearest_blocks, nearest_pair
 from sasgeo_bench.store.catalog import find_split_file, list_region_files, read_region_file, read_split_file
 from sasgeo_bench.tomlfile import parse_toml
 
@@ -29,6 +29,11 @@ TWO = [
     {"name": "a", "regions": ["a"], "part": "train"},
     {"name": "b", "regions": ["b"], "part": "test"},
 ]
+
+
+def halved(halves):
+    """A place of its own for each letter, in that half."""
+    return [{"name": name, "regions": [name], "half": half} for name, half in zip("abcdefgh", halves, strict=False)]
 
 
 @given(st.integers(100, 6000), st.integers(100, 6000), st.floats(150, 3000))
@@ -118,6 +123,9 @@ def test_a_split_file_with_a_fault_is_refused(text, fault):
         ([TWO[0], TWO[1] | {"regions": ["a"]}], "holdout", "region 'a' is listed twice"),
         ([TWO[0], {"name": "b", "regions": ["b"]}], "holdout", "needs a part"),
         (TWO, "crossfit", "must not say a part"),
+        ([*halved("aabb")[:3], {"name": "d", "regions": ["d"]}], "crossfit", 'place \'d\' needs a half, "a" or "b"'),
+        (halved("aaab"), "crossfit", "half 'b' needs two places at least: one is tested, and another one calibrates"),
+        ([TWO[0], TWO[1] | {"half": "a"}], "holdout", "place 'b' must not say a half in a hold-out"),
         ([TWO[0], {"name": "b", "part": "test"}], "holdout", "needs regions or blocks"),
     ],
 )
@@ -156,9 +164,16 @@ def test_the_shipped_splits_hold_every_shipped_region_once_five_kilometres_apart
     assert nearest_pair(split).gap_m >= 5000.0
 
 
-def test_in_a_cross_fit_every_place_tests_once_and_never_teaches_itself():
-    grids = {region: read_region_file(path).grid() for region, path in list_region_files().items()}
-    split = make_split(read_split_file(find_split_file("crossfit")), grids)
+@pytest.fixture(scope="module")
+def crossfit():
+    """The shipped cross-fit, and its region files."""
+    files = {region: read_region_file(path) for region, path in list_region_files().items()}
+    grids = {region: file.grid() for region, file in files.items()}
+    return make_split(read_split_file(find_split_file("crossfit")), grids), files
+
+
+def test_in_a_cross_fit_every_place_tests_once_and_never_teaches_itself(crossfit):
+    split, _ = crossfit
     tested = [place for fold in split.folds for place, part in fold.part_of.items() if part == "test"]
     assert sorted(tested) == sorted(split.blocks)
     for fold in split.folds:
@@ -167,10 +182,49 @@ def test_in_a_cross_fit_every_place_tests_once_and_never_teaches_itself():
         assert len(fold.part_of) == len(split.blocks)
 
 
-def test_adding_a_place_to_a_cross_fit_leaves_the_order_of_the_others():
+def test_what_is_learnt_for_a_place_comes_from_places_that_neither_test_nor_calibrate_it(crossfit):
+    split, _ = crossfit
+    taught = set()
+    for fold in split.folds:
+        train = frozenset(place for place, part in fold.part_of.items() if part == "train")
+        own = split.half_of[fold.held_out]
+        assert train == {place for place, half in split.half_of.items() if half != own}
+        assert {place for place, part in fold.part_of.items() if part != "train"} == set(split.half_of) - train
+        taught.add(train)
+    assert len(taught) == 2  # learning is done twice, not once for each place
+
+
+def test_the_halves_of_the_shipped_cross_fit_are_alike(crossfit):
+    split, files = crossfit
+    blocks, towns, dated = (dict.fromkeys(HALVES, 0) for _ in range(3))
+    for place in split.spec.place:
+        blocks[place.half] += len(split.blocks[place.name])
+        towns[place.half] += any(files[region].pick(None).town is not None for region in place.regions)
+        dated[place.half] += any(
+            files[region].pick(None).town is None and len(files[region].extract) > 1 for region in place.regions
+        )
+    assert blocks["a"] == pytest.approx(blocks["b"], rel=0.1)
+    assert towns["a"] == towns["b"]
+    assert min(dated.values()) >= 2
+
+
+@given(st.permutations("aaabbb"))
+def test_adding_a_place_to_a_cross_fit_leaves_what_the_others_are_for(halves):
     grids = {name: grid(west_m=500_000.0 + 20_000 * at) for at, name in enumerate("abcdefg")}
-    places = [{"name": name, "regions": [name]} for name in "abcdefg"]
-    small, large = (make_split(spec(places[:count], "crossfit"), grids) for count in (6, 7))
+    small, large = (make_split(spec(halved(letters), "crossfit"), grids) for letters in (halves, [*halves, "a"]))
     for before, after in zip(small.folds, large.folds, strict=False):
-        moved = [name for name in before.part_of if before.part_of[name] != after.part_of[name]]
-        assert len(moved) <= 1
+        assert after.part_of == before.part_of | {
+            "g": "calibration" if small.half_of[before.held_out] == "a" else "train"
+        }
+
+
+def test_places_of_a_region_are_those_that_hold_its_blocks(crossfit):
+    split, _ = crossfit
+    assert split.places_in("vaduz") == ("liechtenstein",)
+    assert split.places_in("atlantis") == ()
+
+
+def test_groups_of_blocks_that_are_no_parts_of_a_split_have_a_distance_too():
+    blocks = {name: blocks_of(name, grid(west_m=west_m)) for name, west_m in (("a", 500_000.0), ("b", 503_000.0))}
+    assert nearest_blocks(blocks).gap_m == pytest.approx(1000.0)
+    assert nearest_blocks(blocks, within_m=999.0) is None

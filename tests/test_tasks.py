@@ -296,8 +296,10 @@ def test_a_region_too_small_for_decoys_is_refused_before_its_map_is_edited(own_o
 
 def test_views_that_reach_beyond_the_split_are_refused(own_out, tmp_path):
     split = tmp_path / "split.toml"
-    places = "".join(f'[[place]]\nname = "{name}"\nregions = ["{name}"]\n' for name in (RIVERSIDE, "town-grid"))
-    split.write_text(f'id = "x"\ntitle = "X"\nkind = "crossfit"\nbuffer_m = 0.0\nreach_m = 200.0\n{places}')
+    places = "".join(
+        f'[[place]]\nname = "{name}"\nregions = ["{name}"]\npart = "test"\n' for name in (RIVERSIDE, "town-grid")
+    )
+    split.write_text(f'id = "x"\ntitle = "X"\nkind = "holdout"\nbuffer_m = 0.0\nreach_m = 200.0\n{places}')
     with pytest.raises(ConfigError, match=r"views of 384 m reach up to 288 m .* use a split with a larger reach_m"):
         make(own_out, "clean", split=str(split))
     assert content(own_out) == {}

@@ -36,6 +36,7 @@ ROWS = (
     "time and memory",
     "kept to its scratch folder",
 )
+LEARNT = ("learns, the same text twice", "answers without training")  # rows of those that have a learn()
 shut_in = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kernel has no Landlock to refuse files with")
 
 
@@ -127,6 +128,30 @@ def test_what_a_matcher_may_do_is_no_fault(table, name) -> None:
     rows = table(name)
     assert failed(rows) == []
     assert tuple(rows) == ROWS
+
+
+def test_a_matcher_that_learns_has_two_rows_more(table) -> None:
+    rows = table("Learns")
+    assert failed(rows) == []
+    assert tuple(rows) == (ROWS[0], *LEARNT, *ROWS[1:])
+    assert rows[LEARNT[0]].found.startswith("1 bytes from") or rows[LEARNT[0]].found.startswith("2 bytes from")
+    rows = table("SaysItCannotWithout")
+    assert failed(rows) == []
+    assert rows[LEARNT[1]].outcome == "not applicable"
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "words"),
+    [
+        ("LearnsByChance", 0, "another text the second time"),
+        ("LearnsNothing", 0, "crash: ValueError: too hard"),
+        ("CannotWithout", 1, "learned = None: crash: TypeError"),
+    ],
+)
+def test_a_fault_of_learning_is_told_in_its_own_row(table, name, row, words) -> None:
+    rows = table(name)
+    assert failed(rows) == [LEARNT[row]]
+    assert words in rows[LEARNT[row]].found
 
 
 def test_without_a_map_or_a_query_it_can_answer_a_matcher_is_asked_nothing(table) -> None:

@@ -13,7 +13,7 @@ from sasgeo_baselines.dense import Mode, Plan, Search, ranked
 from sasgeo_baselines.verification import Verifier
 from sasgeo_baselines.view import View
 from sasgeo_bench.evidence import PRESENT, Evidence
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 
@@ -37,9 +37,9 @@ class DenseMatcher(ABC):
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
         """What the map is multiplied with, for all classes of the view: see `voting.make_template`."""
 
-    def prepare(self, region: Region, training: Training | None) -> None:
+    def prepare(self, region: Region, learned: str | None) -> None:
         """Read the map; nothing is learnt."""
-        del training
+        del learned
         self._chart = self.read(region)
         self._used = self._chart.used()
 

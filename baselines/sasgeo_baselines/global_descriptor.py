@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
 from sasgeo_bench.evidence import PRESENT, UNKNOWN
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 
@@ -38,9 +38,9 @@ class GlobalDescriptor:
     def __init__(self) -> None:
         self._sums: Sums | None = None
 
-    def prepare(self, region: Region, training: Training | None) -> None:
+    def prepare(self, region: Region, learned: str | None) -> None:
         """Sum the map once."""
-        del training
+        del learned
         self._sums = Sums.of(region)
         self._region = region.grid
         self._classes = region.classes

@@ -16,7 +16,7 @@ from sasgeo_baselines.descriptor import Descriptor, components
 from sasgeo_baselines.nodes import Nodes
 from sasgeo_baselines.places import at_place, first_apart, lattice_m, points_of
 from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.pose import Prior
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
@@ -57,9 +57,9 @@ class GraphOnly:
     def __init__(self) -> None:
         self._chart: Chart | None = None
 
-    def prepare(self, region: Region, training: Training | None) -> None:
+    def prepare(self, region: Region, learned: str | None) -> None:
         """Read the layers and the nodes of the map."""
-        del training
+        del learned
         self._chart = Chart.of(region)
         self._used = self._chart.used()
         self._nodes = Nodes.of(region.graph)

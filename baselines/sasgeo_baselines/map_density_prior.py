@@ -7,7 +7,7 @@ import numpy as np
 
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 
@@ -36,9 +36,9 @@ class MapDensityPrior:
     def __init__(self) -> None:
         self._sums: Sums | None = None
 
-    def prepare(self, region: Region, training: Training | None) -> None:
+    def prepare(self, region: Region, learned: str | None) -> None:
         """Sum the drawn classes of the map once."""
-        del training
+        del learned
         self._sums = Sums.of(region, DRAWN)
         self._grid = region.grid
 

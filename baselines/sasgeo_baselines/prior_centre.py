@@ -3,7 +3,7 @@
 
 from sasgeo_baselines.answers import is_blind, offsets_m, ranked_candidates
 from sasgeo_baselines.places import at_place, middle_m, points_of
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 
@@ -25,9 +25,9 @@ class PriorCentre:
     def __init__(self) -> None:
         self._region: Region | None = None
 
-    def prepare(self, region: Region, training: Training | None) -> None:
+    def prepare(self, region: Region, learned: str | None) -> None:
         """Keep the map, for queries without a disc."""
-        del training
+        del learned
         self._region = region
 
     def match(self, query: Query, *, top_k: int) -> Match:

@@ -9,7 +9,7 @@ import numpy as np
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import middle_m
 from sasgeo_bench.grid import Grid
-from sasgeo_bench.matcher import MOST_CANDIDATES, WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.matcher import MOST_CANDIDATES, WITHHELD, Match, MatcherCard
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
@@ -32,9 +32,9 @@ class RandomPlaces:
     def __init__(self) -> None:
         self._grid: Grid | None = None
 
-    def prepare(self, region: Region, training: Training | None) -> None:
+    def prepare(self, region: Region, learned: str | None) -> None:
         """Keep the map's outline, for queries without a disc."""
-        del training
+        del learned
         self._grid = region.grid
 
     def match(self, query: Query, *, top_k: int) -> Match:

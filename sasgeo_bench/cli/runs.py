@@ -3,6 +3,7 @@
 
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -13,8 +14,16 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
+from sasgeo_bench.split import Split, make_split
+from sasgeo_bench.store.catalog import (
+    find_split_file,
+    list_region_files,
+    list_split_files,
+    read_region_file,
+    read_split_file,
+)
 from sasgeo_bench.store.rundir import merge_runs
-from sasgeo_bench.store.taskdir import read_asked
+from sasgeo_bench.store.taskdir import read_asked, read_task
 from sasgeo_bench.validate import set_aside, validate
 
 MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
@@ -37,6 +46,20 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     memory_mb: Annotated[
         int, typer.Option(help="MB (10^6 bytes) for all processes of the matcher")
     ] = Limits().memory_bytes // 10**6,
+    train: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="task folder to learn from, its truths beside it, of a place that is not asked; may be repeated"
+        ),
+    ] = None,
+    most_trained: Annotated[
+        int, typer.Option(help="queries to learn from at most, evenly over places, suites and sites")
+    ] = 200,
+    learn_s: Annotated[float, typer.Option(help="seconds to learn")] = Limits().learn_s,
+    split: Annotated[
+        str | None,
+        typer.Option(help="with --train, what is one place; default: the split of the tasks, if it is a shipped one"),
+    ] = None,
     again: Annotated[list[str] | None, typer.Option(help="ask rows of this status again, as in timeout")] = None,
     trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in; run.json says so")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is left to do, and stop")] = False,
@@ -48,18 +71,23 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
         tasks=tasks,
         out=out,
         top_k=top_k,
-        limits=Limits(match_s=match_s, prepare_s=prepare_s, memory_bytes=memory_mb * 10**6),
+        limits=Limits(match_s=match_s, prepare_s=prepare_s, learn_s=learn_s, memory_bytes=memory_mb * 10**6),
         jobs=jobs,
         dask=dask,
         shard=_shard(shard),
         limit=limit,
         again=tuple(again or ()),
         is_shut_in=not trusted,
+        train=tuple(train or ()),
+        most_trained=most_trained,
+        split=_split(split, tasks) if train else None,
     )
     plan = plan_run(request)
     if dry_run:
         typer.echo(plan.to_text())
         return
+    for line in plan.lesson_lines() if plan.lesson is None else ():
+        tell(f"{plan.card.name}: {line}")
     if sys.stderr.isatty():
         with Bars() as bars:
             report = run(plan, tell=tell, progress=bars)
@@ -79,6 +107,16 @@ def _shard(text: str) -> tuple[int, int]:
         message = f"--shard must be i/n, as in 1/2, got {text!r}"
         raise ConfigError(message)
     return int(index), int(count)
+
+
+def _split(name: str | None, tasks: Sequence[Path]) -> Split | None:
+    """The split that is named, or else that of the tasks, with all shipped regions; None where nobody knows it."""
+    if name is None:
+        name = str(read_task(tasks[0]).get("split"))
+        if name not in list_split_files():
+            return None
+    grids = {item: read_region_file(path).grid() for item, path in list_region_files().items()}
+    return make_split(read_split_file(find_split_file(name)), grids)
 
 
 def merge_command(

@@ -80,7 +80,7 @@ class Turn:
     """One use of a split: which rows are scored, and which calibrate.
 
     `is_own` is False where none of the fold's own calibration places is on the board, so that all the other places
-    calibrate.
+    calibrate. Not so for a matcher that learns: its answers on these others come from what the test place taught it.
     """
 
     test: Bools
@@ -88,7 +88,7 @@ class Turn:
     is_own: bool
 
 
-def turns(scores: pd.DataFrame, split: Split) -> Iterator[Turn]:
+def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Iterator[Turn]:
     """Every use of a split for some scored rows; each row is tested once at most.
 
     Parameters
@@ -97,6 +97,8 @@ def turns(scores: pd.DataFrame, split: Split) -> Iterator[Turn]:
         Columns place and part.
     split : Split
         Hold-out: one turn, by the part of each query. Cross-fit: one for each place on the board.
+    is_taught : bool
+        Whether the matcher has learnt from other places: then none but the fold's own calibration places calibrate.
 
     Yields
     ------
@@ -112,10 +114,13 @@ def turns(scores: pd.DataFrame, split: Split) -> Iterator[Turn]:
         if not test.any():
             continue
         own = np.array([fold.part_of.get(name) == "calibration" for name in place], dtype=bool)
-        yield Turn(test=test, calibration=own if own.any() else ~test, is_own=bool(own.any()))
+        is_own = is_taught or bool(own.any())
+        yield Turn(test=test, calibration=own if is_own else ~test, is_own=is_own)
 
 
-def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make, split: Split) -> pd.DataFrame:
+def judge(
+    scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make, split: Split, *, is_taught: bool = False
+) -> pd.DataFrame:
     """What a rejector says of the answers of one matcher, each by a fit on other places.
 
     Parameters
@@ -128,6 +133,8 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
         Gives a new rejector.
     split : Split
         Says which places calibrate.
+    is_taught : bool
+        Whether the matcher has learnt from other places of the split.
 
     Returns
     -------
@@ -138,7 +145,7 @@ def judge(scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Mak
     frames = []
     usable = scores[scores["status"] != NOT_APPLICABLE]
     for _, group in usable.groupby(["track", "prior_group"], sort=True):
-        for turn in turns(group, split):
+        for turn in turns(group, split, is_taught=is_taught):
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
@@ -159,13 +166,15 @@ def remarks_of(judged: pd.DataFrame) -> list[str]:
     return [f"{remark} ({counted(int(count), 'answer')} judged so)" for remark, count in sorted(counts.items())]
 
 
-def why_not(scores: pd.DataFrame) -> str:
+def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:
     """Why `judge` has no row for a matcher, in words.
 
     Parameters
     ----------
     scores : pandas.DataFrame
         Of one matcher.
+    is_taught : bool
+        Whether it has learnt from other places of the split.
 
     Examples
     --------
@@ -174,12 +183,14 @@ def why_not(scores: pd.DataFrame) -> str:
     """
     if not scores["is_answered"].any():
         return "it has no answers to judge"
+    if is_taught:
+        return "no other place of the board is in the half of one that it answered"
     if len(set(scores["place"])) > 1:
         return "no place that may calibrate another one has an answer"
     return "no other place of the board calibrates"
 
 
-def own_word(scores: pd.DataFrame, split: Split | None = None) -> pd.DataFrame:
+def own_word(scores: pd.DataFrame, split: Split | None = None, *, is_taught: bool = False) -> pd.DataFrame:
     """What a matcher itself says of its answers: its confidence, as a rejector that learns nothing.
 
     Parameters
@@ -188,6 +199,8 @@ def own_word(scores: pd.DataFrame, split: Split | None = None) -> pd.DataFrame:
         Of one matcher. Of a hold-out split only the test part counts, as for any rejector.
     split : Split, optional
         Says on which places thresholds for `RISKS` are chosen; all else needs none.
+    is_taught : bool
+        Whether the matcher has learnt from other places of the split.
 
     Returns
     -------
@@ -206,14 +219,14 @@ def own_word(scores: pd.DataFrame, split: Split | None = None) -> pd.DataFrame:
     for _, group in usable.groupby(["track", "prior_group"], sort=True):
         p_right = np.where(group["is_answered"].to_numpy(bool), group["confidence"].to_numpy(float), np.nan)
         if not np.isnan(p_right).all():
-            frames.append(_own_of_group(group.assign(p_right=p_right), split))
+            frames.append(_own_of_group(group.assign(p_right=p_right), split, is_taught=is_taught))
     return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS)])
 
 
-def _own_of_group(group: pd.DataFrame, split: Split | None) -> pd.DataFrame:
+def _own_of_group(group: pd.DataFrame, split: Split | None, *, is_taught: bool) -> pd.DataFrame:
     """The rows of one track and prior group that are tested, with what thresholds of other places accept."""
     accepted = {_accepted(risk): np.full(len(group), np.nan) for risk in RISKS}
-    for turn in () if split is None else turns(group, split):
+    for turn in () if split is None else turns(group, split, is_taught=is_taught):
         known = group[turn.calibration]
         if known["is_answered"].any():
             for name, taken in _accepted_rows(known, group[turn.test]).items():

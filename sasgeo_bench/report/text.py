@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.errors import counted
+from sasgeo_bench.errors import counted, named
 from sasgeo_bench.metrics.compare import LEAST_BLOCKS, RankInterval
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
@@ -243,6 +243,23 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     return [f"CONTROLS FAILED, {len(failed)} of {len(verdicts)}: do not trust this board.", *failed]
 
 
+def learned_lines(about: Mapping[str, Any]) -> list[str]:
+    """Who of a board has learnt, and from which places.
+
+    Examples
+    --------
+    >>> said = {"file": "learned/ab.json", "trained_on": ["monaco", "porto"], "pairs": 24, "asked": ["clean/vaduz"]}
+    >>> learned_lines({"entries": [{"name": "mine", "learned": [said]}]})
+    ['mine: for 1 task (clean/vaduz) learnt from 24 queries of 2 places (monaco, porto).']
+    """
+    return [
+        f"{entry['name']}: for {named(one['asked'], 'task')} {'learnt' if one['file'] else 'could not learn'} from "
+        f"{counted(one['pairs'], 'query', 'queries')} of {named(one['trained_on'], 'place')}."
+        for entry in about.get("entries", ())
+        for one in entry.get("learned", ())
+    ]
+
+
 def board_markdown(
     board: pd.DataFrame,
     about: Mapping[str, Any],
@@ -257,7 +274,7 @@ def board_markdown(
         "",
         _NOTE.format(draws=about["draws"]),
         "",
-        *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board))),
+        *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board), *learned_lines(about))),
         "",
     ]
     if findings:

@@ -19,6 +19,7 @@ from sasgeo_bench.run.schedule import Schedule
 from sasgeo_bench.run.worker import Reply, Worker
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
+from sasgeo_bench.store.taskrows import asked_under
 
 PART_ROWS: Final = 64
 PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
@@ -175,23 +176,25 @@ class _Map:
         for writer in self._writers:
             writer.begin()
             for query, blob, asked in taskdir.read_some(writer.part.task, frozenset(writer.part.left)):
-                if writer.part.asked[query.query_id] != asked:
+                if writer.part.asked[query.query_id] != asked_under(asked, self._plan.key):
                     message = f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
                     raise StoreError(message)
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
         """One process: prepare with the first query, then answer one after the other."""
-        top_k, ready, is_warm = self._plan.request.top_k, None, False
+        top_k, ready, is_warm = self._plan.request.top_k, self._unlearned(), False
         with self._asked() as worker:
             for writer, query, blob in schedule.items(number):
                 if ready is None:
-                    ready = worker.prepare(self._writers[0].part.region)
+                    learned = self._plan.learned
+                    ready = worker.prepare(self._writers[0].part.region, None if learned is None else learned.text)
                     self._check_map()
                     if schedule.is_stopped:
                         return
-                writer.told_by(worker, ready)
-                reason = lacks(self._plan.card, query)
+                if self._unlearned() is None:
+                    writer.told_by(worker, ready)
+                reason = lacks(self._plan.card, query, is_taught=self._plan.lesson is not None)
                 if reason is not None:
                     writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
                     continue
@@ -202,6 +205,13 @@ class _Map:
                         is_warm = True
                     reply = worker.match(blob, top_k=top_k)
                 writer.add(_prediction(query, reply, top_k), cpu_s=reply.cpu_s)
+
+    def _unlearned(self) -> Reply | None:
+        """What every query gets where nothing came of learning: no process is started for it."""
+        learned = self._plan.learned
+        if learned is None or learned.text is not None:
+            return None
+        return Reply(status=learned.status, message=learned.message)
 
     def _check_map(self) -> None:
         """Refuse a map that another run has replaced since; whatever was prepared before is of the old one."""
@@ -215,7 +225,7 @@ class _Map:
         request, part = self._plan.request, self._writers[0].part
         if request.spec == ORACLE:
             return Oracle(part.truth)
-        return Worker(spec=request.spec, reach=reach_of(request, part.region), limits=request.limits)
+        return Worker(spec=request.spec, reach=reach_of(request, (part.region,)), limits=request.limits)
 
 
 def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:

@@ -93,7 +93,8 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
 
     threads = max(1, sum(client.nthreads().values()))
     where = {}
-    bare = replace(plan, parts=())  # other tasks' ids need not travel with every chunk
+    # Other tasks' ids need not travel with every chunk, nor the blocks of a split.
+    bare = replace(plan, parts=(), request=replace(plan.request, split=None))
     for number, part in enumerate(parts):
         for ids in _chunks(part.left, threads):
             chunk = replace(part, left=ids, asked={name: part.asked[name] for name in ids})

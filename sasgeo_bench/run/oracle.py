@@ -51,7 +51,7 @@ class Oracle:
     ) -> None:
         """Nothing is left."""
 
-    def prepare(self, region: Path) -> Reply:
+    def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Read the truths.
 
         Raises
@@ -59,7 +59,7 @@ class Oracle:
         StoreError
             If they are not here.
         """
-        del region
+        del region, learned
         if not (self._folder / taskdir.TRUTH).is_file():
             message = f"{self._folder} holds no truths, and {ORACLE} answers with them: run it where they are"
             raise StoreError(message)

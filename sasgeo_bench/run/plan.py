@@ -11,13 +11,18 @@ from typing import Any, Final
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.matcher import MatcherCard
 from sasgeo_bench.plugins import ORACLE, list_entry_points
-from sasgeo_bench.results import STATUSES, matcher_hash
+from sasgeo_bench.results import STATUSES, Status, matcher_hash
+from sasgeo_bench.run.lesson import Lesson, plan_lesson
 from sasgeo_bench.run.oracle import CARD
 from sasgeo_bench.run.worker import Limits, Reach, Worker
+from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.learnedfile import LearnedSaid, learned_path, read_learned
 from sasgeo_bench.store.regiondir import read_manifest
+from sasgeo_bench.store.taskrows import asked_under
 
 MOST_LINES: Final = 12  # tasks that are named; the others are counted
+MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
 _LEAST_MB, _MOST_MB = 64, 4_000_000
@@ -51,6 +56,13 @@ class RunRequest:
         Statuses whose rows are asked again.
     is_shut_in : bool
         False runs code that is trusted without isolation, and says so.
+    train : sequence of Path
+        Task folders, with their truths beside them, that a matcher with a `learn` learns from before it is asked; of
+        places that are not asked.
+    most_trained : int
+        Queries to learn from at most: evenly over places, then suites, then sites.
+    split : Split, optional
+        Says what is one place, and how far from each other places to learn from and places that are asked must lie.
     """
 
     spec: str
@@ -64,6 +76,9 @@ class RunRequest:
     limit: int | None = None
     again: Sequence[str] = ()
     is_shut_in: bool = True
+    train: Sequence[Path] = ()
+    most_trained: int = 200
+    split: Split | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +86,8 @@ class RunPart:
     """One task of a run: its folder of rows, its map, its truths, and the queries that are left to ask.
 
     `about` is what `task.json` says, `asked` the hash of what is asked by each query that is left
-    (`taskdir.read_asked`), and `aside` how many rows of the folder answer other queries than the task holds now.
+    (`taskdir.read_asked`) and of what was learnt, and `aside` how many rows of the folder answer other queries than the
+    task holds now, or come of other learning.
     """
 
     task: Path
@@ -85,18 +101,65 @@ class RunPart:
     aside: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Learned:
+    """What came of learning: a text, or a status and a line that say why there is none."""
+
+    text: str | None = None
+    status: Status = "ok"
+    message: str = ""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
-    """What a run will do, after the plugin's card was read in a process of its own."""
+    """What a run will do, after the plugin's card was read in a process of its own.
+
+    `lesson` is what a matcher that learns is to learn from, `learned` what came of it, None until it was tried.
+    """
 
     request: RunRequest
     card: MatcherCard
     hash: str
     parts: tuple[RunPart, ...]
+    learns: bool = False
+    lesson: Lesson | None = None
+    learned: Learned | None = None
+
+    @property
+    def run_folder(self) -> Path:
+        """Where the rows of all tasks go."""
+        return _run_folder(self.request, self.card, self.hash)
+
+    @property
+    def key(self) -> str | None:
+        """What rows are tied to besides what is asked; None where there is nothing to learn from."""
+        return None if self.lesson is None else _key(self.lesson, self.learned)
+
+    @property
+    def learned_file(self) -> Path | None:
+        """Where the text is kept, whether it is there yet or not."""
+        return None if self.lesson is None else learned_path(self.run_folder, self.lesson.sha256)
+
+    @property
+    def said(self) -> LearnedSaid | None:
+        """What `run.json` says of learning."""
+        if self.lesson is None or self.key is None or self.learned_file is None:
+            return None
+        has_text = self.learned is not None and self.learned.text is not None
+        file = self.learned_file.relative_to(self.run_folder).as_posix() if has_text else None
+        return LearnedSaid(key=self.key, file=file, trained_on=self.lesson.places, pairs=self.lesson.count)
+
+    def lesson_lines(self) -> list[str]:
+        """What is learnt before anything is asked, in a line; none where nobody asked for it."""
+        if self.lesson is not None:
+            state = "to be learnt from" if self.learned is None else "has learnt from"
+            return [f"{state} {self.lesson.to_text()}"]
+        return ["does not learn: what there is to learn from is passed over"] if self.request.train else []
 
     def to_text(self) -> str:
-        """What is left and done in all, and a line for each of the first tasks."""
+        """What is learnt, what is left and done in all, and a line for each of the first tasks."""
         lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
+        lines += [f"  {line}" for line in self.lesson_lines()]
         lines += [f"  {part.folder}: {_state((part,))}" for part in self.parts[:MOST_LINES]]
         if len(self.parts) > MOST_LINES:
             lines.append(f"  {len(self.parts) - MOST_LINES} more tasks: {_state(self.parts[MOST_LINES:])}")
@@ -120,22 +183,61 @@ def plan_run(request: RunRequest) -> RunPlan:
     MatchError
         If the plugin cannot be loaded or its card is not sound.
     ConfigError
-        If the shard or a number makes no sense.
+        If the shard or a number makes no sense, or there is nothing to learn from but what is asked (`plan_lesson`).
     StoreError
         If a task is missing, of another version, or its map is.
     """
     _check(request)
     if request.dask is not None:  # other processes work in other folders
-        request = replace(request, out=request.out.resolve(), tasks=[task.resolve() for task in request.tasks])
+        tasks, train = ([task.resolve() for task in folders] for folders in (request.tasks, request.train))
+        request = replace(request, out=request.out.resolve(), tasks=tasks, train=train)
     if ":" not in request.spec:
         list_entry_points()  # a clash of names is told here: what the plugin's own process prints is not shown
-    tasks = [(folder, taskdir.read_task(folder)) for folder in dict.fromkeys(request.tasks)]
-    card, code = _card(request)
-    said = {"top_k": request.top_k, "limits": asdict(request.limits), "is_shut_in": request.is_shut_in}
+    abouts = {folder: taskdir.read_task(folder) for folder in request.tasks}
+    card, code, learns = _card(request)
+    limits = {name: value for name, value in asdict(request.limits).items() if learns or name != "learn_s"}
+    said = {"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}
     settings = json.dumps(said, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    parts = tuple(_part(request, card, found, *task) for task in tasks)
-    return RunPlan(request=request, card=card, hash=found, parts=parts)
+    lesson = learned = None
+    if learns and request.train:
+        lesson = plan_lesson(request.train, asked=request.tasks, split=request.split, most=request.most_trained)
+        text = read_learned(learned_path(_run_folder(request, card, found), lesson.sha256))
+        learned = None if text is None else Learned(text=text)
+    key = None if lesson is None else _key(lesson, learned)
+    parts = tuple(_part(request, card, found, key, *item) for item in abouts.items())
+    return RunPlan(request=request, card=card, hash=found, parts=parts, learns=learns, lesson=lesson, learned=learned)
+
+
+def with_learned(plan: RunPlan, learned: Learned) -> RunPlan:
+    """The same plan with what came of learning: only answers under it are done.
+
+    Parameters
+    ----------
+    plan : RunPlan
+        One with a lesson.
+    learned : Learned
+        What came of it.
+
+    Raises
+    ------
+    StoreError
+        As `plan_run` does.
+    """
+    plan = replace(plan, learned=learned)
+    parts = tuple(_part(plan.request, plan.card, plan.hash, plan.key, part.task, part.about) for part in plan.parts)
+    return replace(plan, parts=parts)
+
+
+def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
+    return request.out / "runs" / card.name / found
+
+
+def _key(lesson: Lesson, learned: Learned | None) -> str:
+    """Hash of the text that was learnt; where there is none, of what it was to be learnt from."""
+    text = None if learned is None else learned.text
+    said = f"nothing yet from {lesson.sha256}" if text is None else text
+    return hashlib.sha256(said.encode()).hexdigest()
 
 
 def _check(request: RunRequest) -> None:
@@ -150,7 +252,11 @@ def _check(request: RunRequest) -> None:
         if value is not None and value < 1:
             message = f"{name} must be at least 1, got {value}"
             raise ConfigError(message)
-    for name, seconds in (("--match-s", limits.match_s), ("--prepare-s", limits.prepare_s)):
+    if not 1 <= request.most_trained <= MOST_TRAINED:
+        message = f"--most-trained must lie between 1 and {MOST_TRAINED}, got {request.most_trained}"
+        raise ConfigError(message)
+    times = (("--match-s", limits.match_s), ("--prepare-s", limits.prepare_s), ("--learn-s", limits.learn_s))
+    for name, seconds in times:
         if not 0 < seconds <= _MOST_S:
             message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
             raise ConfigError(message)
@@ -167,11 +273,11 @@ def _check(request: RunRequest) -> None:
         raise ConfigError(message)
 
 
-def _card(request: RunRequest) -> tuple[MatcherCard, str]:
-    """A plugin's card and the hash of its code, told by its own process."""
+def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
+    """A plugin's card, the hash of its code, and whether it learns, told by its own process."""
     if request.spec == ORACLE:
-        return CARD, ""
-    with Worker(spec=request.spec, reach=reach_of(request, None), limits=request.limits) as worker:
+        return CARD, "", False
+    with Worker(spec=request.spec, reach=reach_of(request, ()), limits=request.limits) as worker:
         reply = worker.load()
     if reply.status != "ok" or reply.card is None:
         said = reply.message or "the plugin says nothing of itself"
@@ -179,14 +285,15 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str]:
     if reply.card.name == ORACLE:
         message = f"{request.spec}: card: {ORACLE!r} is the name of a control of the runner, choose another one"
         raise MatchError(message)
-    return reply.card, reply.code
+    return reply.card, reply.code, reply.learns
 
 
-def reach_of(request: RunRequest, region: Path | None) -> Reach:
-    """The map may be read; other maps, truths, and whatever other runs wrote, may not."""
-    roots = {folder.resolve().parent.parent.parent for folder in request.tasks} | {request.out.resolve()}
+def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
+    """Some maps may be read; other maps, truths, and whatever other runs wrote, may not."""
+    folders = (*request.tasks, *request.train)
+    roots = {folder.resolve().parent.parent.parent for folder in folders} | {request.out.resolve()}
     hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards")]
-    readable = [] if region is None else [region.resolve()]
+    readable = [region.resolve() for region in regions]
     # Other dates of a place, and the map that a twin was edited from, would give the world away.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
     hidden += [path for path in maps if path not in readable]
@@ -204,8 +311,10 @@ def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
     return list(groups.values())
 
 
-def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about: dict[str, Any]) -> RunPart:
-    folder = request.out / "runs" / card.name / found / about["suite"] / about["region"]
+def _part(
+    request: RunRequest, card: MatcherCard, found: str, key: str | None, task: Path, about: Mapping[str, Any]
+) -> RunPart:
+    folder = _run_folder(request, card, found) / about["suite"] / about["region"]
     before = rundir.read_run(folder)
     if before is not None and before.get("hash") != found:
         message = f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away"
@@ -216,7 +325,7 @@ def _part(request: RunRequest, card: MatcherCard, found: str, task: Path, about:
     if not taskdir.is_of_map(about, read_manifest(region)):
         message = f"{region} was built anew since the queries of {task} were made: make them again"
         raise StoreError(message)
-    asked = taskdir.read_asked(task)
+    asked = {name: asked_under(said, key) for name, said in taskdir.read_asked(task).items()}
     ties = rundir.read_ties(folder) if folder.is_dir() else []
     _check_old(folder, ties, before, task, about)
     index, count = request.shard

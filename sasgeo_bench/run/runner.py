@@ -14,6 +14,7 @@ from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
 from sasgeo_bench.run.plan import MOST_LINES, RunPart, RunPlan, by_map
+from sasgeo_bench.run.teach import taught
 from sasgeo_bench.store import rundir, runrows, taskdir
 from sasgeo_bench.store.regiondir import locked
 
@@ -100,7 +101,14 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
         If a cluster was named that is not there.
     """
     progress = progress or Lines(tell)
+    for line in plan.lesson_lines() if plan.lesson is None else ():
+        tell(f"{plan.card.name}: {line}")
+    plan = taught(plan, tell=tell)
     _tell_state(plan, tell)
+    for part in plan.parts:
+        if not part.left and part.done and rundir.read_key(part.folder) != plan.key:
+            with locked(part.folder, tell=tell):
+                _begin(plan, part)  # answers under what was learnt before count again: `run.json` says which
     parts = [part for part in plan.parts if part.left]
     if parts:
         progress.begin(plan.card.name, sum(len(part.left) for part in parts))
@@ -124,7 +132,9 @@ def _tell_state(plan: RunPlan, tell: Tell) -> None:
             tell(f"{part.folder}: nothing left, {part.done} done")
     aside = sum(part.aside for part in plan.parts)
     if aside:
-        tell(f"{plan.card.name}: {counted(aside, 'answer')} to queries that these tasks do not hold now, set aside")
+        others = "" if plan.lesson is None else ", or of other learning"
+        said = f"{counted(aside, 'answer')} to queries that these tasks do not hold now{others}, set aside"
+        tell(f"{plan.card.name}: {said}")
 
 
 def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
@@ -249,6 +259,7 @@ def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
             "top_k": plan.request.top_k,
             "limits": asdict(plan.request.limits),
             "warm_up": "one query of each process is asked twice and timed the second time",
+            "learned": None if plan.said is None else asdict(plan.said),
             "map_bytes": sum(path.stat().st_size for path in part.region.iterdir() if path.is_file()),
             **told,
             "licence": LICENCE,

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a matcher's process does once it is shut in: load, prepare, match; every failure becomes a message."""
+"""What a matcher's process does once it is shut in: load, learn, prepare, match; every failure becomes a message."""
 
 import errno
 import hashlib
 import socket
 import sys
 import time
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -13,13 +15,15 @@ from typing import Any, Final
 import psutil
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matcher import Match, Matcher, check_match
+from sasgeo_bench.matcher import Learner, Match, Matcher, Training, check_learned, check_match
 from sasgeo_bench.plugins import load_matcher
+from sasgeo_bench.region import Region
 from sasgeo_bench.results import one_line, told
 from sasgeo_bench.run import wire
 from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.store.taskrows import query_from
+from sasgeo_bench.store.taskrows import pairs_from, query_from
 
+MOST_MAPS: Final = 2  # in memory while a matcher learns, as long as it keeps none itself
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
@@ -54,13 +58,21 @@ class Server:
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
         if message["kind"] == "load":
             self.matcher = load_matcher(self.spec)
-            return {"status": "ok", "card": asdict(self.matcher.card), "code": code_hash(self.matcher)}
+            learns = isinstance(self.matcher, Learner)
+            return {
+                "status": "ok",
+                "card": asdict(self.matcher.card),
+                "code": code_hash(self.matcher),
+                "learns": learns,
+            }
         if self.matcher is None:
             self.matcher = load_matcher(self.spec)
+        if message["kind"] == "learn":
+            return _learn(self.matcher, message, blob)
         if message["kind"] == "prepare":
             region = read_region(Path(message["region"]))
             before, start = _resident_bytes(), time.perf_counter()
-            self.matcher.prepare(region, None)
+            self.matcher.prepare(region, message["learned"])
             seconds = time.perf_counter() - start
             return {"status": "ok", "seconds": seconds, "grown_bytes": max(0, _resident_bytes() - before)}
         query = query_from(blob)
@@ -73,6 +85,53 @@ class Server:
             "cpu_s": cpu_s,
             "match": match_row(check_match(found, query, top_k=message["top_k"])),
         }
+
+
+def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+    if not isinstance(matcher, Learner):
+        fault = f"{matcher.card.name} has no learn()"
+        raise MatchError(fault)
+    pairs = tuple(pairs_from(message["query_bytes"], blob))
+    regions = Maps({name: Path(folder) for name, folder in message["regions"].items()})
+    start = time.perf_counter()
+    learned = check_learned(matcher.learn(Training(regions=regions, pairs=pairs)))
+    return {"status": "ok", "seconds": time.perf_counter() - start, "learned": learned}
+
+
+class Maps(Mapping[str, Region]):
+    """Regions that are read when they are asked for: all those of a split at once would not fit into memory.
+
+    Examples
+    --------
+    >>> list(Maps({"vaduz": Path("out/regions/vaduz")}))
+    ['vaduz']
+    """
+
+    def __init__(self, folders: Mapping[str, Path]) -> None:
+        self._folders = dict(folders)
+        self._kept: OrderedDict[str, Region] = OrderedDict()
+
+    def __getitem__(self, name: str) -> Region:
+        """Read a map, or give the one that was asked for a moment ago."""
+        folder = self._folders[name]
+        if name not in self._kept:
+            while len(self._kept) >= MOST_MAPS:
+                self._kept.popitem(last=False)
+            self._kept[name] = read_region(folder)
+        self._kept.move_to_end(name)
+        return self._kept[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a map of that name, without reading it."""
+        return name in self._folders
+
+    def __iter__(self) -> Iterator[str]:
+        """Names, without reading anything."""
+        return iter(self._folders)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._folders)
 
 
 def code_hash(matcher: Matcher) -> str:

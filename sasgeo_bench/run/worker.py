@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -21,10 +21,12 @@ import psutil
 
 import sasgeo_bench.run.child
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matcher import Match, MatcherCard
+from sasgeo_bench.matcher import Match, MatcherCard, check_learned
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.query import Truth
 from sasgeo_bench.results import Status, one_line
 from sasgeo_bench.run import wire
+from sasgeo_bench.store.taskrows import pairs_bytes
 
 WATCH_S: Final = 0.05  # how often memory is looked at
 _KEPT_BYTES: Final = 4000  # of what a matcher prints
@@ -38,8 +40,8 @@ class Limits:
 
     Parameters
     ----------
-    match_s, prepare_s : float
-        Seconds by the clock for one query, and for one map.
+    match_s, prepare_s, learn_s : float
+        Seconds by the clock for one query, for one map, and for whatever is learnt at once.
     memory_bytes : int
         Of all its processes together, resident; and of the address space of each.
     file_bytes : int
@@ -48,6 +50,7 @@ class Limits:
 
     match_s: float = 30.0
     prepare_s: float = 600.0
+    learn_s: float = 900.0
     memory_bytes: int = 4 * 10**9
     file_bytes: int = 2**30
 
@@ -65,7 +68,8 @@ class Reach:
 class Reply:
     """What came of a question: a status, a line that says why, seconds and processor seconds inside, the answer.
 
-    Of a plugin that was loaded: its card, and a hash of its code; of a map: by how much memory grew.
+    Of a plugin that was loaded: its card, a hash of its code, and whether it has a `learn`; of a map: by how much
+    memory grew; of a lesson: what was learnt.
     """
 
     status: Status
@@ -75,7 +79,9 @@ class Reply:
     match: Match | None = None
     card: MatcherCard | None = None
     code: str = ""
+    learns: bool = False
     grown_bytes: int | None = None
+    learned: str | None = None
 
 
 @dataclass(kw_only=True)
@@ -101,6 +107,7 @@ class Worker:
     _printed: deque[bytes] = field(default_factory=deque)
     _scratch: Path | None = None
     _region: Path | None = None
+    _learned: str | None = None
 
     def __enter__(self) -> Self:
         """Start nothing yet."""
@@ -116,10 +123,18 @@ class Worker:
         """Import the plugin."""
         return self._ask({"kind": "load"}, timeout_s=self.limits.prepare_s)
 
-    def prepare(self, region: Path) -> Reply:
-        """Index a map."""
-        self._region = region
-        reply = self._ask({"kind": "prepare", "region": str(region.resolve())}, timeout_s=self.limits.prepare_s)
+    def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
+        """Learn from queries, each a row in Arrow's stream format, and their truths, on maps by their names."""
+        sizes, blob = pairs_bytes(pairs)
+        maps = {name: str(path.resolve()) for name, path in regions.items()}
+        message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
+        return self._ask(message, blob, timeout_s=self.limits.learn_s)
+
+    def prepare(self, region: Path, learned: str | None = None) -> Reply:
+        """Index a map, with what was learnt before."""
+        self._region, self._learned = region, learned
+        message = {"kind": "prepare", "region": str(region.resolve()), "learned": learned}
+        reply = self._ask(message, timeout_s=self.limits.prepare_s)
         if reply.status != "ok":
             self.end()
         return reply
@@ -127,7 +142,7 @@ class Worker:
     def match(self, query: bytes, *, top_k: int) -> Reply:
         """Ask one query, a row in Arrow's stream format, on the map prepared last."""
         if self._process is None and self._region is not None:
-            again = self.prepare(self._region)
+            again = self.prepare(self._region, self._learned)
             if again.status != "ok":
                 return again
         reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
@@ -292,7 +307,9 @@ def _reply_of(answer: Mapping[str, Any]) -> Reply:
             seconds=seconds,
             card=None if card is None else _card_of(card),
             code=str(answer.get("code", "")),
+            learns=answer.get("learns") is True,
             grown_bytes=int(answer.get("grown_bytes", 0)),
+            learned=check_learned(answer["learned"]) if "learned" in answer else None,
         )
     numbers = [[float(value) for value in candidate] for candidate in row["candidates"]]
     poses = [Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in numbers]

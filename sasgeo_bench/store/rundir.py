@@ -13,8 +13,9 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sasgeo_bench.errors import PoseError, StoreError
+from sasgeo_bench.errors import MatchError, PoseError, StoreError
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.runrows import (
     PREDICTION_SCHEMA,
     RUN_SCHEMA,
@@ -23,7 +24,7 @@ from sasgeo_bench.store.runrows import (
     prediction_row,
     with_candidates,
 )
-from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, poses_of
+from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, asked_under, poses_of
 
 RUN: Final = "run.json"
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
@@ -134,7 +135,8 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
     folder : Path
         Of a run; one that was cut off before its first row has none.
     asked : mapping of str to str
-        By query id, what an answer has to say that it answers (`taskdir.read_asked`).
+        By query id, the hash of what is asked (`taskdir.read_asked`). A row must say it, with what `run.json` beside it
+        says was learnt.
     is_tied : bool
         Whether rows that do not say so are known to answer these queries.
 
@@ -145,9 +147,10 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
     """
     found: dict[str, Prediction] = {}
     aside: set[Tie] = set()
+    under = {parent: asked_in(parent, asked) for parent in {part.parent for part in parts_of(folder)}}
     for part in reversed(parts_of(folder)):
         table = _checked(part)
-        ties = _ties_of(table)
+        ties, asked = _ties_of(table), under[part.parent]
         is_mine = [tie.answers(asked, is_tied=is_tied) for tie in ties]
         aside |= {replace(tie, status="") for tie, mine in zip(ties, is_mine, strict=True) if not mine}
         if not all(is_mine):
@@ -155,6 +158,46 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
         for prediction in _rows_of(part, table, found):
             found.setdefault(prediction.query_id, prediction)
     return Answers(found, len(aside))
+
+
+def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
+    """What rows of a run's folder must say that they answer: what is asked, and what `run.json` says was learnt.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run.
+    asked : mapping of str to str
+        By query id (`taskdir.read_asked`).
+
+    Raises
+    ------
+    StoreError
+        If `run.json` is damaged.
+
+    Examples
+    --------
+    >>> asked_in(Path("nowhere"), {"a": "ff"})
+    {'a': 'ff'}
+    """
+    key = read_key(folder)
+    return {name: asked_under(one, key) for name, one in asked.items()}
+
+
+def read_key(folder: Path) -> str | None:
+    """What `run.json` says was learnt, as rows are tied to it; None for nothing.
+
+    Raises
+    ------
+    StoreError
+        If `run.json` is damaged.
+    """
+    try:
+        said = LearnedSaid.of(read_run(folder) or {})
+    except MatchError as error:
+        message = f"{folder / RUN} is damaged ({error}): remove it and run again, the parts beside it are kept"
+        raise StoreError(message) from error
+    return None if said is None else said.key
 
 
 def read_predictions(path: Path) -> Iterator[Prediction]:
@@ -385,6 +428,8 @@ def tie_of(row: Mapping[str, Any]) -> Tie:
 
 def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = ()) -> set[str]:
     """Ids of those queries that a run has answered as they are now; rows with a status in `again` do not count.
+
+    What is asked is taken as it is given: whoever runs a matcher knows what it has learnt.
 
     Raises
     ------

@@ -13,10 +13,10 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
 from sasgeo_bench.region import ATTRIBUTION
-from sasgeo_bench.split import Block, Split
+from sasgeo_bench.split import HALVES, Block, Split
 
-# Blue, orange and green of Okabe and Ito, told apart by colour-blind readers; a cross-fit has one colour.
-COLOURS: Final = {"train": "#0072b2", "calibration": "#e69f00", "test": "#009e73", "crossfit": "#009e73"}
+# Blue, orange and green of Okabe and Ito, told apart by colour-blind readers.
+COLOURS: Final = {"train": "#0072b2", "calibration": "#e69f00", "test": "#009e73", "a": "#0072b2", "b": "#e69f00"}
 _COLUMNS: Final = 6
 _M_PER_DEG: Final = 111_320.0
 
@@ -41,7 +41,7 @@ def write_split_map(path: Path, split: Split) -> None:
         box = (col / _COLUMNS + 0.01, (height - 0.95 - 2.4 * (row + 1) + 0.25) / height, 0.88 / _COLUMNS, 2.0 / height)
         chart = figure.add_axes(box)
         blocks = split.blocks[place]
-        part = split.part_in_task(blocks[0])
+        part = colour_of(split, place)
         outlines = [_outline_m(block, blocks[0]) for block in blocks]
         for outline in outlines:
             chart.add_patch(Polygon(outline, closed=True, facecolor=COLOURS[part], edgecolor="white", lw=0.5))
@@ -62,12 +62,17 @@ def write_split_map(path: Path, split: Split) -> None:
     figure.text(0.01, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     note = "blocks of about 1 km; the bar is 1 km; panels are not to one scale"
     figure.text(0.01, 1 - 0.45 / height, note, va="top", fontsize=9, color="#444444")
-    parts = dict.fromkeys(split.part_in_task(blocks[0]) for blocks in split.blocks.values())
-    names = {"crossfit": "test in its own fold, else train or calibration"}
+    parts = sorted({colour_of(split, place) for place in split.blocks}, key=list(COLOURS).index)
+    names: dict[str, str] = {half: f"half {half}: test, calibration; train for the other" for half in HALVES}
     handles = [Patch(facecolor=COLOURS[part], label=names.get(part, part)) for part in parts]
     figure.legend(handles=handles, loc="upper right", frameon=False, fontsize=9, ncols=len(handles))
     figure.text(0.01, 0.06 / height, ATTRIBUTION, fontsize=8)
     figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+
+
+def colour_of(split: Split, place: str) -> str:
+    """What a place is coloured by: its part in a hold-out, its half in a cross-fit."""
+    return split.half_of.get(place) or split.part_of(place)
 
 
 def _outline_m(block: Block, origin: Block) -> NDArray[np.float64]:

@@ -4,8 +4,8 @@
 import datetime as dt
 import hashlib
 import json
-from collections.abc import Mapping
-from itertools import pairwise
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate, pairwise
 from typing import Any, Final
 
 import geopandas as gpd
@@ -238,6 +238,22 @@ def truth_of(row: dict[str, Any]) -> Truth:
     return Truth(**rest, pose=pose, measured=dict(row["measured"]))
 
 
+def truth_sha256(truth: Truth) -> str:
+    """Hash of all that a truth says."""
+    return hashlib.sha256(json.dumps(truth_row(truth), sort_keys=True).encode()).hexdigest()
+
+
+def asked_under(asked: str, key: str | None) -> str:
+    """What an answer says that it answers: the hash of what is asked, and of what the matcher had learnt, if anything.
+
+    Examples
+    --------
+    >>> asked_under("ab", None), len(asked_under("ab", "cd"))
+    ('ab', 64)
+    """
+    return asked if key is None else hashlib.sha256(f"{asked} {key}".encode()).hexdigest()
+
+
 def poses_of(lists: pa.ListArray) -> list[tuple[Pose, ...]]:
     """Poses of each row of a column of lists; without a dictionary for each, which takes longer than the pose."""
     columns = [lists.values.field(name).to_numpy(zero_copy_only=False).tolist() for name in POSE_FIELDS]
@@ -257,6 +273,22 @@ def query_from(data: bytes) -> Query:
     """Inverse of `query_bytes`."""
     with pa.ipc.open_stream(data) as stream:
         return query_of(stream.read_all().to_pylist()[0])
+
+
+def pairs_bytes(pairs: Iterable[tuple[bytes, Truth]]) -> tuple[list[int], bytes]:
+    """Queries, each as its bytes, with their truths, as they go to a process that learns; how long each query is."""
+    queries, truths = zip(*pairs, strict=True)
+    rows = pa.RecordBatch.from_pylist([truth_row(truth) for truth in truths], schema=TRUTH_SCHEMA)
+    return [len(query) for query in queries], b"".join((*queries, stream_of(rows)))
+
+
+def pairs_from(sizes: Sequence[int], data: bytes) -> Iterator[tuple[Query, Truth]]:
+    """Inverse of `pairs_bytes`."""
+    ends = list(accumulate(sizes, initial=0))
+    with pa.ipc.open_stream(data[ends[-1] :]) as stream:
+        truths = [truth_of(row) for row in stream.read_all().to_pylist()]
+    for (begin, end), truth in zip(pairwise(ends), truths, strict=True):
+        yield query_from(data[begin:end]), truth
 
 
 def stream_of(batch: pa.RecordBatch) -> bytes:

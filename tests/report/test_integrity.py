@@ -12,7 +12,7 @@ from sasgeo_bench.metrics.draws import ClusterDraws
 from sasgeo_bench.metrics.integrity import aurc
 from sasgeo_bench.metrics.intervals import statistic_interval, wilson
 from sasgeo_bench.report.integrity import integrity_rows
-from sasgeo_bench.report.rejection import OWN, answers_of, own_word
+from sasgeo_bench.report.rejection import OWN, answers_of, own_word, turns, why_not
 from sasgeo_bench.report.rows import to_frame
 from sasgeo_bench.split import SplitFile, make_split
 from tests.report.test_tables import scores
@@ -31,12 +31,16 @@ def pooled(table, split=None):
 
 
 def split_of(kind):
-    names = ("place0", "place1")
+    names = ("place0", "place1", "place2", "place3")[: 2 if kind == "holdout" else 4]
     grids = {
         name: Grid(epsg=32632, west_m=5e5 + 1e5 * at, north_m=5.2e6, cell_size_m=1.0, rows=1000, cols=1000)
         for at, name in enumerate(names)
     }
-    parts = [{"part": part} for part in ("calibration", "test")] if kind == "holdout" else [{}, {}]
+    parts = (
+        [{"part": part} for part in ("calibration", "test")]
+        if kind == "holdout"
+        else [{"half": half} for half in "aabb"]
+    )
     places = [{"name": name, "regions": [name]} | part for name, part in zip(names, parts, strict=True)]
     said = {"id": "two", "title": "Two", "kind": kind, "buffer_m": 0.0, "place": places}
     return make_split(SplitFile.model_validate(said), grids)
@@ -129,6 +133,23 @@ def test_thresholds_of_a_split_are_chosen_on_other_places():
     assert held["risk_reached_at_0.01"]["value"] == 1.0
     one_place = table.assign(place="place0")
     assert "coverage_at_risk_0.05" not in pooled(one_place, split_of("crossfit"))
+
+
+def test_what_the_test_place_taught_calibrates_nobody():
+    table = scores(ERRORS, confidence=0.5)  # place0 and place1, of one half
+    apart = table.assign(place=table["place"].replace("place1", "place2"))  # of two halves
+    split = split_of("crossfit")
+    for rows, is_taught, expected in (
+        (table, False, [True, True]),
+        (table, True, [True, True]),
+        (apart, False, [False, False]),
+        (apart, True, [True, True]),
+    ):
+        found = list(turns(rows, split, is_taught=is_taught))
+        assert [turn.is_own for turn in found] == expected
+        assert all(turn.calibration.any() for turn in found) == (rows is table or not is_taught)
+        assert not any((turn.test & turn.calibration).any() for turn in found)
+    assert "half" in why_not(apart, is_taught=True)
 
 
 def test_withholding_all_is_no_cost_by_right_fixes_and_the_whole_one_by_places():

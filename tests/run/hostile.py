@@ -20,7 +20,7 @@ class Plain:
 
     card = MatcherCard(name="plain", tracks=("localization", "retrieval"), **SAID)
 
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         self.region = region
 
     def match(self, query, *, top_k):
@@ -47,7 +47,7 @@ class TellsProcess(Plain):
     def __init__(self):
         self.token, self.maps = float(int.from_bytes(os.urandom(6), "big")), 0
 
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         self.maps += 1
         self.readable = 0
         for name in ("town-riverside", "town-copy"):
@@ -102,7 +102,7 @@ class Hangs(Plain):
 
 
 class HangsInPrepare(Plain):
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         time.sleep(1000)
 
 
@@ -134,7 +134,7 @@ class Raises(Plain):
 
 
 class RaisesInPrepare(Plain):
-    def prepare(self, region, training):
+    def prepare(self, region, learned):
         message = "no index today"
         raise ValueError(message)
 

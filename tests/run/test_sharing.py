@@ -167,7 +167,7 @@ def test_only_so_many_tasks_are_locked_at_once_and_those_of_a_map_together(monke
 def test_other_maps_are_hidden_and_all_of_them_where_only_the_card_is_read(pair, elsewhere, place, tmp_path):
     plan = plan_of((pair[0], elsewhere), tmp_path)
     regions = place / "out" / "regions"
-    reach = answers.reach_of(plan.request, plan.parts[0].region)
+    reach = answers.reach_of(plan.request, (plan.parts[0].region,))
     assert regions / COPY in reach.hidden
     assert regions / TOWN not in reach.hidden
-    assert {regions / COPY, regions / TOWN} <= set(answers.reach_of(plan.request, None).hidden)
+    assert {regions / COPY, regions / TOWN} <= set(answers.reach_of(plan.request, ()).hidden)

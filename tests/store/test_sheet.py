@@ -28,7 +28,7 @@ from sasgeo_bench.store.sheet import (
     paint_difference,
     write_sheet,
 )
-from sasgeo_bench.store.splitmap import COLOURS, write_split_map
+from sasgeo_bench.store.splitmap import COLOURS, colour_of, write_split_map
 from sasgeo_bench.suites.vectors import vector_table
 from sasgeo_bench.taxonomy import load_taxonomy
 
@@ -135,6 +135,6 @@ def test_the_map_of_a_split_has_a_panel_for_each_place_in_the_colours_of_the_par
     assert picture.shape[1] == pytest.approx(100 * 2.3 * 6, abs=1)
     assert picture.shape[0] == pytest.approx(100 * (2.4 * rows + 1.1), abs=1)
     found = {tuple(pixel) for pixel in picture.reshape(-1, 3)[::7].tolist()}
-    parts = {split.part_in_task(blocks[0]) for blocks in split.blocks.values()}
+    parts = {colour_of(split, place) for place in split.blocks}
     for part in parts:
         assert tuple(round(255 * value) for value in to_rgb(COLOURS[part])) in found

@@ -15,6 +15,7 @@ from sasgeo_bench.split import SplitFile, make_split
 from sasgeo_bench.suites.mining import STRIDE_M, least_apart_m
 
 SITES = 3
+PLACES = ("here", "there", "beyond", "away")
 GROUP = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
 
 
@@ -32,11 +33,16 @@ def drawn(carried):
                 "title": "Mine",
                 "kind": "crossfit",
                 "buffer_m": 0.0,
-                "place": [{"name": name, "regions": [name]} for name in ("here", "there")],
+                "place": [
+                    {"name": name, "regions": [name], "half": half} for name, half in zip(PLACES, "abab", strict=True)
+                ],
             }
         )
-        far = replace(grid, west_m=grid.west_m + 50_000)
-        split = make_split(spec, {"here": grid, "there": far})
+
+        def far(at):
+            return replace(grid, west_m=grid.west_m + 50_000 * at)
+
+        split = make_split(spec, {name: grid if name == "here" else far(at) for at, name in enumerate(PLACES)})
         drawer = Drawer(suite=made.suite, scene=made.scene, seeds=made.seeds, group=made.suite.card.group, split=split)
         jobs = [job for job in drawer.jobs(made.sites[:SITES]) if drawer.can_draw(job)]
         return made, drawer, [drawer.draw(job) for job in jobs]

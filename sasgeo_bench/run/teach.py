@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a matcher learns before it is asked: once for a lesson, in a process of its own, kept as a text."""
+
+from collections.abc import Callable
+
+from sasgeo_bench.results import one_line
+from sasgeo_bench.run.lesson import Lesson, read_pairs
+from sasgeo_bench.run.plan import Learned, RunPlan, reach_of, with_learned
+from sasgeo_bench.run.worker import Reply, Worker
+from sasgeo_bench.store.learnedfile import read_learned, write_learned
+from sasgeo_bench.store.regiondir import locked
+
+Tell = Callable[[str], None]
+
+
+def taught(plan: RunPlan, *, tell: Tell) -> RunPlan:
+    """Have a matcher learn, if there is anything to learn and to ask, and nothing was learnt from it before.
+
+    Parameters
+    ----------
+    plan : RunPlan
+        From `plan_run`.
+    tell : callable
+        Gets a line.
+
+    Returns
+    -------
+    RunPlan
+        With what was learnt, or why nothing was; then every query gets that for an answer.
+
+    Raises
+    ------
+    StoreError
+        If a task was made anew meanwhile, or what was learnt cannot be kept.
+    """
+    lesson, path = plan.lesson, plan.learned_file
+    if lesson is None or path is None or plan.learned is not None or not any(part.left for part in plan.parts):
+        return plan
+    with locked(path, tell=tell):
+        text = read_learned(path)
+        if text is None:
+            reply = _learn(plan, lesson)
+            if reply.status != "ok" or reply.learned is None:
+                failed = _failed(reply)
+                tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {lesson.to_text()}")
+                return with_learned(plan, failed)
+            write_learned(path, reply.learned)
+            text = reply.learned
+            tell(f"{plan.card.name}: learnt from {lesson.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
+    return with_learned(plan, Learned(text=text))
+
+
+def _learn(plan: RunPlan, lesson: Lesson) -> Reply:
+    """Ask a process of its own, which may read the maps and is sent the truths."""
+    request, regions = plan.request, lesson.regions
+    pairs = read_pairs(lesson)
+    reach = reach_of(request, tuple(regions.values()))
+    with Worker(spec=request.spec, reach=reach, limits=request.limits) as worker:
+        return worker.learn(regions, pairs)
+
+
+def _failed(reply: Reply) -> Learned:
+    """What all rows say of a lesson from which nothing was learnt."""
+    if reply.status == "ok":
+        return Learned(status="invalid", message="while learning: no text in an answer")
+    return Learned(status=reply.status, message=one_line(f"while learning: {reply.message}"))

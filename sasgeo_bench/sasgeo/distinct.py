@@ -160,4 +160,4 @@ def _sectors(cell_m: float) -> list[list[NDArray[np.float32]]]:
 
 
 def _mean_of(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return (mask / max(mask.sum(), 1)).astype(np.float32)
+    return np.asarray(mask / max(mask.sum(), 1), dtype=np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joint score, Eq. 11 of the SASGeo paper: what raster and graph say of one list of modes, and what speaks against."""
+"""The joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph, and what speaks against."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.matcher import Training
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
-from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.joint import Blend, columns
+from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.rates import NOWHERE, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
 from sasgeo_bench.sasgeo.temper import fit_temper
@@ -28,24 +29,25 @@ MODES: Final = 16  # of a search to learn from
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lesson:
-    """One view whose place on a map is known."""
-
-    query: Query
-    truth: Truth
-    pose: Pose
-    region: Region
+Lessons = Mapping[str, Sequence[tuple[Query, Truth]]]  # by the map they lie on
 
 
-def lessons_of(training: Training) -> list[Lesson]:
-    """Views that lie on their maps, map by map; those of a list of candidates are the same views once more."""
-    found = [
-        Lesson(query=query, truth=truth, pose=truth.pose, region=training.regions[query.region])
-        for query, truth in training.pairs
-        if truth.is_present and truth.pose is not None and query.track == "localization"
-    ]
-    return sorted(found, key=lambda lesson: lesson.query.region)
+def lessons_of(training: Training) -> Lessons:
+    """Views that lie on their maps, map by map, since maps are large; those of a list of candidates are the same again.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    found: dict[str, list[tuple[Query, Truth]]] = {}
+    for query, truth in training.pairs:
+        if truth.is_present and truth.pose is not None and query.track == "localization":
+            found.setdefault(query.region, []).append((query, truth))
+    if not found:
+        message = "no view of the train part lies on its map: name suites whose places are there, such as clean"
+        raise ConfigError(message)
+    return found
 
 
 def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -> Learnt:
@@ -71,12 +73,11 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         If no view lies on its map, or maps have different classes.
     """
     lessons = lessons_of(training)
-    if not lessons:
-        message = "no view of the train part lies on its map: name suites whose places are there, such as clean"
-        raise ConfigError(message)
-    by_map = _by_map(lessons)
-    learnt = Learnt.of([one for some in by_map.values() for one in _tallies(some, switches)])
-    lists = [one for some in by_map.values() for one in _lists(some, learnt, switches, plan or Plan())]
+    learnt = Learnt.of([one for name in lessons for one in _tallies(training.regions[name], lessons[name], switches)])
+    lists = []
+    for name, some in lessons.items():
+        reader = Reader.of(training.regions[name], learnt, switches)
+        lists += [_list(query, _pose(truth), reader, plan or Plan()) for query, truth in some]
     lists = [one for one in lists if len(one.by_class) > 1]
     if not lists:
         return learnt
@@ -98,41 +99,36 @@ class _List:
 def _fit_blend(lists: Sequence[_List], temper: NDArray[np.float64]) -> Blend:
     """Weights of the joint score by the same logit, exponents held."""
     terms = [
-        columns(one.by_class * temper, one.graph, Blend(alpha=1.0, beta=1.0, eta=1.0), nodes=one.nodes)
-        for one in lists
+        columns(one.by_class * temper, one.graph, Blend(alpha=1.0, beta=1.0, eta=1.0), nodes=one.nodes) for one in lists
     ]
     sums = [np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:])) for rows in terms]
     alpha, beta, eta = fit_temper(sums, start=(1.0, Blend().beta, Blend().eta)).tolist()
     return Blend(alpha=alpha, beta=beta, eta=eta)
 
 
-def _by_map(lessons: Sequence[Lesson]) -> Mapping[str, list[Lesson]]:
-    """Lessons by the map they lie on: one map is made ready at a time."""
-    names = dict.fromkeys(lesson.query.region for lesson in lessons)
-    return {name: [lesson for lesson in lessons if lesson.query.region == name] for name in names}
+def _pose(truth: Truth) -> Pose:
+    if truth.pose is None:
+        message = "a lesson has a place"
+        raise AssertionError(message)
+    return truth.pose
 
 
-def _tallies(lessons: Sequence[Lesson], switches: Switches) -> list[Tally]:
+def _tallies(region: Region, lessons: Sequence[tuple[Query, Truth]], switches: Switches) -> list[Tally]:
     """What was seen on one map, at the true places."""
-    region = lessons[0].region
     near = rings(region.layers, cell_size_m=region.grid.cell_size_m)
-    return [_tally(lesson, near, switches) for lesson in lessons]
+    return [_tally(query, truth, region, near, switches.seen(query.evidence)) for query, truth in lessons]
 
 
-def _tally(lesson: Lesson, near: NDArray[np.uint8], switches: Switches) -> Tally:
-    region, seen = lesson.region, switches.seen(lesson.query.evidence)
-    under = _under(near, region.grid, lesson.pose, seen.shape, seen.cell_size_m)
+def _tally(query: Query, truth: Truth, region: Region, near: NDArray[np.uint8], seen: Evidence) -> Tally:
+    under = _under(near, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
     cells = np.full(under.shape, NOWHERE, dtype=np.uint8)  # neither present nor absent: a class the view does not know
     for at, name in enumerate(region.classes):
         if name in seen.classes:
             cells[at] = seen.layer(name)
-    age = age_years(lesson.query, region)
-    return tally(region.classes, cells, under, age_years=age, block=lesson.truth.block)
+    return tally(region.classes, cells, under, age_years=age_years(query, region), block=truth.block)
 
 
-def _under(
-    near: NDArray[np.uint8], grid: Grid, pose: Pose, shape: tuple[int, int], cell_m: float
-) -> NDArray[np.uint8]:
+def _under(near: NDArray[np.uint8], grid: Grid, pose: Pose, shape: tuple[int, int], cell_m: float) -> NDArray[np.uint8]:
     """What of a map lies in the middle of each cell of a view."""
     rows, cols = np.indices(shape)
     right_m, up_m = (cols - (shape[1] - 1) / 2) * cell_m, ((shape[0] - 1) / 2 - rows) * cell_m
@@ -142,15 +138,10 @@ def _under(
     return np.asarray(np.where(inside, found, NOWHERE), dtype=np.uint8).reshape(len(near), *shape)
 
 
-def _lists(lessons: Sequence[Lesson], learnt: Learnt, switches: Switches, plan: Plan) -> list[_List]:
-    """Right and wrong places of each view of one map."""
-    reader = Reader.of(lessons[0].region, learnt, switches)
-    return [_list(lesson, reader, plan) for lesson in lessons]
-
-
-def _list(lesson: Lesson, reader: Reader, plan: Plan) -> _List:
-    glance, pose = reader.glance(lesson.query), lesson.pose
-    modes = search(reader.field, glance.template, lesson.query.prior, plan, count=MODES).modes
+def _list(query: Query, pose: Pose, reader: Reader, plan: Plan) -> _List:
+    """The right place of a view and the wrong ones that a search finds."""
+    glance = reader.glance(query)
+    modes = search(reader.field, glance.template, query.prior, plan, count=MODES).modes
     here = (pose.easting_m, pose.northing_m)
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.sasgeo.joint import Blend
-from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
+from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
 from sasgeo_bench.sasgeo.temper import START
 
 VERSION: Final = 1  # of the text
+DEFAULT_BLEND: Final = Blend()
 _DIGITS: Final = 6
 
 
@@ -52,7 +53,7 @@ class Learnt:
     likeness: NDArray[np.float64]
     missed_share: NDArray[np.float64]
     temper: NDArray[np.float64]
-    blend: Blend = Blend()
+    blend: Blend = DEFAULT_BLEND
     views: int = 0
     blocks: int = 0
 
@@ -124,7 +125,8 @@ class Learnt:
             for at, name in enumerate(self.classes)
         ]
         blend = json.dumps(_rounded(asdict(self.blend)))
-        head = f'{{"version": {VERSION}, "views": {self.views}, "blocks": {self.blocks}, "blend": {blend}, "classes": {{'
+        counts = f'"views": {self.views}, "blocks": {self.blocks}'
+        head = f'{{"version": {VERSION}, {counts}, "blend": {blend}, "classes": {{'
         return "\n".join((head, ",\n".join(rows), "}}"))
 
     def _shape(self, at: int) -> dict[str, Any]:
@@ -185,4 +187,4 @@ def _rounded(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _short(value: float | Iterable[float]) -> Any:  # noqa: ANN401 - whatever JSON holds
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else [_short(one) for one in value]  # type: ignore[union-attr]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else [_short(one) for one in value]

@@ -124,9 +124,7 @@ def _of_candidates(glance: Glance, plan: Plan, *, top_k: int) -> Match:
     """Rank the candidates of a query; those whose neighbourhood is off the map come last."""
     query = glance.query
     found, null = rank(glance.reader.field, glance.template, query.prior, query.candidates, plan)
-    scored = sorted(
-        ((at, mode) for at, mode in enumerate(found) if mode is not None), key=lambda item: -item[1].score
-    )
+    scored = sorted(((at, mode) for at, mode in enumerate(found) if mode is not None), key=lambda item: -item[1].score)
     if not scored:
         return WITHHELD
     looked, rest = scored[:LISTED], scored[LISTED:]

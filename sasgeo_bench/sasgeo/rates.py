@@ -130,9 +130,8 @@ def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]
     for layer, into in zip(layers, made, strict=True):
         if (layer == PRESENT).any():
             distance = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            into[:] = 0
-            for edge_m in (0.0, *RINGS_M):  # a sorted search through millions of cells takes several times as long
-                into += distance > (edge_m + _SLACK_M) / cell_size_m
+            edges = [(edge_m + _SLACK_M) / cell_size_m for edge_m in (0.0, *RINGS_M)]
+            into[:] = sum(distance > edge for edge in edges)  # a sorted search takes several times as long
         else:
             into[:] = FAR
     made[:, (layers > PRESENT).any(axis=0)] = NOWHERE
@@ -222,7 +221,7 @@ def _seen_share(tallies: Sequence[Tally]) -> NDArray[np.float64]:
     seen = np.sum([one.seen for one in tallies], axis=0) / _CELLS_PER_WITNESS
     known = seen + np.sum([one.missed for one in tallies], axis=0) / _CELLS_PER_WITNESS
     far = (seen[:, FAR:] + _EDGE) / (known[:, FAR:] + 2 * _EDGE)
-    return np.clip((seen + far) / (known + 1), _EDGE, 1 - _EDGE)
+    return np.asarray(np.clip((seen + far) / (known + 1), _EDGE, 1 - _EDGE))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -48,7 +48,6 @@ class Gains:
         agree, extra, missed, quiet = (part * weights for part in parts)
         return type(self)(agree=agree, extra=extra, missed=missed, quiet=quiet)
 
-
     def softened(self, shares: NDArray[np.float64]) -> Self:
         """The same, a miss worth a share of each class, shape (C,): see `rates.missed_share`."""
         missed = self.quiet + shares * (self.missed - self.quiet)

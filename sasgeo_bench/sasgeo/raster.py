@@ -15,7 +15,7 @@ from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, rings
 from sasgeo_bench.sasgeo.weights import Gains, weigh
-from sasgeo_bench.search.field import FULL, Field, Template, between, warped
+from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 
 THIN: Final = frozenset(
     {"road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"}
@@ -136,21 +136,17 @@ class RasterView:
     def by_class(self, field: Field, pose: Pose) -> NDArray[np.float64]:
         """Score of each class at a pose, shape (C,); their sum is `search.find.score_at` of the template.
 
-        The map is read in the middle of each cell of the view, as the search does.
+        The map is read in the middle of each square of cells of the view that is as large as its own, as the search
+        does.
         """
-        rows, cols = self.known.shape[1:]
-        frame = Grid(
-            epsg=0,
-            west_m=-cols * self.cell_size_m / 2,
-            north_m=rows * self.cell_size_m / 2,
-            cell_size_m=self.cell_size_m,
-            rows=rows,
-            cols=cols,
-        )
+        pool = max(1, round(field.grid.cell_size_m / self.cell_size_m))
+        bands, frame = squares(np.concatenate((self.weights, self.known)), pool, cell_size_m=self.cell_size_m)
+        weights, known = bands[: len(self.weights)], bands[len(self.weights) :]
         to_map = between(frame, pose, field.grid)
         knows = warped(field.known, to_map, frame.shape).astype(np.float32)
-        under = np.stack([warped(layer, to_map, frame.shape) for layer in field.layers]).astype(np.float32)
-        total = (self.weights * under).sum(axis=(1, 2)) + (self.known * knows).sum(axis=(1, 2))
+        total = np.einsum("cij,ij->c", known, knows)
+        for at in np.flatnonzero(weights.any(axis=(1, 2))).tolist():
+            total[at] += np.einsum("ij,ij", weights[at], warped(field.layers[at], to_map, frame.shape))
         return np.asarray(total, dtype=np.float64) / FULL
 
     def tempered(self, temper: NDArray[np.float64]) -> Self:

@@ -197,21 +197,32 @@ def _softened(template: Template, level: Level) -> NDArray[np.float32]:
 
 
 def pooled(template: Template, level: Level, pool: int) -> tuple[NDArray[np.float32], Grid]:
-    """Sum the bands for a level over squares of cells of the view, with the lattice of these squares.
+    """Sum the bands for a level over squares of cells of the view, with the lattice of these squares."""
+    return squares(_softened(template, level), pool, cell_size_m=template.cell_size_m)
+
+
+def squares(bands: NDArray[np.float32], pool: int, *, cell_size_m: float) -> tuple[NDArray[np.float32], Grid]:
+    """Sum bands of a view, shape (B, rows, cols), over squares of `pool` cells a side, with the lattice of the squares.
 
     The origin of the lattice is the middle of the view, right and up are its east and north.
+
+    Examples
+    --------
+    >>> summed, frame = squares(np.ones((1, 4, 4), np.float32), 2, cell_size_m=1.0)
+    >>> summed[0].tolist(), frame.bounds_m
+    ([[4.0, 4.0], [4.0, 4.0]], (-2.0, -2.0, 2.0, 2.0))
     """
-    (rows, cols), cell_m = template.known.shape, template.cell_size_m
+    rows, cols = bands.shape[1:]
     down, across = -rows % pool, -cols % pool
     around = ((0, 0), (down // 2, down - down // 2), (across // 2, across - across // 2))
-    bands = np.pad(_softened(template, level), around)
-    high, wide = bands.shape[1] // pool, bands.shape[2] // pool
-    summed = bands.reshape(len(bands), high, pool, wide, pool).sum(axis=(2, 4))
+    padded = np.pad(bands, around) if down or across else bands
+    high, wide = padded.shape[1] // pool, padded.shape[2] // pool
+    summed = padded.reshape(len(bands), high, pool, wide, pool).sum(axis=(2, 4))
     frame = Grid(
         epsg=0,
-        west_m=-(cols / 2 + across // 2) * cell_m,
-        north_m=(rows / 2 + down // 2) * cell_m,
-        cell_size_m=cell_m * pool,
+        west_m=-(cols / 2 + across // 2) * cell_size_m,
+        north_m=(rows / 2 + down // 2) * cell_size_m,
+        cell_size_m=cell_size_m * pool,
         rows=summed.shape[1],
         cols=summed.shape[2],
     )

@@ -133,21 +133,23 @@ class RasterView:
         """All classes in one, for the search."""
         return Template(weights=self.weights, known=self.known.sum(axis=0), cell_size_m=self.cell_size_m)
 
-    def by_class(self, field: Field, pose: Pose) -> NDArray[np.float64]:
-        """Score of each class at a pose, shape (C,); their sum is `search.find.score_at` of the template.
+    def by_class(self, field: Field, poses: Sequence[Pose]) -> NDArray[np.float64]:
+        """Score of each class at each pose, shape (M, C); the sum of a row is `search.find.score_at` of the template.
 
         The map is read in the middle of each square of cells of the view that is as large as its own, as the search
         does.
         """
-        pool = max(1, round(field.grid.cell_size_m / self.cell_size_m))
+        pool, count = max(1, round(field.grid.cell_size_m / self.cell_size_m)), len(self.weights)
         bands, frame = squares(np.concatenate((self.weights, self.known)), pool, cell_size_m=self.cell_size_m)
-        weights, known = bands[: len(self.weights)], bands[len(self.weights) :]
-        to_map = between(frame, pose, field.grid)
-        knows = warped(field.known, to_map, frame.shape).astype(np.float32)
-        total = np.einsum("cij,ij->c", known, knows)
-        for at in np.flatnonzero(weights.any(axis=(1, 2))).tolist():
-            total[at] += np.einsum("ij,ij", weights[at], warped(field.layers[at], to_map, frame.shape))
-        return np.asarray(total, dtype=np.float64) / FULL
+        weights, known = bands[:count], bands[count:]
+        speaking = np.flatnonzero(weights.any(axis=(1, 2))).tolist()
+        total = np.zeros((len(poses), count))
+        for row, pose in zip(total, poses, strict=True):
+            to_map = between(frame, pose, field.grid)
+            row[:] = np.einsum("cij,ij->c", known, warped(field.known, to_map, frame.shape).astype(np.float32))
+            for at in speaking:
+                row[at] += np.vdot(weights[at], warped(field.layers[at], to_map, frame.shape).astype(np.float32))
+        return total / FULL
 
     def tempered(self, temper: NDArray[np.float64]) -> Self:
         """The same, the score of each class times its exponent."""

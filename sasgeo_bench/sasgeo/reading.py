@@ -106,7 +106,7 @@ class Glance:
 
     def by_class(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
         """Scores of Eq. 8 by class, not tempered, shape (M, C)."""
-        return np.stack([self.view.by_class(self.reader.field, pose) for pose in poses])
+        return self.view.by_class(self.reader.field, poses)
 
     def verified(self, poses: Sequence[Pose]) -> list[GraphScore] | None:
         """Scores of Eq. 9, where the arm looks at graphs."""

@@ -34,6 +34,11 @@ class Level:
     layers: NDArray[np.uint8]
     thinner: NDArray[np.float64]
 
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """Bands that hold anything, shape (K + 1,)."""
+        return np.array([bool(layer.any()) for layer in self.layers])
+
     def window(self, row: int, col: int, shape: tuple[int, int], bands: NDArray[np.int64]) -> NDArray[np.float32]:
         """Cut some bands, 0..1, zeros beyond the map; shape (len(bands), *shape)."""
         cut = np.zeros((len(bands), *shape), dtype=np.float32)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Final
 
+import numpy as np
+
 from sasgeo_bench.angles import wrap_deg
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose, Prior
@@ -123,12 +125,13 @@ class _Search:
         tiles = tiles_of(self._coarse_grid, self.field.grid, disc.wider(_CORNER * self._coarse_m))
         guesses, null = self._begun(tiles, most=self.plan.width(0))
         followed = self._followed([replace(guess, owner=0) for guess in guesses], [disc])
-        return Found(modes=tuple(_thinned((guess.mode for guess in followed), self.plan.apart_m)[:count]), null=null)
+        near = disc.wider(_CORNER * self.field.grid.cell_size_m)  # those left behind had the leeway of larger cells
+        inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
+        return Found(modes=tuple(_thinned(inside, self.plan.apart_m)[:count]), null=null)
 
     def candidates(self, poses: Sequence[Pose]) -> tuple[list[Mode | None], Null]:
         """Best mode near each of some poses."""
-        places_m = [(pose.easting_m, pose.northing_m) for pose in poses]
-        discs = [Disc(center_m=place_m, radius_m=self.plan.around_m) for place_m in places_m]
+        discs = [Disc(center_m=place_m(pose), radius_m=self.plan.around_m) for pose in poses]
         wide = [disc.wider(_CORNER * self._coarse_m) for disc in discs]
         tiles = [(tiles_of(self._coarse_grid, self.field.grid, disc) or [NO_PLACE])[0] for disc in wide]
         guesses, null = self._begun(tiles, most=self.plan.each)
@@ -176,10 +179,17 @@ class _Search:
                 merged = _merged(moved, factor * self.field.grid.cell_size_m, stride.yaw_deg)
                 width = self.plan.width(len(behind))
                 kept, behind = merged[:width], [*behind, merged[width - 1 :]]
-            kept = _ranked(pool.map(partial(polished, Sight.of(self.field, self.template, 1), stride), kept))
+            near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
+            step = partial(polished, Sight.of(self.field, self.template, 1), stride)
+            kept = _ranked(pool.map(step, kept, [near[guess.owner] for guess in kept]))
         for rest in reversed(behind):
             kept = [*kept, *_below(kept, rest)]
         return kept
+
+
+def place_m(pose: Pose) -> tuple[float, float]:
+    """Easting and northing of a pose."""
+    return (pose.easting_m, pose.northing_m)
 
 
 def _ranked(guesses: Iterable[Guess]) -> list[Guess]:
@@ -219,4 +229,4 @@ def _thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
 
 
 def _distance_m(one: Pose, other: Pose) -> float:
-    return math.dist((one.easting_m, one.northing_m), (other.easting_m, other.northing_m))
+    return math.dist(place_m(one), place_m(other))

@@ -37,7 +37,8 @@ class Sight:
         level = field.level(factor)
         pool = max(1, round(level.grid.cell_size_m / template.cell_size_m))
         bands, frame = pooled(template, level, pool)
-        return cls(level=level, speaking=template.speaking, bands=bands, frame=frame)
+        heard = level.used[template.speaking]
+        return cls(level=level, speaking=template.speaking[heard], bands=bands[heard], frame=frame)
 
     def scores(self, pose: Pose, *, reach: int = 1) -> NDArray[np.float64]:
         """Score a pose and those some cells of the frame away; [i, j] is `shifted(pose, i - reach, j - reach)`."""
@@ -113,8 +114,8 @@ def climbed(sight: Sight, stride: Stride, guess: Guess, disc: Disc) -> Guess:
     return best
 
 
-def polished(sight: Sight, stride: Stride, guess: Guess) -> Guess:
-    """Go to the top of parabolas through the neighbours in place, heading and scale, if that is better."""
+def polished(sight: Sight, stride: Stride, guess: Guess, disc: Disc) -> Guess:
+    """Go to the top of parabolas through neighbours in place, heading and scale, if it is better and within a disc."""
     pose = guess.mode.pose
     table = sight.scores(pose)
     here = float(table[1, 1])
@@ -124,7 +125,8 @@ def polished(sight: Sight, stride: Stride, guess: Guess) -> Guess:
     yaw, scale = (_vertex(sight.score(less), here, sight.score(more)) for less, more in (turned, scaled))
     top = stride.moved(sight.shifted(pose, down, right), yaw=yaw, scale=scale)
     score = sight.score(top)
-    return replace(guess, mode=Mode(pose=top, score=score) if score > here else Mode(pose=pose, score=here))
+    is_better = score > here and disc.holds(np.array([(top.easting_m, top.northing_m)]))[0]
+    return replace(guess, mode=Mode(pose=top, score=score) if is_better else Mode(pose=pose, score=here))
 
 
 def _vertex(less: float, here: float, more: float) -> float:

@@ -50,9 +50,9 @@ def _turn(yaw_deg: float, scale: float) -> Pose:
 
 
 def _steps(reach: float, step: float) -> tuple[list[float], float]:
-    """From -reach to reach through 0 in equal steps no larger than `step`, and their size."""
-    count = math.ceil(reach / step - _NOTHING)
-    return ([reach * at / count for at in range(-count, count + 1)], reach / count) if count else ([0.0], 0.0)
+    """Cut -reach to reach into equal parts no larger than `step`: their middles, and their size."""
+    count = math.ceil(2 * reach / step - _NOTHING)
+    return ([reach * (2 * at + 1 - count) / count for at in range(count)], 2 * reach / count) if count else ([0.0], 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -45,14 +45,14 @@ def test_the_parts_by_class_make_up_the_score(tiny, field, asked):
     for query, pose in asked[:4]:
         view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
         whole = score_at(field, view.template(), pose)
-        assert view.by_class(field, pose).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
+        assert view.by_class(field, [pose]).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
 
 
 def test_the_true_place_scores_high_in_every_class_it_shows(tiny, field, asked):
     for query, pose in asked[:4]:
         view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
         away = replace(pose, easting_m=pose.easting_m + 60.0, northing_m=pose.northing_m - 45.0)
-        here, there = view.by_class(field, pose), view.by_class(field, away)
+        here, there = view.by_class(field, [pose, away])
         assert here.sum() > there.sum()
 
 
@@ -98,5 +98,5 @@ def test_exponents_scale_each_class(tiny, field, asked):
     query, pose = asked[0]
     view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
     temper = np.linspace(0.1, 1.0, len(tiny.region.classes))
-    parts = view.tempered(temper).by_class(field, pose)
-    assert parts == pytest.approx(view.by_class(field, pose) * temper, rel=1e-4, abs=1e-3)
+    parts = view.tempered(temper).by_class(field, [pose])
+    assert parts == pytest.approx(view.by_class(field, [pose]) * temper, rel=1e-4, abs=1e-3)

@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.search.plan import Null, posterior
@@ -172,6 +173,11 @@ class Modes:
         return posterior(self.scores.tolist(), temper=1.0, null_score=self.none_nats)
 
     @cached_property
+    def shares(self) -> NDArray[np.float64]:
+        """Posterior probability of each mode if one of them is right, shape (M,)."""
+        return np.asarray(special.softmax(self.scores))
+
+    @cached_property
     def away_m(self) -> NDArray[np.float64]:
         """Distance of each mode from the chosen one, metres, shape (M,)."""
         return np.asarray(np.hypot(*(self.positions_m - self.positions_m[0]).T))
@@ -220,13 +226,12 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None)
     rivals = np.flatnonzero(modes.away_m >= APART_M)
     rival = rivals[np.argmax(modes.scores[rivals])] if len(rivals) else None
     against = modes.none_nats if rival is None else modes.scores[rival]
-    shares = modes.masses[:-1] / modes.masses[:-1].sum()
-    middle_m = shares @ modes.positions_m
+    middle_m = modes.shares @ modes.positions_m
     found: dict[str, float | None] = {
         "margin_nats": modes.scores[0] - against,
         "posterior_entropy_nats": -(modes.masses * np.log(np.maximum(modes.masses, np.finfo(float).tiny))).sum(),
         "modes_above": 1 + (modes.masses[rivals] >= RIVAL_SHARE * modes.masses[0]).sum(),
-        "spread_m": np.sqrt(shares @ ((modes.positions_m - middle_m) ** 2).sum(axis=1)),
+        "spread_m": np.sqrt(modes.shares @ ((modes.positions_m - middle_m) ** 2).sum(axis=1)),
         "null_z": None if null is None or not null.deviation > 0 else (null.best - null.mean) / null.deviation,
         "class_agreement": _agreement(modes.by_class[0] - (0.0 if rival is None else modes.by_class[rival])),
         **told,

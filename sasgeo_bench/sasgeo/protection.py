@@ -78,9 +78,8 @@ def posterior_sigma_m(modes: Modes) -> float:
     >>> posterior_sigma_m(Modes(positions_m=np.zeros((1, 2)), by_class=np.array([[9.0]]), sigma_m=2.0))
     2.0
     """
-    shares = modes.masses[:-1] / modes.masses[:-1].sum()
     apart_m = modes.positions_m - modes.positions_m[0]
-    spread = (shares[:, None] * apart_m).T @ apart_m
+    spread = (modes.shares[:, None] * apart_m).T @ apart_m
     return float(np.sqrt(np.linalg.eigvalsh(spread)[-1].clip(0.0) + modes.sigma_m**2))
 
 

@@ -139,16 +139,17 @@ class RasterView:
         The map is read in the middle of each square of cells of the view that is as large as its own, as the search
         does.
         """
-        pool, count = max(1, round(field.grid.cell_size_m / self.cell_size_m)), len(self.weights)
-        bands, frame = squares(np.concatenate((self.weights, self.known)), pool, cell_size_m=self.cell_size_m)
-        weights, known = bands[:count], bands[count:]
-        speaking = np.flatnonzero(weights.any(axis=(1, 2))).tolist()
-        total = np.zeros((len(poses), count))
+        pool = max(1, round(field.grid.cell_size_m / self.cell_size_m))
+        speaking = np.flatnonzero(self.weights.any(axis=(1, 2)) | self.known.any(axis=(1, 2)))
+        bands = np.concatenate((self.weights[speaking], self.known[speaking]))
+        summed, frame = squares(bands, pool, cell_size_m=self.cell_size_m)
+        weights, known = summed[: len(speaking)], summed[len(speaking) :]
+        total = np.zeros((len(poses), len(self.weights)))
         for row, pose in zip(total, poses, strict=True):
             to_map = between(frame, pose, field.grid)
-            row[:] = np.einsum("cij,ij->c", known, warped(field.known, to_map, frame.shape).astype(np.float32))
-            for at in speaking:
-                row[at] += np.vdot(weights[at], warped(field.layers[at], to_map, frame.shape).astype(np.float32))
+            row[speaking] = np.einsum("cij,ij->c", known, warped(field.known, to_map, frame.shape).astype(np.float32))
+            for at, mine in zip(speaking.tolist(), weights, strict=True):
+                row[at] += np.vdot(mine, warped(field.layers[at], to_map, frame.shape).astype(np.float32))
         return total / FULL
 
     def tempered(self, temper: NDArray[np.float64]) -> Self:

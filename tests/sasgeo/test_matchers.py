@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arms of the scorer on a made-up place: they answer, learn, withhold, and take whatever a view or a map lacks."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.matcher import Learner, Matcher, Training, check_match
+from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
+from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.protection import PROTECTION
+from sasgeo_bench.sasgeo.variants import (
+    Sasgeo,
+    SasgeoDistinct,
+    SasgeoGraph,
+    SasgeoHand,
+    SasgeoNoGraph,
+    SasgeoRaster,
+    SasgeoStability,
+)
+
+ALL = (SasgeoRaster, SasgeoGraph, SasgeoStability, Sasgeo, SasgeoHand, SasgeoDistinct, SasgeoNoGraph)
+LEARNERS = {SasgeoStability, Sasgeo, SasgeoDistinct, SasgeoNoGraph}
+
+
+def first(tiny, track, **wanted):
+    """The first query of a track whose place is there, and where it is."""
+    return next(
+        (query, truth)
+        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
+        if query.track == track
+        and query.suite == "clean"
+        and truth.pose is not None
+        and all(getattr(truth, name) == value for name, value in wanted.items())
+        and query.evidence.shape[0] >= 192
+    )
+
+
+def prepared(arm, region):
+    matcher = arm()
+    matcher.prepare(region, None)
+    return matcher
+
+
+@pytest.fixture(scope="module")
+def whole(tiny):
+    return prepared(Sasgeo, tiny.region)
+
+
+@pytest.mark.parametrize("arm", ALL)
+def test_cards_are_full_and_say_who_learns(arm):
+    assert isinstance(arm(), Matcher)
+    assert isinstance(arm(), Learner) == (arm in LEARNERS)
+    assert arm.card.limits
+
+
+def test_switches_tell_the_arms_apart():
+    assert len({arm.switches for arm in ALL}) == len(ALL)
+    assert len({arm.card.name for arm in ALL}) == len(ALL)
+
+
+@pytest.mark.parametrize("arm", ALL)
+def test_every_arm_finds_a_noise_free_view(tiny, arm):
+    query, truth = first(tiny, "localization", kind="no error")
+    match = check_match(prepared(arm, tiny.region).match(query, top_k=5), query, top_k=5)
+    best = match.poses[0]
+    assert math.dist((best.easting_m, best.northing_m), (truth.pose.easting_m, truth.pose.northing_m)) < 5.0
+
+
+def test_an_answer_tells_its_evidence_and_protection_levels(tiny, whole):
+    query, _ = first(tiny, "localization", kind="no error")
+    match = whole.match(query, top_k=5)
+    told = set(match.diagnostics)
+    assert {"margin_nats", "null_z", "graph_consistency", "unknown_share", "map_age_years", "sigma_m"} <= told
+    assert told <= {*EVIDENCE_NAMES, *(item.name for item in PROTECTION)}
+    assert 0 <= match.confidence <= 1
+
+
+def test_candidates_are_ranked_and_keep_their_places(tiny, whole):
+    query, truth = first(tiny, "localization", kind="no error")
+    here = truth.pose
+    places = [replace(here, easting_m=here.easting_m + 80.0 * at, yaw_deg=0.0, scale=1.0) for at in (2, 1, 0, -1)]
+    asked = replace(
+        query, track="retrieval", candidates=tuple(places), prior=replace(query.prior, center_m=None, radius_m=None)
+    )
+    match = check_match(whole.match(asked, top_k=50), asked, top_k=50)
+    assert len(match.poses) == len(places)
+    assert match.poses[0].easting_m == here.easting_m
+    assert abs(match.poses[0].yaw_deg - here.yaw_deg) % 360 < 3.0
+
+
+def test_a_blind_view_is_withheld(tiny, whole):
+    query, _ = first(tiny, "localization")
+    blind = query.evidence.replace(np.full_like(query.evidence.cells, UNKNOWN))
+    assert not whole.match(replace(query, evidence=blind), top_k=5).poses
+
+
+@pytest.mark.parametrize("state", [ABSENT, PRESENT])
+@pytest.mark.parametrize("arm", [SasgeoGraph, Sasgeo])
+def test_a_view_that_says_the_same_everywhere_breaks_nothing(tiny, arm, state):
+    query, _ = first(tiny, "localization")
+    plain = query.evidence.replace(np.full_like(query.evidence.cells, state))
+    asked = replace(query, evidence=plain, vectors=None)
+    check_match(prepared(arm, tiny.region).match(asked, top_k=5), asked, top_k=5)
+
+
+def test_one_class_alone_and_classes_that_one_side_lacks(tiny, whole):
+    query, _ = first(tiny, "localization")
+    seen, at = query.evidence, query.evidence.classes.index("road_major")
+    for classes in (("road_major",), ("lava",)):
+        one = Evidence(classes=classes, cells=seen.cells[at : at + 1].copy(), cell_size_m=seen.cell_size_m)
+        asked = replace(query, evidence=one, vectors=None)
+        match = check_match(whole.match(asked, top_k=5), asked, top_k=5)
+        assert bool(match.poses) or classes == ("lava",)
+
+
+def test_a_prior_off_the_map_and_a_view_larger_than_it(tiny, whole):
+    query, _ = first(tiny, "localization")
+    west_m, south_m, _, _ = tiny.region.grid.bounds_m
+    away = replace(query, prior=replace(query.prior, center_m=(west_m - 9000.0, south_m), radius_m=100.0))
+    assert not whole.match(away, top_k=5).poses
+    cells = np.pad(query.evidence.cells, ((0, 0), (420, 420), (420, 420)), constant_values=UNKNOWN)
+    large = Evidence(classes=query.evidence.classes, cells=cells, cell_size_m=query.evidence.cell_size_m)
+    asked = replace(query, evidence=large, vectors=None)
+    check_match(whole.match(asked, top_k=5), asked, top_k=5)
+
+
+def test_unknown_cells_change_nothing_where_they_are_silent_and_something_where_not(tiny):
+    query, _ = first(tiny, "localization", kind="no error")
+    cells = query.evidence.cells.copy()
+    rows = cells.shape[1]
+    cells[:, : rows // 2] = UNKNOWN
+    half = replace(query, evidence=query.evidence.replace(cells), vectors=None)
+    silent, blind = (prepared(arm, tiny.region).match(half, top_k=1) for arm in (Sasgeo, SasgeoStability))
+    assert silent.scores != blind.scores
+
+
+@pytest.fixture(scope="module")
+def training(tiny):
+    pairs = [
+        (query, truth)
+        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
+        if query.suite == "clean" and query.evidence.shape[0] == 192
+    ]
+    return Training(regions={tiny.queries[0].region: tiny.region}, pairs=pairs[:5])
+
+
+def test_what_is_learnt_is_read_back_and_the_same_again(tiny, training):
+    one, other = (SasgeoNoGraph().learn(training) for _ in range(2))
+    assert one == other
+    said = Learnt.from_text(one)
+    assert said.views == sum(query.track == "localization" for query, _ in training.pairs)
+    assert set(said.classes) == set(tiny.region.classes)
+    matcher = SasgeoNoGraph()
+    matcher.prepare(tiny.region, one)
+    query, truth = first(tiny, "localization", kind="no error")
+    best = matcher.match(query, top_k=1).poses[0]
+    assert math.dist((best.easting_m, best.northing_m), (truth.pose.easting_m, truth.pose.northing_m)) < 5.0
+
+
+def test_the_whole_scorer_learns_weights_of_the_joint_score(training):
+    said = Learnt.from_text(Sasgeo().learn(training))
+    assert said.blend != Learnt.by_hand(said.classes).blend
+
+
+def test_nothing_to_learn_from_is_said(training):
+    with pytest.raises(ConfigError, match="no view of the train part"):
+        Sasgeo().learn(replace(training, pairs=[]))
+    absent = [(query, replace(truth, is_present=False)) for query, truth in training.pairs]
+    with pytest.raises(ConfigError, match="no view of the train part"):
+        Sasgeo().learn(replace(training, pairs=absent))
+
+
+def test_match_before_prepare_says_so(tiny):
+    with pytest.raises(RuntimeError, match="prepare"):
+        Sasgeo().match(tiny.queries[0], top_k=5)

@@ -180,8 +180,10 @@ class _Search:
                 width = self.plan.width(len(behind))
                 kept, behind = merged[:width], [*behind, merged[width - 1 :]]
             near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
-            step = partial(polished, Sight.of(self.field, self.template, 1), stride)
-            kept = _ranked(pool.map(step, kept, [near[guess.owner] for guess in kept]))
+            sight = Sight.of(self.field, self.template, 1)
+            for step in (climbed, climbed, polished):
+                kept = _ranked(pool.map(partial(step, sight, stride), kept, [near[guess.owner] for guess in kept]))
+                stride = stride.half()
         for rest in reversed(behind):
             kept = [*kept, *_below(kept, rest)]
         return kept

@@ -152,7 +152,7 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
         goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
         left, done = _count(goes)
         planned = goes[0].plan
-        lacking = [item for stage in mine for item in stage.lacking]
+        lacking = [item for stage in mine for item in stage.lacking if _is_asked(plan, spec, item.suite)]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
         more = f", and what is drawn; {behind} answered there before" if lacking else ""
@@ -342,14 +342,15 @@ def _count(goes: Sequence[_Go]) -> tuple[int, int]:
 
 def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
     """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other."""
-    whole = plan_run(_run_request(plan, spec, list(tasks)))
+    mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
+    whole = plan_run(_run_request(plan, spec, mine))
     learning = plan.spec.learning
-    if learning is None or not whole.learns or not tasks:
+    if learning is None or not whole.learns or not mine:
         return [_Go(name="", plan=whole)]
     halves = {task: _half_of(plan, task) for task in tasks}
     goes = []
     for half in (*HALVES, None):
-        asked = [task for task in tasks if halves[task] == half]
+        asked = [task for task in mine if halves[task] == half]
         train = [
             task
             for task in tasks
@@ -361,6 +362,11 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
         if asked:
             goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
     return goes
+
+
+def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
+    """Whether a matcher is asked on a suite: controls of all, all of the controls, else as the file says."""
+    return suite in {CONTROLS, PAPER_SUITE} or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
 
 
 def _half_of(plan: PipelinePlan, task: Path) -> Half | None:

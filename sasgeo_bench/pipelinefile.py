@@ -29,11 +29,15 @@ class ContrastSpec(Document):
 
 
 class TaskSpec(Document):
-    """Suites that are drawn alike; several of these make up a pipeline. `prior` is that of each suite unless given."""
+    """Suites that are drawn alike; several of these make up a pipeline.
+
+    `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
+    """
 
     suites: Annotated[list[str], Field(min_length=1)]
     sites: Annotated[int, Field(ge=1, le=10_000)]
     prior: str | None = None
+    matchers: list[str] = []
 
 
 class PaperSpec(Document):
@@ -144,10 +148,32 @@ class PipelineFile(Document):
                 message = f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"'
                 raise ValueError(message)
             _check_methods(item, self.matchers, self.rejectors)
+            _check_asked(item, self.task)
         for task in self.task:
             if task.prior is not None:
                 PriorGroup.parse(task.prior)
+            strange = next((name for name in task.matchers if name not in self.matchers), None)
+            if strange is not None:
+                message = f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too"
+                raise ValueError(message)
+        idle = next((name for name in self.matchers if self.task and not self.suites_of(name)), None)
+        if idle is not None and self.paper is None:
+            message = f"matcher {idle!r} is asked on no suite: leave it out, or name it in a [[task]]"
+            raise ValueError(message)
         return self
+
+    def suites_of(self, matcher: str) -> frozenset[str]:
+        """Suites that a matcher is asked on.
+
+        Examples
+        --------
+        >>> tasks = [{"suites": ["clean"], "sites": 2}, {"suites": ["alias"], "sites": 2, "matchers": ["fft_vote"]}]
+        >>> spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random", "fft_vote"]}
+        >>> sorted(PipelineFile.model_validate(spec | {"task": tasks}).suites_of("random"))
+        ['clean']
+        """
+        asked = (task for task in self.task if not task.matchers or matcher in task.matchers)
+        return frozenset(name for task in asked for name in task.suites)
 
 
 def _check_apart(contrasts: list[ContrastSpec]) -> None:
@@ -162,6 +188,17 @@ def _check_apart(contrasts: list[ContrastSpec]) -> None:
         if before != item.name:
             message = f"contrasts {before!r} and {item.name!r} compare the same: leave one out"
             raise ValueError(message)
+
+
+def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
+    """Refuse a contrast of a matcher that is not asked on its suites."""
+    for task in tasks:
+        for method in (item.first, item.second):
+            suite = next((name for name in task.suites if name in item.suites), None)
+            matcher = method.split(" x ")[0]
+            if suite is not None and task.matchers and matcher not in task.matchers:
+                message = f"contrast {item.name!r} names {matcher!r}, which is not asked on {suite!r}"
+                raise ValueError(message)
 
 
 def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:

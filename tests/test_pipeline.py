@@ -384,3 +384,36 @@ def test_a_rehearsal_asks_what_the_experiment_asks(small, large, may_differ):
             item.pop("sites")
     assert {name for name in one if one[name] != other[name]} <= may_differ
     assert one["contrast"]
+
+
+def with_tasks(*tasks, **changes):
+    spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random", "fft_vote"]}
+    return PipelineFile.model_validate(spec | {"task": list(tasks)} | changes)
+
+
+def test_matchers_of_a_task_are_asked_there_alone():
+    both = {"suites": ["clean"], "sites": 2}
+    one = {"suites": ["alias"], "sites": 2, "matchers": ["fft_vote"]}
+    spec = with_tasks(both, one)
+    assert spec.suites_of("random") == {"clean"}
+    assert spec.suites_of("fft_vote") == {"clean", "alias"}
+
+
+@pytest.mark.parametrize(
+    ("tasks", "changes", "fault"),
+    [
+        ([{"suites": ["clean"], "sites": 2, "matchers": ["nobody"]}], {}, "asks 'nobody'"),
+        ([{"suites": ["clean"], "sites": 2, "matchers": ["random"]}], {}, "'fft_vote' is asked on no suite"),
+        (
+            [
+                {"suites": ["clean"], "sites": 2},
+                {"suites": ["alias"], "sites": 2, "matchers": ["random"]},
+            ],
+            {"contrast": [{"name": "one", "first": "fft_vote", "second": "random", "suites": ["clean", "alias"]}]},
+            "'fft_vote', which is not asked on 'alias'",
+        ),
+    ],
+)
+def test_matchers_of_a_task_that_nobody_asks_are_refused(tasks, changes, fault):
+    with pytest.raises(ValueError, match=fault):
+        with_tasks(*tasks, **changes)

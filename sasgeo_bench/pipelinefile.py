@@ -148,7 +148,10 @@ class PipelineFile(Document):
                 message = f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"'
                 raise ValueError(message)
             _check_methods(item, self.matchers, self.rejectors)
-            _check_asked(item, self.task)
+        return self
+
+    @model_validator(mode="after")
+    def _asks_whom_it_names(self) -> Self:
         for task in self.task:
             if task.prior is not None:
                 PriorGroup.parse(task.prior)
@@ -160,6 +163,8 @@ class PipelineFile(Document):
         if idle is not None and self.paper is None:
             message = f"matcher {idle!r} is asked on no suite: leave it out, or name it in a [[task]]"
             raise ValueError(message)
+        for item in self.contrast:
+            _check_asked(item, self.task)
         return self
 
     def suites_of(self, matcher: str) -> frozenset[str]:

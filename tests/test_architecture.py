@@ -78,7 +78,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
     "sasgeo": (
-        *("rates", "temper", "weights", "raster", "distinct"),
+        *("rates", "seasons", "temper", "weights", "raster", "distinct"),
         *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
         *("temporal", "joint", "learnt", "arms", "reading", "learning"),
         *("integrity", "protection", "conformal", "frame", "rejectors", "matchers", "variants"),

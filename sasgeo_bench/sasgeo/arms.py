@@ -9,6 +9,7 @@ import numpy as np
 from sasgeo_bench.evidence import ABSENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.raster import doubted
+from sasgeo_bench.sasgeo.seasons import by_hand
 from sasgeo_bench.sasgeo.weights import Gains, even_gains, hand_gains, likelihood_gains
 
 Weights = Literal["even", "hand", "fitted"]
@@ -53,10 +54,11 @@ class Switches:
             evidence = Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
         return doubted(evidence)
 
-    def gains(self, learnt: Learnt, *, age_years: float) -> Gains:
-        """Gains of Eq. 7 for a map of an age, for classes in the order of what was learnt."""
+    def gains(self, learnt: Learnt, *, age_years: float, season: str = "") -> Gains:
+        """Gains of Eq. 7 for a map of an age and a season, for classes in the order of what was learnt."""
         if self.weights == "even":
             return even_gains(learnt.classes)
         if self.weights == "hand":
-            return hand_gains(learnt.classes, age_years=age_years)
-        return likelihood_gains(learnt.rates, age_years=age_years).softened(learnt.missed_share)
+            return hand_gains(learnt.classes, age_years=age_years, persists=by_hand(season, learnt.classes).tolist())
+        persists = learnt.persists(season).tolist()
+        return likelihood_gains(learnt.rates, age_years=age_years, persists=persists).softened(learnt.missed_share)

@@ -73,7 +73,12 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         If no view lies on its map, or maps have different classes.
     """
     lessons = lessons_of(training)
-    learnt = Learnt.of([one for name in lessons for one in _tallies(training.regions[name], lessons[name], switches)])
+    tallies: dict[str, list[Tally]] = {"": []}
+    for name, some in lessons.items():
+        found = _tallies(training.regions[name], some, switches)
+        for (query, _), one in zip(some, found, strict=True):
+            tallies.setdefault(query.season, []).append(one)
+    learnt = Learnt.of(tallies)
     lists = []
     for name, some in lessons.items():
         reader = Reader.of(training.regions[name], learnt, switches)

@@ -2,7 +2,7 @@
 """What the scorer has learnt of classes: rates, likeness, exponents; from train places, as text that can be read."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Self
 
@@ -13,6 +13,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
+from sasgeo_bench.sasgeo.seasons import SEASONS, by_hand, fit_season
 from sasgeo_bench.sasgeo.temper import START
 
 VERSION: Final = 1  # of the text
@@ -36,6 +37,8 @@ class Learnt:
         How much of `Gains.missed` one degree of that likeness is worth.
     temper : ndarray of float, shape (C,)
         What the score of each is multiplied with: neighbouring cells say the same.
+    seasons : mapping of str to ndarray of float, shape (C,)
+        By season, what share of a mapped class can still be seen.
     blend : Blend
         Weights of raster, graph and contradiction in the joint score.
     views, blocks : int
@@ -53,6 +56,7 @@ class Learnt:
     likeness: NDArray[np.float64]
     missed_share: NDArray[np.float64]
     temper: NDArray[np.float64]
+    seasons: Mapping[str, NDArray[np.float64]]
     blend: Blend = DEFAULT_BLEND
     views: int = 0
     blocks: int = 0
@@ -74,28 +78,45 @@ class Learnt:
             likeness=likeness_by_hand(classes),
             missed_share=np.ones(len(classes)),
             temper=np.full(len(classes), START),
+            seasons={season: by_hand(season, classes) for season in SEASONS},
         )
 
     @classmethod
-    def of(cls, tallies: Sequence[Tally]) -> Self:
-        """Learn rates and likeness; exponents are learnt afterwards, from searches made with these.
+    def of(cls, tallies: Mapping[str, Sequence[Tally]]) -> Self:
+        """Learn rates, likeness and seasons; exponents are learnt afterwards, from searches made with these.
+
+        Parameters
+        ----------
+        tallies : mapping of str to sequence of Tally
+            By season; "" for views that tell none, from which rates and likeness come.
 
         Raises
         ------
         ConfigError
-            If there is no tally, or their classes differ.
+            If there is no tally without a season, or classes differ.
         """
-        fitted = fit_rates(tallies)
-        near = likeness(tallies)
+        plain = tallies.get("", ())
+        fitted = fit_rates(plain)
+        near, rates = likeness(plain), tuple(one.best for one in fitted.values())
+        classes = plain[0].classes
+        seasons = {
+            season: fit_season(season, tallies[season], rates) if tallies.get(season) else by_hand(season, classes)
+            for season in SEASONS
+        }
         return cls(
-            classes=tallies[0].classes,
-            rates=tuple(one.best for one in fitted.values()),
+            classes=classes,
+            rates=rates,
             likeness=near,
-            missed_share=missed_share(tallies, near),
+            missed_share=missed_share(plain, near),
             temper=np.full(len(near), START),
-            views=len(tallies),
-            blocks=len({one.block for one in tallies}),
+            seasons=seasons,
+            views=len(plain),
+            blocks=len({one.block for one in plain}),
         )
+
+    def persists(self, season: str) -> NDArray[np.float64]:
+        """Factors of a season, shape (C,); all 1 where a view tells none."""
+        return self.seasons.get(season, np.ones(len(self.classes)))
 
     def of_classes(self, classes: Sequence[str]) -> Self:
         """The same for other classes in another order; what was not learnt is as by hand."""
@@ -110,6 +131,7 @@ class Learnt:
             likeness=np.concatenate((self.likeness, hand.likeness))[at],
             missed_share=np.concatenate((self.missed_share, hand.missed_share))[at],
             temper=np.concatenate((self.temper, hand.temper))[at],
+            seasons={name: np.concatenate((self.seasons[name], hand.seasons[name]))[at] for name in SEASONS},
         )
 
     def to_text(self) -> str:
@@ -134,6 +156,7 @@ class Learnt:
             "likeness": self.likeness[at].tolist(),
             "missed_share": float(self.missed_share[at]),
             "temper": float(self.temper[at]),
+            "seasons": [float(self.seasons[season][at]) for season in SEASONS],
         }
 
     @classmethod
@@ -151,16 +174,20 @@ class Learnt:
                 message = f"it is of version {said['version']}, this program reads {VERSION}"
                 raise ConfigError(message)
             rows: dict[str, dict[str, Any]] = said["classes"]
-            shapes = [[row.pop(name) for name in ("likeness", "missed_share", "temper")] for row in rows.values()]
+            shapes = [
+                [row.pop(name) for name in ("likeness", "missed_share", "temper", "seasons")] for row in rows.values()
+            ]
             near = np.array([shape[0] for shape in shapes], dtype=np.float64).reshape(-1, FAR + 1)
             shares, temper = (np.array([shape[at] for shape in shapes], dtype=np.float64) for at in (1, 2))
-            _check(near, shares, temper)
+            seasons = np.array([shape[3] for shape in shapes], dtype=np.float64).reshape(-1, len(SEASONS))
+            _check(near, shares, temper, seasons)
             return cls(
                 classes=tuple(rows),
                 rates=tuple(ClassRates(**row) for row in rows.values()),
                 likeness=near,
                 missed_share=shares,
                 temper=temper,
+                seasons=dict(zip(SEASONS, seasons.T, strict=True)),
                 blend=Blend(**said["blend"]),
                 views=int(said["views"]),
                 blocks=int(said["blocks"]),
@@ -170,12 +197,14 @@ class Learnt:
             raise ConfigError(message) from error
 
 
-def _check(near: NDArray[np.float64], shares: NDArray[np.float64], temper: NDArray[np.float64]) -> None:
+def _check(
+    near: NDArray[np.float64], shares: NDArray[np.float64], temper: NDArray[np.float64], seasons: NDArray[np.float64]
+) -> None:
     """Refuse numbers that no class can have."""
     if not (np.isfinite(temper).all() and (temper >= 0).all()):
         message = "an exponent is negative or not finite"
         raise ValueError(message)
-    for name, values in (("likeness", near), ("missed_share", shares)):
+    for name, values in (("likeness", near), ("missed_share", shares), ("a season", seasons)):
         if not ((values >= 0) & (values <= 1)).all():
             message = f"{name} is not within 0..1"
             raise ValueError(message)

@@ -88,7 +88,7 @@ class Glance:
     def view(self) -> RasterView:
         """Weighed by the gains of the arm, by square metre so that exponents are those of any cell, not tempered."""
         reader, seen = self.reader, self.reader.switches.seen(self.query.evidence)
-        gains = reader.switches.gains(reader.learnt, age_years=self.age_years)
+        gains = reader.switches.gains(reader.learnt, age_years=self.age_years, season=self.query.season)
         view = RasterView.of(seen, reader.region.classes, gains).times(np.float32(seen.cell_size_m**2))
         if reader.rarity is None:
             return view

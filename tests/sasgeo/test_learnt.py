@@ -49,6 +49,8 @@ def test_classes_are_put_in_the_order_of_a_map_and_unknown_ones_are_by_hand():
         (learnt(temper=float("nan")), "negative or not finite"),
         (learnt(likeness=[1.0, 2.0, 0.0, 0.0, 0.0]), "within 0..1"),
         (learnt(likeness=[1.0]), "cannot be read"),
+        (learnt(seasons=[1.0]), "cannot be read"),
+        (learnt(seasons=[1.0, 1.0, 1.0, 2.0]), "a season is not within 0..1"),
         (learnt(hit=1.5), "hit is a share"),
         (learnt(vanish_per_year=-0.1), "vanish_per_year is a rate"),
         (learnt(colour="red"), "cannot be read"),

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a season does to a class: the d_season of Eq. 5 of the SASGeo paper, by hand and from views that tell theirs."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.sasgeo.rates import ClassRates, Tally
+
+# Shares of a mapped class that can still be seen: guesses of ours, for want of a source; 1 for what is not named.
+HAND: Final[Mapping[str, Mapping[str, float]]] = {
+    "leaf_on": {"road_minor": 0.8, "path_track": 0.5, "railway": 0.9, "waterway": 0.7, "field_boundary": 0.8},
+    "snow": {
+        "road_minor": 0.6,
+        "path_track": 0.3,
+        "railway": 0.8,
+        "water": 0.7,
+        "waterway": 0.5,
+        "green": 0.6,
+        "farmland": 0.6,
+        "field_boundary": 0.4,
+        "parking": 0.4,
+    },
+    "low_water": {"water": 0.7, "waterway": 0.6, "coastline": 0.8},
+    "harvest": {"farmland": 0.5, "field_boundary": 0.9},
+}
+SEASONS: Final = tuple(HAND)
+_CELLS_PER_WITNESS: Final = 200.0  # as for rates: a house or a piece of road is right or wrong as a whole
+_HAND_WITNESSES: Final = 20.0  # that a factor by hand is worth
+
+
+def by_hand(season: str, classes: Sequence[str]) -> NDArray[np.float64]:
+    """Factors of a season that were set by hand, shape (C,); all 1 where nothing is said of the season.
+
+    Examples
+    --------
+    >>> by_hand("snow", ["building", "path_track"]).tolist(), by_hand("", ["water"]).tolist()
+    ([1.0, 0.3], [1.0])
+    """
+    mine = HAND.get(season, {})
+    return np.array([mine.get(name, 1.0) for name in classes], dtype=np.float64)
+
+
+def fit_season(season: str, tallies: Sequence[Tally], rates: Sequence[ClassRates]) -> NDArray[np.float64]:
+    """Estimate the factors of one season: what was seen of what is mapped, over what would be seen without it.
+
+    Parameters
+    ----------
+    season : str
+        Of `SEASONS`.
+    tallies : sequence of Tally
+        Views of that season; all of the same classes.
+    rates : sequence of ClassRates
+        Of these classes, learnt from views of which no season is told.
+
+    Returns
+    -------
+    ndarray of float, shape (C,)
+        0..1; drawn to those by hand where little was seen.
+
+    Examples
+    --------
+    >>> rate = ClassRates(
+    ...     hit=0.8, false_alarm=0.01, missing=0.0, vanish_per_year=0.0, appear_per_year=0.0, mapped=0.1
+    ... )
+    >>> seen, missed = np.array([[200_000, 0, 0, 0, 0]]), np.array([[800_000, 0, 0, 0, 0]])
+    >>> white = Tally(classes=("path_track",), age_years=0.0, block="a", seen=seen, missed=missed)
+    >>> fit_season("snow", [white], [rate]).round(2).tolist()
+    [0.25]
+    """
+    hand = by_hand(season, tallies[0].classes if tallies else ())
+    seen, expected = np.zeros(len(hand)), np.zeros(len(hand))
+    for one in tallies:
+        standing = np.array([rate.survival(one.age_years) for rate in rates])
+        hits, alarms = (np.array([getattr(rate, name) for rate in rates]) for name in ("hit", "false_alarm"))
+        cells = (one.seen[:, 0] + one.missed[:, 0]) / _CELLS_PER_WITNESS
+        seen += one.seen[:, 0] / _CELLS_PER_WITNESS
+        expected += cells * (standing * hits + (1 - standing) * alarms)
+    return np.clip((seen + _HAND_WITNESSES * hand) / (expected + _HAND_WITNESSES), 0.0, 1.0)

@@ -66,7 +66,8 @@ class SasgeoMatcher:
         glance = self._reader.glance(query)
         if query.track == "retrieval":
             return _of_candidates(glance, self.plan, top_k=top_k)
-        found = search(self._reader.field, glance.template, query.prior, self.plan, count=LISTED)
+        starts = glance.proposed()
+        found = search(self._reader.field, glance.template, query.prior, self.plan, count=LISTED, starts=starts)
         if not found.modes:
             return WITHHELD
         ranked = _ranked(glance, found.modes)

@@ -22,12 +22,16 @@ from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.tuples import proposals
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
 
 DAYS_PER_YEAR: Final = 365.25
 LEAST_SIGMA_M: Final = 1.0  # of a refined position: half a cell of the search
 MOST_SIGMA_M: Final = 25.0  # a score that does not bend tells no place better than this
+PROPOSED: Final = 20  # poses by the graph, of a view of any heading
+SCALE_SPREAD: Final = 2.5  # standard deviations of scale, as the search looks for
+MOST_SCALED: Final = 0.9
 _STEP_M: Final = 4.0  # for the bend of a score
 
 
@@ -103,6 +107,15 @@ class Glance:
     def observed(self) -> ObservedGraph:
         """The graph of the view."""
         return ObservedGraph.of(self.query)
+
+    def proposed(self) -> list[Pose]:
+        """Poses that pairs of junctions propose, where the arm looks at graphs and the heading is not known."""
+        prior, graph = self.query.prior, self.reader.graph
+        if graph is None or prior.yaw_deg is not None:
+            return []
+        reach = min(SCALE_SPREAD * prior.scale_sigma, MOST_SCALED)
+        found = proposals(self.observed, graph, count=PROPOSED, scales=(1 - reach, 1 + reach), prior=prior)
+        return [item.pose for item in found]
 
     def by_class(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
         """Scores of Eq. 8 by class, not tempered, shape (M, C)."""

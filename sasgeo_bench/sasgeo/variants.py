@@ -26,7 +26,7 @@ _BLIND: Final = "what is unknown counts as absent, as in all variants of the pap
 _SILENT: Final = "what is unknown says nothing"
 _LIMITS: Final = (
     "headings and scales beyond 2.5 standard deviations are not searched; places are 2 m apart before they are "
-    "refined; the graph finds no place that the raster has not found"
+    "refined; where the heading is known the graph finds no place that the raster has not found"
 )
 
 

@@ -23,7 +23,15 @@ _NOTHING: Final = 1e-9
 _CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner
 
 
-def search(field: Field, template: Template, prior: Prior, plan: Plan | None = None, *, count: int = 10) -> Found:
+def search(
+    field: Field,
+    template: Template,
+    prior: Prior,
+    plan: Plan | None = None,
+    *,
+    count: int = 10,
+    starts: Sequence[Pose] = (),
+) -> Found:
     """Find the best modes within a prior: all of it on large cells, the best of that ever more finely.
 
     Parameters
@@ -38,6 +46,8 @@ def search(field: Field, template: Template, prior: Prior, plan: Plan | None = N
         How it is done.
     count : int
         Most modes that are given.
+    starts : sequence of Pose
+        Poses that something else proposes; they are followed as the search's own are, where they score as well.
 
     Returns
     -------
@@ -60,7 +70,7 @@ def search(field: Field, template: Template, prior: Prior, plan: Plan | None = N
     >>> round(best.easting_m), round(best.northing_m)
     (26, 28)
     """
-    return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).places(count)
+    return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).places(count, starts)
 
 
 def rank(
@@ -119,15 +129,23 @@ class _Search:
     prior: Prior
     plan: Plan
 
-    def places(self, count: int) -> Found:
+    def places(self, count: int, starts: Sequence[Pose]) -> Found:
         """Best modes within the prior."""
         disc = Disc(center_m=self.prior.center_m, radius_m=self.prior.radius_m or 0.0)
         tiles = tiles_of(self._coarse_grid, self.field.grid, disc.wider(_CORNER * self._coarse_m))
         guesses, null = self._begun(tiles, most=self.plan.width(0))
-        followed = self._followed([replace(guess, owner=0) for guess in guesses], [disc])
+        guesses = _ranked([*(replace(guess, owner=0) for guess in guesses), *self._proposed(starts)])
+        followed = self._followed(guesses, [disc])
         near = disc.wider(_CORNER * self.field.grid.cell_size_m)  # those left behind had the leeway of larger cells
         inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
         return Found(modes=tuple(_thinned(inside, self.plan.apart_m)[:count]), null=null)
+
+    def _proposed(self, starts: Sequence[Pose]) -> list[Guess]:
+        """Score poses that are given on the coarsest level."""
+        if not starts or not len(self.template.speaking):
+            return []
+        sight = Sight.of(self.field, self.template, self._factor)
+        return [Guess(mode=Mode(pose=pose, score=sight.score(pose)), owner=0) for pose in starts]
 
     def candidates(self, poses: Sequence[Pose]) -> tuple[list[Mode | None], Null]:
         """Best mode near each of some poses."""
@@ -181,8 +199,8 @@ class _Search:
                 kept, behind = merged[:width], [*behind, merged[width - 1 :]]
             near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
             sight = Sight.of(self.field, self.template, 1)
-            for step in (climbed, climbed, polished):
-                kept = _ranked(pool.map(partial(step, sight, stride), kept, [near[guess.owner] for guess in kept]))
+            for move in (climbed, climbed, polished):
+                kept = _ranked(pool.map(partial(move, sight, stride), kept, [near[guess.owner] for guess in kept]))
                 stride = stride.half()
         for rest in reversed(behind):
             kept = [*kept, *_below(kept, rest)]

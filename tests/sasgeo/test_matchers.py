@@ -139,6 +139,12 @@ def test_unknown_cells_change_nothing_where_they_are_silent_and_something_where_
     assert silent.scores != blind.scores
 
 
+def test_without_a_heading_the_graph_proposes_poses(tiny, whole):
+    query = next(query for query in tiny.queries if query.suite == "no-priors" and query.track == "localization")
+    assert query.prior.yaw_deg is None
+    check_match(whole.match(query, top_k=5), query, top_k=5)
+
+
 @pytest.fixture(scope="module")
 def training(tiny):
     pairs = [

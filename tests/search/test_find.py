@@ -273,3 +273,15 @@ def test_a_posterior_sums_to_one_and_grows_with_the_score():
     assert mass.sum() == pytest.approx(1.0)
     assert mass[0] > mass[1] > mass[3] > mass[2]
     assert posterior([1e6, 0.0], temper=1.0).tolist() == [1.0, 0.0, 0.0]
+
+
+def test_a_pose_that_is_given_is_followed_where_the_search_would_not_look(place):
+    (truth,) = some_poses(place[0], 1)
+    template = as_template(view_of(place, truth))
+    turned = Prior(center_m=None, radius_m=None, yaw_deg=truth.yaw_deg + 120.0, yaw_sigma_deg=2.0, scale_sigma=0.0)
+    near = replace(truth, easting_m=truth.easting_m + 3.0, yaw_deg=truth.yaw_deg + 2.0)
+    alone = search(place[2], template, turned).modes[0].pose
+    given = search(place[2], template, turned, starts=[near]).modes[0].pose
+    assert off(alone, truth)[1] > 60.0
+    assert off(given, truth)[0] < 1.0
+    assert search(place[2], template, turned, starts=[]).modes[0].pose == alone

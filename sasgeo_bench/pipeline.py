@@ -17,6 +17,7 @@ from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.plugins import check_names
 from sasgeo_bench.query import CONTROLS, PriorGroup
 from sasgeo_bench.report.contrasts import Contrast
+from sasgeo_bench.report.rows import YARDSTICK, is_unranked
 from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.run.lesson import base_of
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
@@ -65,6 +66,8 @@ class PipelinePlan:
             lines.append(
                 f"  learning: each half is asked after learning from the other ({suites}, at most {most} queries)"
             )
+            if self.spec.learning.oracles:
+                lines.append(f"    {', '.join(self.spec.learning.oracles)}: from the half itself, never ranked")
         lines += _run_lines(self, stages, controls)
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
         lines.append(f"  board: {board_folder(self)}")
@@ -341,23 +344,39 @@ def _count(goes: Sequence[_Go]) -> tuple[int, int]:
 
 
 def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
-    """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other."""
+    """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other.
+
+    An oracle learns from the half itself.
+    """
     mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
     whole = plan_run(_run_request(plan, spec, mine))
     learning = plan.spec.learning
     if learning is None or not whole.learns or not mine:
         return [_Go(name="", plan=whole)]
     halves = {task: _half_of(plan, task) for task in tasks}
-    goes = []
+    is_oracle, goes = spec in learning.oracles, []
+    if is_oracle and not is_unranked(whole.card.name):
+        message = (
+            f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
+            f"oracles begin with {YARDSTICK}, so that no board ranks them"
+        )
+        raise ConfigError(message)
     for half in (*HALVES, None):
         asked = [task for task in mine if halves[task] == half]
         train = [
             task
             for task in tasks
-            if task.parent.name in learning.suites and None not in {half, halves[task]} and halves[task] != half
+            if task.parent.name in learning.suites
+            and None not in {half, halves[task]}
+            and (halves[task] == half) == is_oracle
         ]
         request = replace(
-            whole.request, tasks=asked, train=train, most_trained=learning.most, split=plan.requests[0].split
+            whole.request,
+            tasks=asked,
+            train=train,
+            most_trained=learning.most,
+            split=plan.requests[0].split,
+            is_oracle=is_oracle,
         )
         if asked:
             goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))

@@ -56,6 +56,8 @@ class PaperSpec(Document):
 class LearningSpec(Document):
     """What matchers that have a `learn` learn from: queries of these suites, at most so many, on the other half.
 
+    `oracles` learn from the half that they are asked on: yardsticks of what rates known in advance would be worth.
+
     Examples
     --------
     >>> LearningSpec(suites=["clean"]).most
@@ -64,6 +66,7 @@ class LearningSpec(Document):
 
     suites: Annotated[list[str], Field(min_length=1)]
     most: Annotated[int, Field(ge=1, le=2000)] = 200
+    oracles: list[str] = []
 
 
 class PipelineFile(Document):
@@ -159,6 +162,11 @@ class PipelineFile(Document):
             if strange is not None:
                 message = f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too"
                 raise ValueError(message)
+        oracles = [] if self.learning is None else self.learning.oracles
+        strange = next((name for name in oracles if name not in self.matchers), None)
+        if strange is not None:
+            message = f"learning names the oracle {strange!r}, which is not among 'matchers': name it there, too"
+            raise ValueError(message)
         idle = next((name for name in self.matchers if self.task and not self.suites_of(name)), None)
         if idle is not None and self.paper is None:
             message = f"matcher {idle!r} is asked on no suite: leave it out, or name it in a [[task]]"

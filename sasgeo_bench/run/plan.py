@@ -63,6 +63,8 @@ class RunRequest:
         Queries to learn from at most: evenly over places, then suites, then sites.
     split : Split, optional
         Says what is one place, and how far from each other places to learn from and places that are asked must lie.
+    is_oracle : bool
+        Lets it learn from what it is asked: a yardstick, never ranked.
     """
 
     spec: str
@@ -79,6 +81,7 @@ class RunRequest:
     train: Sequence[Path] = ()
     most_trained: int = 200
     split: Split | None = None
+    is_oracle: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,7 +204,8 @@ def plan_run(request: RunRequest) -> RunPlan:
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
     lesson = learned = None
     if learns and request.train:
-        lesson = plan_lesson(request.train, asked=request.tasks, split=request.split, most=request.most_trained)
+        apart = () if request.is_oracle else request.tasks
+        lesson = plan_lesson(request.train, asked=apart, split=request.split, most=request.most_trained)
         text = read_learned(learned_path(_run_folder(request, card, found), lesson.sha256))
         learned = None if text is None else Learned(text=text)
     key = None if lesson is None else _key(lesson, learned)

@@ -119,6 +119,22 @@ class SasgeoDistinct(LearningMatcher):
     switches = Switches(is_distinctive=True)
 
 
+class OracleSasgeo(LearningMatcher):
+    """The whole scorer, learning from what it is asked: what rates known in advance would be worth."""
+
+    card = _card(
+        "oracle_sasgeo",
+        "SASGeo that learns from the places it is asked on",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _GRAPH.format(how="learnt"),
+        _SILENT,
+        "a yardstick, never ranked: a pipeline names it among its oracles",
+        limits=f"Knows what no matcher can know; {_LIMITS}",
+    )
+    switches = Switches()
+
+
 class SasgeoNoGraph(LearningMatcher):
     """The whole scorer but its graph."""
 

@@ -44,6 +44,10 @@ class NeedsTraining(Counts):
         self.learned = json.loads(learned)
 
 
+class Oracle(Counts):
+    card = MatcherCard(name="oracle_counts", tracks=BOTH, **SAID)
+
+
 class RaisesInLearn(Counts):
     def learn(self, training):
         message = "nothing\nto see"

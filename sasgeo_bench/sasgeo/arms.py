@@ -30,6 +30,8 @@ class Switches:
         Eq. 9 has a say in the order of the modes.
     is_distinctive : bool
         Eq. 6: what is rare on the map weighs more.
+    is_stamped : bool
+        Eq. 5 feature by feature: what nobody has edited for years is worth what it was learnt to be worth.
 
     Examples
     --------
@@ -41,6 +43,7 @@ class Switches:
     is_unknown_silent: bool = True
     has_graph: bool = True
     is_distinctive: bool = False
+    is_stamped: bool = False
 
     @property
     def learns(self) -> bool:

@@ -19,8 +19,9 @@ from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.joint import Blend, columns
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.rates import NOWHERE, Tally, rings, tally
+from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
+from sasgeo_bench.sasgeo.stamps import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.sasgeo.temper import fit_temper
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
@@ -74,11 +75,15 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     """
     lessons = lessons_of(training)
     tallies: dict[str, list[Tally]] = {"": []}
+    stamps: list[StampTally] = []
     for name, some in lessons.items():
         found = _tallies(training.regions[name], some, switches)
+        stamps += _stamps(training.regions[name], some, switches) if switches.is_stamped else ()
         for (query, _), one in zip(some, found, strict=True):
             tallies.setdefault(query.season, []).append(one)
     learnt = Learnt.of(tallies)
+    if switches.is_stamped:
+        learnt = replace(learnt, trust=fit_trust(stamps))
     lists = []
     for name, some in lessons.items():
         reader = Reader.of(training.regions[name], learnt, switches)
@@ -126,11 +131,29 @@ def _tallies(region: Region, lessons: Sequence[tuple[Query, Truth]], switches: S
 
 def _tally(query: Query, truth: Truth, region: Region, near: NDArray[np.uint8], seen: Evidence) -> Tally:
     under = _under(near, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
-    cells = np.full(under.shape, NOWHERE, dtype=np.uint8)  # neither present nor absent: a class the view does not know
+    return tally(region.classes, _on_map(region, seen), under, age_years=age_years(query, region), block=truth.block)
+
+
+def _stamps(region: Region, lessons: Sequence[tuple[Query, Truth]], switches: Switches) -> list[StampTally]:
+    """What was seen on one map of what was edited lately and long ago; views of a season apart, as for rates."""
+    near, stratum = rings(region.layers, cell_size_m=region.grid.cell_size_m), strata(region)
+    found = []
+    for query, truth in lessons:
+        if not query.season:
+            seen = switches.seen(query.evidence)
+            under = _under(near, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
+            stamped = _under(stratum, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
+            found.append(stamp_tally(_on_map(region, seen), under, stamped, FAR))
+    return found
+
+
+def _on_map(region: Region, seen: Evidence) -> NDArray[np.uint8]:
+    """A view in the classes of a map; neither present nor absent where it does not know a class."""
+    cells = np.full((len(region.classes), *seen.shape), NOWHERE, dtype=np.uint8)
     for at, name in enumerate(region.classes):
         if name in seen.classes:
             cells[at] = seen.layer(name)
-    return tally(region.classes, cells, under, age_years=age_years(query, region), block=truth.block)
+    return cells
 
 
 def _under(near: NDArray[np.uint8], grid: Grid, pose: Pose, shape: tuple[int, int], cell_m: float) -> NDArray[np.uint8]:

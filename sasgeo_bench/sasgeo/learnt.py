@@ -14,6 +14,7 @@ from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
 from sasgeo_bench.sasgeo.seasons import SEASONS, by_hand, fit_season
+from sasgeo_bench.sasgeo.stamps import STRATA
 from sasgeo_bench.sasgeo.temper import START
 
 VERSION: Final = 1  # of the text
@@ -37,6 +38,8 @@ class Learnt:
         How much of `Gains.missed` one degree of that likeness is worth.
     temper : ndarray of float, shape (C,)
         What the score of each is multiplied with: neighbouring cells say the same.
+    trust : ndarray of float, shape (C, STRATA)
+        How much a feature is worth by its own age: see `stamps.fit_trust`.
     seasons : mapping of str to ndarray of float, shape (C,)
         By season, what share of a mapped class can still be seen.
     blend : Blend
@@ -56,6 +59,7 @@ class Learnt:
     likeness: NDArray[np.float64]
     missed_share: NDArray[np.float64]
     temper: NDArray[np.float64]
+    trust: NDArray[np.float64]
     seasons: Mapping[str, NDArray[np.float64]]
     blend: Blend = DEFAULT_BLEND
     views: int = 0
@@ -78,6 +82,7 @@ class Learnt:
             likeness=likeness_by_hand(classes),
             missed_share=np.ones(len(classes)),
             temper=np.full(len(classes), START),
+            trust=np.ones((len(classes), STRATA)),
             seasons={season: by_hand(season, classes) for season in SEASONS},
         )
 
@@ -109,6 +114,7 @@ class Learnt:
             likeness=near,
             missed_share=missed_share(plain, near),
             temper=np.full(len(near), START),
+            trust=np.ones((len(near), STRATA)),
             seasons=seasons,
             views=len(plain),
             blocks=len({one.block for one in plain}),
@@ -131,6 +137,7 @@ class Learnt:
             likeness=np.concatenate((self.likeness, hand.likeness))[at],
             missed_share=np.concatenate((self.missed_share, hand.missed_share))[at],
             temper=np.concatenate((self.temper, hand.temper))[at],
+            trust=np.concatenate((self.trust, hand.trust))[at],
             seasons={name: np.concatenate((self.seasons[name], hand.seasons[name]))[at] for name in SEASONS},
         )
 
@@ -156,6 +163,7 @@ class Learnt:
             "likeness": self.likeness[at].tolist(),
             "missed_share": float(self.missed_share[at]),
             "temper": float(self.temper[at]),
+            "trust": self.trust[at].tolist(),
             "seasons": [float(self.seasons[season][at]) for season in SEASONS],
         }
 
@@ -175,18 +183,21 @@ class Learnt:
                 raise ConfigError(message)
             rows: dict[str, dict[str, Any]] = said["classes"]
             shapes = [
-                [row.pop(name) for name in ("likeness", "missed_share", "temper", "seasons")] for row in rows.values()
+                [row.pop(name) for name in ("likeness", "missed_share", "temper", "seasons", "trust")]
+                for row in rows.values()
             ]
             near = np.array([shape[0] for shape in shapes], dtype=np.float64).reshape(-1, FAR + 1)
             shares, temper = (np.array([shape[at] for shape in shapes], dtype=np.float64) for at in (1, 2))
             seasons = np.array([shape[3] for shape in shapes], dtype=np.float64).reshape(-1, len(SEASONS))
-            _check(near, shares, temper, seasons)
+            trust = np.array([shape[4] for shape in shapes], dtype=np.float64).reshape(-1, STRATA)
+            _check(near, shares, temper, seasons, trust)
             return cls(
                 classes=tuple(rows),
                 rates=tuple(ClassRates(**row) for row in rows.values()),
                 likeness=near,
                 missed_share=shares,
                 temper=temper,
+                trust=trust,
                 seasons=dict(zip(SEASONS, seasons.T, strict=True)),
                 blend=Blend(**said["blend"]),
                 views=int(said["views"]),
@@ -198,13 +209,17 @@ class Learnt:
 
 
 def _check(
-    near: NDArray[np.float64], shares: NDArray[np.float64], temper: NDArray[np.float64], seasons: NDArray[np.float64]
+    near: NDArray[np.float64],
+    shares: NDArray[np.float64],
+    temper: NDArray[np.float64],
+    seasons: NDArray[np.float64],
+    trust: NDArray[np.float64],
 ) -> None:
     """Refuse numbers that no class can have."""
     if not (np.isfinite(temper).all() and (temper >= 0).all()):
         message = "an exponent is negative or not finite"
         raise ValueError(message)
-    for name, values in (("likeness", near), ("missed_share", shares), ("a season", seasons)):
+    for name, values in (("likeness", near), ("missed_share", shares), ("a season", seasons), ("trust", trust)):
         if not ((values >= 0) & (values <= 1)).all():
             message = f"{name} is not within 0..1"
             raise ValueError(message)

@@ -14,6 +14,7 @@ from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, rings
+from sasgeo_bench.sasgeo.stamps import strata
 from sasgeo_bench.sasgeo.weights import Gains, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 
@@ -42,7 +43,13 @@ def likeness_by_hand(classes: Sequence[str], *, reach_m: float = REACH_M) -> NDA
     return table
 
 
-def read_field(region: Region, likeness: NDArray[np.float64], *, cell_size_m: float = CELL_M) -> Field:
+def read_field(
+    region: Region,
+    likeness: NDArray[np.float64],
+    *,
+    trust: NDArray[np.float64] | None = None,
+    cell_size_m: float = CELL_M,
+) -> Field:
     """Make a map ready for the search: each class to the degree that a cell is on it or near it.
 
     Parameters
@@ -51,6 +58,8 @@ def read_field(region: Region, likeness: NDArray[np.float64], *, cell_size_m: fl
         The map.
     likeness : ndarray of float, shape (C, FAR + 1)
         Of its classes: see `rates.likeness` and `likeness_by_hand`.
+    trust : ndarray of float, shape (C, STRATA), optional
+        Of features by their own age: see `stamps.fit_trust`; all alike without it.
     cell_size_m : float
         Least side of a cell of the search, metres.
 
@@ -64,12 +73,38 @@ def read_field(region: Region, likeness: NDArray[np.float64], *, cell_size_m: fl
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
     known = _pooled(np.where((region.layers <= PRESENT).all(axis=0), FULL, 0).astype(np.uint8), around, grid)
     layers = np.empty((len(region.classes), *grid.shape), dtype=np.uint8)
-    for layer, row, into in zip(region.layers, likeness, layers, strict=True):
-        near = rings(layer[None], cell_size_m=region.grid.cell_size_m)[0]
-        table = np.zeros(NOWHERE + 1, dtype=np.uint8)
-        table[: FAR + 1] = np.rint(FULL * row)
-        into[:] = _pooled(table[near], around, grid)
+    cell_m = region.grid.cell_size_m
+    stamped = None if trust is None else strata(region)
+    for at, (layer, into) in enumerate(zip(region.layers, layers, strict=True)):
+        if trust is None or stamped is None:
+            degree = _likened(layer, likeness[at], cell_m)
+        else:
+            degree = _trusted(layer, likeness[at], cell_m, stamped[at], trust[at])
+        into[:] = _pooled(degree, around, grid)
     return Field(grid=grid, layers=layers, known=np.where(known > FULL // 2, np.uint8(FULL), np.uint8(0)))
+
+
+def _likened(layer: NDArray[np.uint8], likeness: NDArray[np.float64], cell_m: float) -> NDArray[np.uint8]:
+    """To what degree each cell is on a class or near it, 0..FULL."""
+    table = np.zeros(NOWHERE + 1, dtype=np.uint8)
+    table[: FAR + 1] = np.rint(FULL * likeness)
+    return np.asarray(table[rings(layer[None], cell_size_m=cell_m)[0]])
+
+
+def _trusted(
+    layer: NDArray[np.uint8],
+    likeness: NDArray[np.float64],
+    cell_m: float,
+    stratum: NDArray[np.uint8],
+    trust: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """The same, the features of each stratum as far as they are trusted."""
+    degree = np.zeros(layer.shape, dtype=np.uint8)
+    for index, share in enumerate(trust):
+        mine = np.where((layer == PRESENT) & (stratum != index), np.uint8(ABSENT), layer)
+        if (mine == PRESENT).any():
+            np.maximum(degree, _likened(mine, share * likeness, cell_m), out=degree)
+    return degree
 
 
 def _pooled(layer: NDArray[np.uint8], around: tuple[tuple[int, int], tuple[int, int]], grid: Grid) -> NDArray[np.uint8]:

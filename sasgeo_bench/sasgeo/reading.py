@@ -62,7 +62,7 @@ class Reader:
             region=region,
             learnt=learnt,
             switches=switches,
-            field=read_field(region, near),
+            field=read_field(region, near, trust=learnt.trust if switches.is_stamped else None),
             graph=MappedGraph.of(region) if switches.has_graph else None,
             rarity=Rarity.of(region.layers, region.classes, cell_size_m=cell_m) if is_rare else None,
         )

@@ -119,6 +119,22 @@ class SasgeoDistinct(LearningMatcher):
     switches = Switches(is_distinctive=True)
 
 
+class SasgeoStamped(LearningMatcher):
+    """The whole scorer with each feature by its own age."""
+
+    card = _card(
+        "sasgeo_stamped",
+        "SASGeo with OSM timestamps",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        "features weigh by how long nobody had edited them when the map was taken, learnt by class in four strata",
+        _GRAPH.format(how="learnt"),
+        _SILENT,
+        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+    )
+    switches = Switches(is_stamped=True)
+
+
 class OracleSasgeo(LearningMatcher):
     """The whole scorer, learning from what it is asked: what rates known in advance would be worth."""
 

@@ -21,10 +21,11 @@ from sasgeo_bench.sasgeo.variants import (
     SasgeoNoGraph,
     SasgeoRaster,
     SasgeoStability,
+    SasgeoStamped,
 )
 
-ALL = (SasgeoRaster, SasgeoGraph, SasgeoStability, Sasgeo, SasgeoHand, SasgeoDistinct, SasgeoNoGraph)
-LEARNERS = {SasgeoStability, Sasgeo, SasgeoDistinct, SasgeoNoGraph}
+ALL = (SasgeoRaster, SasgeoGraph, SasgeoStability, Sasgeo, SasgeoHand, SasgeoDistinct, SasgeoStamped, SasgeoNoGraph)
+LEARNERS = {SasgeoStability, Sasgeo, SasgeoDistinct, SasgeoStamped, SasgeoNoGraph}
 
 
 def first(tiny, track, **wanted):

@@ -4,7 +4,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.joint import Blend, columns
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, Tally, rings, tally
+from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
 from sasgeo_bench.sasgeo.stamps import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.sasgeo.temper import fit_temper
@@ -77,10 +77,10 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     tallies: dict[str, list[Tally]] = {"": []}
     stamps: list[StampTally] = []
     for name, some in lessons.items():
-        found = _tallies(training.regions[name], some, switches)
-        stamps += _stamps(training.regions[name], some, switches) if switches.is_stamped else ()
-        for (query, _), one in zip(some, found, strict=True):
-            tallies.setdefault(query.season, []).append(one)
+        region = training.regions[name]
+        stamps += _stamps(region, some, switches) if switches.is_stamped else ()
+        for query, truth in some:
+            tallies.setdefault(query.season, []).append(_tally(query, truth, region, switches))
     learnt = Learnt.of(tallies)
     if switches.is_stamped:
         learnt = replace(learnt, trust=fit_trust(stamps))
@@ -123,27 +123,55 @@ def _pose(truth: Truth) -> Pose:
     return truth.pose
 
 
-def _tallies(region: Region, lessons: Sequence[tuple[Query, Truth]], switches: Switches) -> list[Tally]:
-    """What was seen on one map, at the true places."""
-    near = rings(region.layers, cell_size_m=region.grid.cell_size_m)
-    return [_tally(query, truth, region, near, switches.seen(query.evidence)) for query, truth in lessons]
+@dataclass(frozen=True, kw_only=True)
+class _Footprint:
+    """Cells of a map in the middle of each cell of a view, and which of them lie on the map."""
+
+    row: NDArray[np.int64]
+    col: NDArray[np.int64]
+    is_inside: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, grid: Grid, pose: Pose, seen: Evidence) -> Self:
+        """Where a view lies on a map."""
+        rows, cols = np.indices(seen.shape)
+        right_m = (cols - (seen.shape[1] - 1) / 2) * seen.cell_size_m
+        up_m = ((seen.shape[0] - 1) / 2 - rows) * seen.cell_size_m
+        places_m = pose.to_map(np.column_stack((right_m.ravel(), up_m.ravel())))
+        row, col = (part.reshape(seen.shape) for part in grid.to_cells(places_m).T)
+        is_inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
+        return cls(row=np.clip(row, 0, grid.rows - 1), col=np.clip(col, 0, grid.cols - 1), is_inside=is_inside)
+
+    def of_layers(self, layers: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What layers of the map have there, shape (C, rows, cols)."""
+        return np.where(self.is_inside, layers[:, self.row, self.col], np.uint8(NOWHERE))
+
+    def rings(self, region: Region) -> NDArray[np.uint8]:
+        """How far each class is there: rings of no more of the map than they need."""
+        cell_m = region.grid.cell_size_m
+        reach = math.ceil(RINGS_M[-1] / cell_m) + 1
+        top, left = max(0, int(self.row.min()) - reach), max(0, int(self.col.min()) - reach)
+        window = region.layers[:, top : int(self.row.max()) + reach + 1, left : int(self.col.max()) + reach + 1]
+        near = rings(window, cell_size_m=cell_m)
+        return np.where(self.is_inside, near[:, self.row - top, self.col - left], np.uint8(NOWHERE))
 
 
-def _tally(query: Query, truth: Truth, region: Region, near: NDArray[np.uint8], seen: Evidence) -> Tally:
-    under = _under(near, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
+def _tally(query: Query, truth: Truth, region: Region, switches: Switches) -> Tally:
+    """What was seen of a map at the true place."""
+    seen = switches.seen(query.evidence)
+    under = _Footprint.of(region.grid, _pose(truth), seen).rings(region)
     return tally(region.classes, _on_map(region, seen), under, age_years=age_years(query, region), block=truth.block)
 
 
 def _stamps(region: Region, lessons: Sequence[tuple[Query, Truth]], switches: Switches) -> list[StampTally]:
     """What was seen on one map of what was edited lately and long ago; views of a season apart, as for rates."""
-    near, stratum = rings(region.layers, cell_size_m=region.grid.cell_size_m), strata(region)
-    found = []
+    stratum, found = strata(region), []
     for query, truth in lessons:
         if not query.season:
             seen = switches.seen(query.evidence)
-            under = _under(near, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
-            stamped = _under(stratum, region.grid, _pose(truth), seen.shape, seen.cell_size_m)
-            found.append(stamp_tally(_on_map(region, seen), under, stamped, FAR))
+            there = _Footprint.of(region.grid, _pose(truth), seen)
+            stamped = there.of_layers(stratum)
+            found.append(stamp_tally(_on_map(region, seen), there.rings(region), stamped, FAR))
     return found
 
 
@@ -154,16 +182,6 @@ def _on_map(region: Region, seen: Evidence) -> NDArray[np.uint8]:
         if name in seen.classes:
             cells[at] = seen.layer(name)
     return cells
-
-
-def _under(near: NDArray[np.uint8], grid: Grid, pose: Pose, shape: tuple[int, int], cell_m: float) -> NDArray[np.uint8]:
-    """What of a map lies in the middle of each cell of a view."""
-    rows, cols = np.indices(shape)
-    right_m, up_m = (cols - (shape[1] - 1) / 2) * cell_m, ((shape[0] - 1) / 2 - rows) * cell_m
-    row, col = grid.to_cells(pose.to_map(np.column_stack((right_m.ravel(), up_m.ravel())))).T
-    inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
-    found = near[:, np.clip(row, 0, grid.rows - 1), np.clip(col, 0, grid.cols - 1)]
-    return np.asarray(np.where(inside, found, NOWHERE), dtype=np.uint8).reshape(len(near), *shape)
 
 
 def _list(query: Query, pose: Pose, reader: Reader, plan: Plan) -> _List:

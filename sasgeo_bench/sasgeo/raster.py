@@ -13,8 +13,8 @@ from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import Region
-from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, rings
-from sasgeo_bench.sasgeo.stamps import strata
+from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
+from sasgeo_bench.sasgeo.stamps import STRATA, strata
 from sasgeo_bench.sasgeo.weights import Gains, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 
@@ -71,45 +71,39 @@ def read_field(
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
-    known = _pooled(np.where((region.layers <= PRESENT).all(axis=0), FULL, 0).astype(np.uint8), around, grid)
-    layers = np.empty((len(region.classes), *grid.shape), dtype=np.uint8)
-    cell_m = region.grid.cell_size_m
+    known = _share(np.asarray((region.layers <= PRESENT).all(axis=0)), around, grid) > FULL // 2
     stamped = None if trust is None else strata(region)
+    layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
     for at, (layer, into) in enumerate(zip(region.layers, layers, strict=True)):
-        if trust is None or stamped is None:
-            degree = _likened(layer, likeness[at], cell_m)
-        else:
-            degree = _trusted(layer, likeness[at], cell_m, stamped[at], trust[at])
-        into[:] = _pooled(degree, around, grid)
-    return Field(grid=grid, layers=layers, known=np.where(known > FULL // 2, np.uint8(FULL), np.uint8(0)))
+        parts, worth = [layer == PRESENT], np.ones(1)
+        if trust is not None and stamped is not None:
+            parts, worth = [stamped[at] == index for index in range(STRATA)], trust[at]
+        into[:] = _degree([_share(part, around, grid) for part in parts], worth, likeness[at], grid)
+        into[~known] = 0
+    return Field(grid=grid, layers=layers, known=np.where(known, np.uint8(FULL), np.uint8(0)))
 
 
-def _likened(layer: NDArray[np.uint8], likeness: NDArray[np.float64], cell_m: float) -> NDArray[np.uint8]:
-    """To what degree each cell is on a class or near it, 0..FULL."""
-    table = np.zeros(NOWHERE + 1, dtype=np.uint8)
-    table[: FAR + 1] = np.rint(FULL * likeness)
-    return np.asarray(table[rings(layer[None], cell_size_m=cell_m)[0]])
-
-
-def _trusted(
-    layer: NDArray[np.uint8],
-    likeness: NDArray[np.float64],
-    cell_m: float,
-    stratum: NDArray[np.uint8],
-    trust: NDArray[np.float64],
+def _degree(
+    shares: Sequence[NDArray[np.uint8]], worth: NDArray[np.float64], likeness: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.uint8]:
-    """The same, the features of each stratum as far as they are trusted."""
-    degree = np.zeros(layer.shape, dtype=np.uint8)
-    for index, share in enumerate(trust):
-        mine = np.where((layer == PRESENT) & (stratum != index), np.uint8(ABSENT), layer)
-        if (mine == PRESENT).any():
-            np.maximum(degree, _likened(mine, share * likeness, cell_m), out=degree)
-    return degree
+    """To what degree each cell is on a class or near it, 0..FULL, of the share that each part of the class covers."""
+    on, near = (np.zeros(grid.shape, dtype=np.float32) for _ in range(2))
+    rest = np.full(grid.shape, FULL, dtype=np.float32)
+    beside = np.concatenate((likeness[1:2], likeness[1:])).astype(np.float32)  # a cell that is covered in part
+    for share, factor in zip(shares, worth.astype(np.float32), strict=True):
+        if share.any():
+            on += factor * np.float32(likeness[0]) * share
+            rest -= share
+            np.maximum(near, factor * beside[ring_of(share > 0, cell_size_m=grid.cell_size_m)], out=near)
+    return np.asarray(np.clip(np.rint(on + near * rest), 0, FULL), dtype=np.uint8)
 
 
-def _pooled(layer: NDArray[np.uint8], around: tuple[tuple[int, int], tuple[int, int]], grid: Grid) -> NDArray[np.uint8]:
-    size = (grid.cols, grid.rows)
-    return np.asarray(cv2.resize(np.pad(layer, around), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+def _share(
+    is_there: NDArray[np.bool_], around: tuple[tuple[int, int], tuple[int, int]], grid: Grid
+) -> NDArray[np.uint8]:
+    """How much of each cell is marked, 0..FULL."""
+    marked = np.pad(is_there.view(np.uint8) * np.uint8(FULL), around)
+    return np.asarray(cv2.resize(marked, (grid.cols, grid.rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def doubted(evidence: Evidence) -> Evidence:

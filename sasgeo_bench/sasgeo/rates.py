@@ -126,16 +126,26 @@ def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]
     >>> rings(row, cell_size_m=1.0)[0, 0, [0, 1, 4, 5, 12, 13]].tolist()
     [0, 1, 1, 2, 3, 4]
     """
-    made = np.empty(layers.shape, dtype=np.uint8)
-    for layer, into in zip(layers, made, strict=True):
-        if (layer == PRESENT).any():
-            distance = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            edges = [(edge_m + _SLACK_M) / cell_size_m for edge_m in (0.0, *RINGS_M)]
-            into[:] = sum(distance > edge for edge in edges)  # a sorted search takes several times as long
-        else:
-            into[:] = FAR
+    made = np.stack([ring_of(layer == PRESENT, cell_size_m=cell_size_m) for layer in layers])
     made[:, (layers > PRESENT).any(axis=0)] = NOWHERE
     return made
+
+
+def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.uint8]:
+    """How far each cell is from the nearest that is marked, as `rings` has it, shape (rows, cols).
+
+    Examples
+    --------
+    >>> ring_of(np.array([[True, False, False]]), cell_size_m=5.0).tolist()
+    [[0, 2, 3]]
+    """
+    if not is_there.any():
+        return np.full(is_there.shape, FAR, dtype=np.uint8)
+    distance = cv2.distanceTransform((~is_there).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    beyond = np.zeros(is_there.shape, dtype=np.uint8)
+    for edge_m in (0.0, *RINGS_M):
+        beyond += distance > (edge_m + _SLACK_M) / cell_size_m
+    return beyond
 
 
 def tally(

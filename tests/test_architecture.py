@@ -68,7 +68,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
         *("boardfile", "pluginfiles"),
-        *("preview", "sheet", "weightplot", "splitmap", "paperplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
+        *("preview", "sheet", "weightplot", "lookalikeplot", "splitmap", "paperplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,
     "request": None,

@@ -15,6 +15,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.lookalike import SIDE_M, find_lookalike, sheet_of
 from sasgeo_bench.sasgeo.worth import (
     AGES_YEARS,
     FITTED,
@@ -29,12 +30,17 @@ from sasgeo_bench.sasgeo.worth import (
     worth_table,
 )
 from sasgeo_bench.store.learnedfile import read_learned
+from sasgeo_bench.store.lookalikeplot import draw_lookalike
 from sasgeo_bench.store.regiondir import MANIFEST, read_region
 from sasgeo_bench.store.weightplot import WeightSheet, draw_weights, top_of
 from sasgeo_bench.taxonomy import load_taxonomy
 
 # Column of the table, what it says, what it is multiplied with. By hand the gains of Eq. 7 repeat sigma.
-WORTH: Final = ("worth", "worth of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5", 1)
+WORTH: Final = (
+    "worth",
+    "worth of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
+    1,
+)
 INFORMATION: Final = ("information", "information between map and view: thousandths of a nat a cell", 1000)
 GAINS: Final = (
     ("agree", "gain where mapped and seen (Eq. 7): nats a cell", 1),
@@ -48,7 +54,9 @@ Learned = Annotated[
 
 
 def weights_command(
-    region: Annotated[str | None, typer.Argument(help="a built region or its folder: draws a map of the weights")] = None,
+    region: Annotated[
+        str | None, typer.Argument(help="a built region or its folder: draws a map of the weights")
+    ] = None,
     learned: Learned = None,
     age: Annotated[
         list[float] | None,
@@ -76,6 +84,30 @@ def weights_command(
     if place is not None:
         for path in _drawn(place, *list(arms.values())[-1], ages=ages or [0.0], season=season, out=out):
             typer.echo(f"map of weights: {path}")
+
+
+def lookalike_command(
+    region: Annotated[str, typer.Argument(help="a built region or its folder: the map, as in vaduz@2015-07-27")],
+    world: Annotated[
+        str | None, typer.Option(help="the same region at a later date: what is seen; default: the map itself")
+    ] = None,
+    learned: Learned = None,
+    side_m: Annotated[float, typer.Option(min=64, max=1000, help="side of the view, metres")] = SIDE_M,
+    out: Out = Path("out"),
+) -> None:
+    """Draw a place, the weights of its map, and the place most like it by class shares; with the scores of both."""
+    learnt = read_learnt(learned)
+    mapped = find_region(region, out=out)
+    seen = mapped if world is None else find_region(world, out=out)
+    arm = HAND if learnt is None else FITTED
+    known = check_classes(learnt or Learnt.by_hand(mapped.classes), mapped.classes)
+    found = find_lookalike(mapped, seen, known, arm, side_m=side_m)
+    for table in (_numbers(found.scores), _numbers(found.terms)):
+        print_table(table)
+    path = out / "sheets" / f"lookalike-{mapped.manifest.id}-{mapped.manifest.extract.date}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draw_lookalike(path, sheet_of(found, mapped, known, arm))
+    typer.echo(f"lookalike: {path}")
 
 
 def read_learnt(path: Path | None) -> Learnt | None:
@@ -117,6 +149,15 @@ def _table(wide: pd.DataFrame) -> Table:
         column.justify = "right"
     for name, row in zip(wide.index, wide.to_numpy(), strict=True):
         table.add_row(name, *(f"{value:.2f}" for value in row))
+    return table
+
+
+def _numbers(frame: pd.DataFrame) -> Table:
+    table = Table(str(frame.index.name or "nats"), *frame.columns, box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, row in zip(frame.index, frame.to_numpy(), strict=True):
+        table.add_row(str(name), *(f"{value:.3f}" for value in row))
     return table
 
 

@@ -11,20 +11,29 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import PRESENT, Evidence
+from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import PriorGroup, Query
+from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.reading import Glance, Reader
+from sasgeo_bench.sasgeo.worth import rarity_map, weight_map, worth_of
 from sasgeo_bench.search.find import rank
+from sasgeo_bench.store.lookalikeplot import LookalikeSheet
+from sasgeo_bench.store.weightplot import top_of
 from sasgeo_bench.suites.base import State
 from sasgeo_bench.suites.mining import RINGS, Windows, describe, least_apart_m
 
 VARIED: Final = 0.1  # share of the places that are most varied, among which one is chosen
 LEAST_DRAWN: Final = 0.05  # of a place's ground: with less there is nothing to confuse
-GROUP: Final = PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.03)
+SIDE_M: Final = 192.0  # of the view, as in most suites
 NAMES: Final = ("true place", "lookalike")
+NOTE: Final = (
+    "Chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one whose like by the "
+    "shares of all classes is nearest; the two lie at least three footprint radii apart. They differ by {apart:.2f} "
+    "standard deviations over the map. Scores are those of the best pose within 24 m of each place, at any heading."
+)
 _CHUNK: Final = 256
 _NOTHING: Final = 1e-9
 
@@ -154,8 +163,8 @@ def find_lookalike(mapped: Region, world: Region, learnt: Learnt, arm: Switches,
         evidence=in_world.view(places[0], size_cells=size, cell_size_m=cell_m),
         observed_on=in_world.date,
         season="",
-        prior=Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=GROUP.scale_sigma),
-        prior_group=GROUP.name,
+        prior=Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0),
+        prior_group="rnone-unknown-s0",
         candidates=tuple(places),
     )
     glance = Reader.of(mapped, learnt, arm).glance(query)
@@ -212,3 +221,41 @@ def _terms(glance: Glance, poses: tuple[Pose, ...]) -> pd.DataFrame:
     graph, against = rest.T if rest.shape[1] else np.zeros((2, len(poses)))
     rows = {"raster": raster, "graph": graph, "contradiction": against, "joint": terms.sum(axis=1)}
     return pd.DataFrame(rows, index=list(NAMES)).T
+
+
+def sheet_of(found: Lookalike, mapped: Region, learnt: Learnt, arm: Switches) -> LookalikeSheet:
+    """Put what was found into words and pictures."""
+    about, side_m = mapped.manifest, found.query.evidence.size_m[0]
+    worth = worth_of(learnt, arm, age_years=found.age_years)
+    weights = weight_map(mapped.layers, worth, rarity_map(mapped))
+    apart_m = math.dist(found.pair.here_m, found.pair.there_m)
+    turned_deg = round(float(found.poses[1].yaw_deg)) % 360
+    east_m, north_m = (round(value) for value in found.pair.here_m)
+    return LookalikeSheet(
+        title=f"{about.title}: what is seen, what the map says there, and where else it says nearly the same",
+        facts=(
+            f"{side_m:g} m views, no errors of perception  |  map {found.age_years:.1f} years older than the view  |  "
+            f"scores of {'sasgeo' if arm.learns else 'sasgeo_hand'}  |  EPSG:{about.epsg}, {east_m} E, {north_m} N"
+        ),
+        view=found.query.evidence,
+        mapped=found.views[0],
+        lookalike=found.views[1],
+        weights=_cut(weights, mapped.grid, found.pair.here_m, found.query.evidence.shape[0]),
+        top=top_of([weights]),
+        worth=dict(zip(mapped.classes, worth.tolist(), strict=True)),
+        scores=found.scores,
+        terms=found.terms,
+        panels=(
+            f"a  the view, {found.query.observed_on}",
+            f"b  the map there, {about.extract.date}",
+            "c  weights of the map there",
+            f"d  the lookalike, {apart_m:.0f} m off" + (f", turned by {turned_deg}\u00b0" if turned_deg else ""),
+        ),
+        note=NOTE.format(apart=found.pair.apart),
+    )
+
+
+def _cut(raster: NDArray[np.float32], grid: Grid, at_m: tuple[float, float], size_cells: int) -> NDArray[np.float32]:
+    """The square of a raster around a place."""
+    col, row = np.rint(grid.to_uv(np.array([at_m]))[0] - size_cells / 2).astype(int).tolist()
+    return raster[row : row + size_cells, col : col + size_cells]

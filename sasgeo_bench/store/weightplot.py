@@ -111,23 +111,23 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
     side_m = (about.cols * about.cell_size_m, about.rows * about.cell_size_m)
     scale = _MAP_INCHES / max(side_m)
     wide, high = max(side_m[0] * scale, 2.2), max(side_m[1] * scale, _LEAST_INCHES)
-    total = (2 * wide + _LEGEND_INCHES + 0.75, high + 1.85)
+    total = (2 * wide + _LEGEND_INCHES + 0.75, high + 1.75)
     figure = Figure(figsize=total, dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    place = Evidence(
-        classes=about.classes, cells=shrunk(sheet.layers), cell_size_m=about.cell_size_m * factor
-    )
+    place = Evidence(classes=about.classes, cells=shrunk(sheet.layers), cell_size_m=about.cell_size_m * factor)
     charts = [
         figure.add_axes((left / total[0], 0.75 / total[1], wide / total[0], high / total[1]))
         for left in (0.25, wide + 0.4)
     ]
-    _picture(charts[0], paint(place), side_m, "what is mapped")
-    mapped = _picture(charts[1], np.where(weights < 0, np.nan, weights), side_m, "what it weighs: w", top=sheet.top)
+    picture_of(charts[0], paint(place), side_m, "what is mapped")
+    mapped = picture_of(charts[1], np.where(weights < 0, np.nan, weights), side_m, "what it weighs: w", top=sheet.top)
     scale_bar(charts[0], *side_m)
     north_arrow(charts[0], *side_m)
-    _words(figure, f"{about.title} ({about.id}): weight of the evidence", f"map of {about.extract.date}  |  {sheet.facts}")
+    words(
+        figure, f"{about.title} ({about.id}): weight of the evidence", f"map of {about.extract.date}  |  {sheet.facts}"
+    )
     bar = figure.add_axes(((wide + 0.4) / total[0], 0.56 / total[1], wide / total[0], 0.13 / total[1]))
-    _colour_bar(figure, mapped, bar)
+    colour_bar(figure, mapped, bar)
     keys = _class_keys({name: f"  {sheet.worth[name]:.2f}" for name in about.classes if about.counts.get(name)})
     if np.isnan(sheet.weights).any():
         keys.append(Patch(facecolor=HIDDEN, edgecolor="#666666", lw=0.4, label="not mapped (unknown)"))
@@ -142,13 +142,15 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
         alignment="left",
     )
     legend.get_title().set_fontsize(9)
+    note = "w sums over the classes of a cell; each dot is the strongest of its cells"
+    figure.text(0.25 / total[0], 0.38 / total[1], note, fontsize=8.5, va="bottom", color=_GREY)
     figure.text(0.25 / total[0], 0.1 / total[1], about.attribution, fontsize=9, va="bottom")
     figure.savefig(
         path, format="png", metadata={"Title": about.title, "Copyright": about.attribution, "Software": None}
     )
 
 
-def _picture(
+def picture_of(
     chart: Axes, picture: NDArray[np.generic], side_m: tuple[float, float], title: str, *, top: float | None = None
 ) -> ScalarMappable:
     """A raster in metres without ticks; values from 0 to `top` by the colours of weights."""
@@ -161,13 +163,15 @@ def _picture(
     return chart.imshow(picture, extent=box, interpolation="nearest", cmap=weight_colours(), norm=Normalize(0, top))
 
 
-def _colour_bar(figure: Figure, mapped: ScalarMappable, bar: Axes) -> None:
+def colour_bar(figure: Figure, mapped: ScalarMappable, bar: Axes) -> None:
+    """The colours of weights with their unit."""
     drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", extend="max", extendfrac=0.03)
     drawn.ax.tick_params(labelsize=8, length=2, pad=2)
-    drawn.set_label(f"w = \u03c3\u03bd, {UNIT}: what it says for a place that this is seen there", fontsize=8.5, labelpad=1)
+    drawn.set_label(f"w = \u03c3\u03bd, {UNIT} that are mapped and seen", fontsize=8.5, labelpad=1)
 
 
-def _words(figure: Figure, title: str, facts: str) -> None:
+def words(figure: Figure, title: str, facts: str) -> None:
+    """Title and a line of facts at the top."""
     width, height = figure.get_size_inches()
     figure.text(0.25 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     figure.text(0.25 / width, 1 - 0.45 / height, facts, va="top", fontsize=9, color=_GREY)

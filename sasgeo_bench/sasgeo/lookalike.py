@@ -30,9 +30,10 @@ LEAST_DRAWN: Final = 0.05  # of a place's ground: with less there is nothing to 
 SIDE_M: Final = 192.0  # of the view, as in most suites
 NAMES: Final = ("true place", "lookalike")
 NOTE: Final = (
-    "Chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one whose like by the "
-    "shares of all classes is nearest; the two lie at least three footprint radii apart. They differ by {apart:.2f} "
-    "standard deviations over the map. Scores are those of the best pose within 24 m of each place, at any heading."
+    "The place was chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one with "
+    "the nearest lookalike. A lookalike is the place nearest by the shares of all classes, at least three footprint "
+    "radii away; these two differ by {apart:.2f} standard deviations over the map. Scores are those of the best pose "
+    "within 24 m of each place, at any heading; what is seen and not mapped counts against both."
 )
 _CHUNK: Final = 256
 _NOTHING: Final = 1e-9
@@ -214,7 +215,7 @@ def _shares(view: Evidence) -> NDArray[np.float64]:
 
 
 def _terms(glance: Glance, poses: tuple[Pose, ...]) -> pd.DataFrame:
-    """Raster, graph, contradiction and their sum; the last two of `Glance.terms` are there where graphs are looked at."""
+    """Raster, graph, contradiction and their sum; an arm without a graph has the first alone."""
     terms = glance.terms(poses, glance.verified(poses))
     classes = len(glance.reader.region.classes)
     raster, rest = terms[:, :classes].sum(axis=1), terms[:, classes:]
@@ -251,6 +252,7 @@ def sheet_of(found: Lookalike, mapped: Region, learnt: Learnt, arm: Switches) ->
             "c  weights of the map there",
             f"d  the lookalike, {apart_m:.0f} m off" + (f", turned by {turned_deg}\u00b0" if turned_deg else ""),
         ),
+        worth_name="worth" if arm.learns else "\u03c3",
         note=NOTE.format(apart=found.pair.apart),
     )
 

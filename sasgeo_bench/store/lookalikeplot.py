@@ -32,9 +32,9 @@ _SHARES: Final = ("share view", "share true place", "share lookalike")
 _SCORES: Final = ("score true place", "score lookalike")
 _LEAST_SHARE: Final = 5e-4  # that is not 0.0 %
 # Right edges of the columns of numbers, inches from the left: shares, weight, scores.
-_COLUMNS: Final = (2.15, 2.85, 3.6, 4.5, 5.45, 6.2)
-_TERMS_AT: Final = (6.75, 8.45, 9.35, 10.35)  # left edge of the names, right edges of the numbers
-_NOTE_CHARS: Final = 92
+_COLUMNS: Final = (2.3, 3.0, 3.7, 4.3, 5.25, 6.05)
+_TERMS_AT: Final = (6.65, 8.75, 9.65, 10.55)  # left edge of the names, right edges of the numbers
+_NOTE_CHARS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +57,8 @@ class LookalikeSheet:
         As those of `sasgeo.lookalike.Lookalike`.
     panels : tuple of str
         A title for each of the four panels.
+    worth_name : str
+        What the weight of a class is called.
     note : str
         How the places were chosen.
     """
@@ -72,6 +74,7 @@ class LookalikeSheet:
     scores: pd.DataFrame
     terms: pd.DataFrame
     panels: tuple[str, str, str, str]
+    worth_name: str
     note: str
 
 
@@ -86,7 +89,7 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
         What is drawn.
     """
     rows = _told(sheet.scores)
-    below = 0.95 + _ROW * (max(len(rows), 8) + 3)  # colour bar, table, attribution
+    below = 0.5 + _ROW * max(len(rows) + 3, 13)  # colour bar, table, attribution
     height = 0.98 + _SIDE + below
     figure = Figure(figsize=(_WIDTH, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
@@ -120,7 +123,7 @@ def _text(figure: Figure, left: float, up: float, text: str, *, size: float = 8.
 
 def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: float) -> None:
     """Legend and table in one: a row for each class."""
-    heads = ("view", "map there", "lookalike", "\u03c3", "true place", "lookalike")
+    heads = ("view", "map there", "lookalike", sheet.worth_name, "true place", "lookalike")
     for left, title in ((_COLUMNS[2], "covers, % of the ground"), (_COLUMNS[5], "raster score (Eq. 8), nats")):
         _text(figure, left, top, title, color=_GREY, ha="right")
     for right, head in zip(_COLUMNS, heads, strict=True):

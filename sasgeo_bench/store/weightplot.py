@@ -13,11 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.region import ATTRIBUTION, Manifest
+from sasgeo_bench.region import Manifest
 from sasgeo_bench.store.preview import north_arrow, scale_bar
 from sasgeo_bench.store.sheet import GROUND, HIDDEN, paint
 from sasgeo_bench.taxonomy import load_taxonomy
@@ -63,7 +63,7 @@ def top_of(weights: Sequence[NDArray[np.float32]]) -> float:
 
 
 def shrunk(layers: NDArray[np.uint8], *, most_cells: int = _MOST_CELLS) -> NDArray[np.uint8]:
-    """Layers, shape (C, rows, cols), of no more than so many cells a side: a class is where any cell of a square has it.
+    """Layers, shape (C, rows, cols), of at most so many cells a side: a class is where any cell of a square is.
 
     Examples
     --------
@@ -137,7 +137,7 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
         bbox_to_anchor=((2 * wide + 0.6) / total[0], (0.75 + high) / total[1]),
         frameon=False,
         fontsize=9,
-        title=f"class, and its weight where\nits surroundings are as rare\nas the map's mean (\u03bd = 1)",
+        title="class, and its weight where\nits surroundings are as rare\nas the map's mean (\u03bd = 1)",
         borderaxespad=0,
         alignment="left",
     )

@@ -15,7 +15,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region queries leaderboard test check bench ageing docs lock clean
+.PHONY: help install demo list-regions build-region queries leaderboard test check bench ageing figures docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -74,6 +74,13 @@ bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, ne
 ageing: $(STAMP) ## measure docs/ageing anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
 	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make ageing EXTRACTS=~/osm" >&2; exit 2; }
 	docs/ageing/measure.sh $(abspath $(SASGEO)) "$(EXTRACTS)"
+
+figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
+	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make figures EXTRACTS=~/osm" >&2; exit 2; }
+	$(SASGEO) build-region vaduz --extracts "$(EXTRACTS)" --out $(OUT)
+	$(SASGEO) build-region vaduz --date 2015-07-27 --extracts "$(EXTRACTS)" --out $(OUT)
+	$(SASGEO) lookalike vaduz@2015-07-27 --world vaduz --out $(OUT)
+	cp $(OUT)/sheets/lookalike-vaduz-2015-07-27.png docs/figures/lookalike.png
 
 docs: $(STAMP) ## run the examples in the docstrings and follow the links between the documents; builds no site
 	$(VENV_PYTHON) -m pytest -q -p no:benchmark sasgeo_bench

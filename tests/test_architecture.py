@@ -68,7 +68,18 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
         *("boardfile", "pluginfiles"),
-        *("preview", "sheet", "splitmap", "paperplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
+        *(
+            "preview",
+            "sheet",
+            "weightplot",
+            "lookalikeplot",
+            "splitmap",
+            "paperplot",
+            "ageingplot",
+            "ageingfile",
+            "ratebookfile",
+            "catalog",
+        ),
     ),
     "build": None,
     "request": None,
@@ -80,7 +91,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "sasgeo": (
         *("rates", "seasons", "temper", "weights", "raster", "distinct"),
         *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
-        *("temporal", "joint", "learnt", "arms", "reading", "learning"),
+        *("temporal", "joint", "learnt", "arms", "worth", "reading", "lookalike", "learning"),
         *("integrity", "protection", "conformal", "frame", "rejectors", "matchers", "variants"),
     ),
     "plugins": None,
@@ -106,7 +117,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "pipeline": None,
     "scaffold": None,
     "testing": None,
-    "cli": ("console", "regions", "ageing", "queries", "looking", "matchers", "runs", "boards", "program"),
+    "cli": ("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "boards", "program"),
 }
 
 # The rooms that touch the disk, and the few calls others may make, each with its reason.

@@ -23,6 +23,7 @@ from sasgeo_bench.cli.matchers import (
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
 from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
+from sasgeo_bench.cli.weights import lookalike_command, weights_command
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.results import one_line
@@ -49,6 +50,8 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "make-queries": make_queries_command,
     "inspect": inspect_command,
     "verify": verify_command,
+    "weights": weights_command,
+    "lookalike": lookalike_command,
     "list-matchers": list_matchers_command,
     "list-rejectors": list_rejectors_command,
     "new-matcher": new_matcher_command,

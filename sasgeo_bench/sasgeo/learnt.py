@@ -203,7 +203,7 @@ class Learnt:
                 views=int(said["views"]),
                 blocks=int(said["blocks"]),
             )
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             message = f"what was learnt cannot be read ({error}): learn it again"
             raise ConfigError(message) from error
 

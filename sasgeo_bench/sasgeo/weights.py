@@ -5,12 +5,11 @@ Eq. 5 lets a class fade as the map ages. Here map and world disagree both ways, 
 gains of Eq. 7 follow as log-likelihood ratios: as a class stops saying anything, they go to nothing by themselves.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import ABSENT, PRESENT
@@ -166,8 +165,10 @@ def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], 
     return weights, known
 
 
-def information(rates: ClassRates, *, age_years: float) -> float:
+def information(rates: ClassRates, *, age_years: float, persists: float = 1.0) -> float:
     """Mutual information between the map and what is seen of a class, nats a cell: what the class is worth.
+
+    `persists` is the seasonal factor of the class, as in `likelihood_gains`.
 
     Examples
     --------
@@ -177,26 +178,9 @@ def information(rates: ClassRates, *, age_years: float) -> float:
     >>> information(rail, age_years=0.0) > information(rail, age_years=5.0) > information(rail, age_years=50.0)
     True
     """
-    agree, extra, missed, quiet = _ratios(rates, age_years, 1.0)
-    survival, unmapped = rates.survival(age_years), rates.unmapped(age_years)
+    agree, extra, missed, quiet = _ratios(rates, age_years, persists)
+    survival, unmapped = rates.survival(age_years) * persists, rates.unmapped(age_years)
     mapped, empty = (share * rates.hit + (1 - share) * rates.false_alarm for share in (survival, unmapped))
     where_mapped = mapped * agree + (1 - mapped) * missed
     elsewhere = empty * extra + (1 - empty) * quiet
     return rates.mapped * where_mapped + (1 - rates.mapped) * elsewhere
-
-
-def worth_table(rates: Mapping[str, ClassRates], *, ages_years: Sequence[float] = (0, 2, 5, 10, 20)) -> pd.DataFrame:
-    """What each class is worth as the map ages: gains and information, a row for each class and age.
-
-    Examples
-    --------
-    >>> worth_table({}).columns.tolist()[:2]
-    ['class', 'age_years']
-    """
-    columns = ("class", "age_years", "agree", "extra", "missed", "quiet", "information")
-    rows = [
-        (name, float(age), *_ratios(one, age, 1.0), information(one, age_years=age))
-        for name, one in rates.items()
-        for age in ages_years
-    ]
-    return pd.DataFrame(rows, columns=list(columns))

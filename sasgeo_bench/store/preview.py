@@ -57,8 +57,8 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     chart.set_xticks([])
     chart.set_yticks([])
     chart.set_anchor("NW")
-    _scale_bar(chart, *side_m)
-    _north_arrow(chart, *side_m)
+    scale_bar(chart, *side_m)
+    north_arrow(chart, *side_m)
     _words(figure, manifest, total)
     _legend(figure, manifest, overview, left=(width + 0.45) / total[0], top=1 - _TITLE_INCHES / total[1])
     figure.savefig(
@@ -88,8 +88,8 @@ def _picture(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.floa
     return picture
 
 
-def _scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
-    """A bar of a round length, about a fifth of the width."""
+def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
+    """A bar of a round length, about a fifth of the width, in the lower left corner of a chart in metres."""
     goal = width_m / 4
     power = 10.0 ** np.floor(np.log10(goal))
     length_m = float(max(step * power for step in (1, 2, 5) if step * power <= goal))
@@ -109,7 +109,8 @@ def _scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
     chart.text(left + length_m / 2, bottom + thick + 0.4 * pad, text, ha="center", va="bottom", fontsize=9)
 
 
-def _north_arrow(chart: Axes, width_m: float, height_m: float) -> None:
+def north_arrow(chart: Axes, width_m: float, height_m: float) -> None:
+    """An arrow with an N in the upper right corner of a chart in metres."""
     size = 0.05 * max(width_m, height_m)
     x, y = width_m - 0.9 * size, height_m - 1.5 * size
     chart.add_patch(

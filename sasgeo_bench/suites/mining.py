@@ -20,7 +20,7 @@ STRIDE_M: Final = 32.0
 LEAST_RADII: Final = 3.0  # no decoy nearer to the truth, in footprint radii (half diagonals)
 
 _COARSE_M: Final = 8.0
-_RINGS: Final = 4
+RINGS: Final = 4
 _SECTORS: Final = 12
 _FAR_M: Final = 64.0  # distances are cut here: farther than this is far
 _THIN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "building")
@@ -76,7 +76,7 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
     grid = state.grid.coarsen(factor)
     known = _mean_blocks(state.known, factor)
     radius = side_m / 2 / grid.cell_size_m
-    kernels = _rings(radius, _RINGS)
+    kernels = _rings(radius, RINGS)
     step = max(1, round(STRIDE_M / grid.cell_size_m))
     rows, cols = np.meshgrid(
         np.arange(step // 2, grid.rows, step), np.arange(step // 2, grid.cols, step), indexing="ij"
@@ -93,7 +93,7 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
             for kernel in kernels
         ],
         axis=1,
-    ).reshape(len(cells), len(state.classes), _RINGS)
+    ).reshape(len(cells), len(state.classes), RINGS)
     drawn = [index for index, name in enumerate(state.classes) if name in (*DRAWN_CLASSES, "water")]
     areas = np.array([kernel.size for kernel in kernels], dtype=np.float32)
     polar = _polar(state, factor, cells, radius)
@@ -140,7 +140,7 @@ def _filtered(share: Floats, kernel: Floats) -> Floats:
 def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -> Floats:
     """Cut distances to thin classes, sampled on rings and sectors, shape (N, classes * rings, sectors), 0..1."""
     turns = np.arange(_SECTORS) * 2 * np.pi / _SECTORS
-    reach = radius * (np.arange(_RINGS) + 0.5) / _RINGS
+    reach = radius * (np.arange(RINGS) + 0.5) / RINGS
     down = np.rint(-np.cos(turns)[None, :] * reach[:, None]).astype(int)  # sector 0 is north, the next one clockwise
     right = np.rint(np.sin(turns)[None, :] * reach[:, None]).astype(int)
     found = []

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.sasgeo.rates import ClassRates
-from sasgeo_bench.sasgeo.weights import hand_gains, information, likelihood_gains, weigh, worth_table
+from sasgeo_bench.sasgeo.weights import hand_gains, information, likelihood_gains, weigh
 from sasgeo_bench.taxonomy import load_taxonomy
 
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
@@ -37,13 +37,6 @@ def test_a_class_that_tells_nothing_is_silent():
         parts = (gains.agree, gains.extra, gains.missed, gains.quiet)
         assert [float(part[0]) for part in parts] == pytest.approx([0, 0, 0, 0], abs=1e-9)
         assert information(rates, age_years=age) == pytest.approx(0, abs=1e-9)
-
-
-def test_gains_shrink_as_the_map_ages():
-    worth = worth_table({"building": HOUSE})
-    for column in ("agree", "information"):
-        assert worth[column].is_monotonic_decreasing
-    assert worth["missed"].is_monotonic_increasing
 
 
 def test_a_class_out_of_season_counts_for_less():

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that show what classes and places are worth to the SASGeo scorer."""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final
+
+import pandas as pd
+import typer
+from rich.table import Table
+
+from sasgeo_bench.cli.console import Out, print_table
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.region import Region
+from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.lookalike import SIDE_M, find_lookalike, sheet_of
+from sasgeo_bench.sasgeo.worth import (
+    AGES_YEARS,
+    FITTED,
+    HAND,
+    check_age,
+    check_classes,
+    check_season,
+    rarity_map,
+    side_by_side,
+    weight_map,
+    worth_of,
+    worth_table,
+)
+from sasgeo_bench.store.learnedfile import read_learned
+from sasgeo_bench.store.lookalikeplot import draw_lookalike
+from sasgeo_bench.store.regiondir import MANIFEST, read_region
+from sasgeo_bench.store.weightplot import WeightSheet, draw_weights, top_of
+from sasgeo_bench.taxonomy import load_taxonomy
+
+# Column of the table, what it says, what it is multiplied with. By hand the gains of Eq. 7 repeat sigma.
+WORTH: Final = (
+    "worth",
+    "worth of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
+    1,
+)
+INFORMATION: Final = ("information", "information between map and view: thousandths of a nat a cell", 1000)
+GAINS: Final = (
+    ("agree", "gain where mapped and seen (Eq. 7): nats a cell", 1),
+    ("extra", "gain where seen and not mapped: nats a cell", 1),
+    ("missed", "gain where mapped and seen to be absent: nats a cell", 1),
+    ("quiet", "gain where neither mapped nor seen: nats a cell", 1),
+)
+Learned = Annotated[
+    Path | None, typer.Option(help="what a matcher has learnt: out/runs/<matcher>/<hash>/learned/<sha>.json")
+]
+
+
+def weights_command(
+    region: Annotated[
+        str | None, typer.Argument(help="a built region or its folder: draws a map of the weights")
+    ] = None,
+    learned: Learned = None,
+    age: Annotated[
+        list[float] | None,
+        typer.Option(metavar="YEARS", help="of the map; may be repeated; default: 0 2 5 10 20, and 0 for the picture"),
+    ] = None,
+    season: Annotated[str, typer.Option(help="of the view: leaf_on, snow, low_water or harvest; default: none")] = "",
+    out: Out = Path("out"),
+) -> None:
+    """Say what each class is worth to the scorer as the map ages; of a region draw the weight of each cell."""
+    ages = sorted({check_age(one) for one in age or ()})
+    check_season(season)
+    learnt = read_learnt(learned)
+    place = None if region is None else find_region(region, out=out)
+    classes = load_taxonomy().names if place is None else place.classes
+    arms: dict[str, tuple[Learnt, Switches]] = {"hand": (Learnt.by_hand(classes), HAND)}
+    if learnt is not None:
+        arms["fitted"] = (check_classes(learnt, () if place is None else place.classes), FITTED)
+    tables = {
+        name: worth_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
+        for name, (known, arm) in arms.items()
+    }
+    for column, title, factor in (WORTH, *(GAINS if learnt else ()), INFORMATION):
+        typer.echo(title)
+        print_table(_table(side_by_side(tables, column) * factor))
+    if place is not None:
+        for path in _drawn(place, *list(arms.values())[-1], ages=ages or [0.0], season=season, out=out):
+            typer.echo(f"map of weights: {path}")
+
+
+def lookalike_command(
+    region: Annotated[str, typer.Argument(help="a built region or its folder: the map, as in vaduz@2015-07-27")],
+    world: Annotated[
+        str | None, typer.Option(help="the same region at a later date: what is seen; default: the map itself")
+    ] = None,
+    learned: Learned = None,
+    side_m: Annotated[float, typer.Option(min=64, max=1000, help="side of the view, metres")] = SIDE_M,
+    out: Out = Path("out"),
+) -> None:
+    """Draw a place, the weights of its map, and the place most like it by class shares; with the scores of both."""
+    learnt = read_learnt(learned)
+    mapped = find_region(region, out=out)
+    seen = mapped if world is None else find_region(world, out=out)
+    arm = HAND if learnt is None else FITTED
+    known = check_classes(learnt or Learnt.by_hand(mapped.classes), mapped.classes)
+    found = find_lookalike(mapped, seen, known, arm, side_m=side_m)
+    for table in (_numbers(found.scores), _numbers(found.terms)):
+        print_table(table)
+    path = out / "sheets" / f"lookalike-{mapped.manifest.id}-{mapped.manifest.extract.date}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draw_lookalike(path, sheet_of(found, mapped, known, arm))
+    typer.echo(f"lookalike: {path}")
+
+
+def read_learnt(path: Path | None) -> Learnt | None:
+    """What was learnt, of classes that this program knows; None where no file is named."""
+    if path is None:
+        return None
+    text = read_learned(path)
+    if text is None:
+        message = f"there is no file {path}: name a .json of out/runs/<matcher>/<hash>/learned/"
+        raise ConfigError(message)
+    try:
+        return check_classes(Learnt.from_text(text))
+    except ConfigError as error:
+        message = f"{path} is nothing that a sasgeo matcher has learnt: {error}"
+        raise ConfigError(message) from error
+
+
+def find_region(name: str, *, out: Path) -> Region:
+    """Read a built region by its name or folder; a refusal suggests the nearest name."""
+    folder = Path(name) if (Path(name) / MANIFEST).is_file() else out / "regions" / name
+    if not (folder / MANIFEST).is_file():
+        built = sorted(path.parent.name for path in (out / "regions").glob(f"*/{MANIFEST}"))
+        near = difflib.get_close_matches(name, built, n=1)
+        hint = f", did you mean {near[0]!r}?" if near else ": build-region it first"
+        message = f"{out / 'regions'} holds no region {name!r}{hint}"
+        raise ConfigError(message)
+    region = read_region(folder)
+    strange = [item for item in region.classes if item not in load_taxonomy().names]
+    if strange:
+        message = f"{folder} has a class {strange[0]!r} that this version does not know: build the region again"
+        raise ConfigError(message)
+    return region
+
+
+def _table(wide: pd.DataFrame) -> Table:
+    columns = [f"{name}\n{age:g} y" for name, age in wide.columns]
+    table = Table("class", *columns, box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, row in zip(wide.index, wide.to_numpy(), strict=True):
+        table.add_row(name, *(f"{value:.2f}" for value in row))
+    return table
+
+
+def _numbers(frame: pd.DataFrame) -> Table:
+    table = Table(str(frame.index.name or "nats"), *frame.columns, box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, row in zip(frame.index, frame.to_numpy(), strict=True):
+        table.add_row(str(name), *(f"{value:.3f}" for value in row))
+    return table
+
+
+def _drawn(
+    region: Region, learnt: Learnt, arm: Switches, *, ages: Sequence[float], season: str, out: Path
+) -> list[Path]:
+    """Draw a map of weights for each age, all by one scale of colours."""
+    rarity = rarity_map(region)
+    worth = {age: worth_of(learnt, arm, age_years=age, season=season) for age in ages}
+    maps = {age: weight_map(region.layers, worth[age], rarity) for age in ages}
+    top = top_of(list(maps.values()))
+    weights = "weights fitted" if arm.learns else "weights by hand"
+    (out / "sheets").mkdir(parents=True, exist_ok=True)
+    paths = []
+    for age in ages:
+        sheet = WeightSheet(
+            manifest=region.manifest,
+            layers=region.layers,
+            weights=maps[age],
+            worth=dict(zip(region.classes, worth[age].tolist(), strict=True)),
+            top=top,
+            facts=f"taken to be {age:g} years old  |  season: {season or 'none told'}  |  {weights}",
+        )
+        name = f"{region.manifest.id}-{region.manifest.extract.date}-{age:g}y{f'-{season}' if season else ''}"
+        paths.append(out / "sheets" / f"weights-{name}{'-fitted' if arm.learns else ''}.png")
+        draw_weights(paths[-1], sheet)
+    return paths

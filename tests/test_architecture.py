@@ -68,7 +68,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
         *("boardfile", "pluginfiles"),
-        *("preview", "sheet", "splitmap", "paperplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
+        *("preview", "sheet", "splitmap", "paperplot", "boardplot", "ageingplot", "ageingfile", "ratebookfile", "catalog"),
     ),
     "build": None,
     "request": None,
@@ -97,11 +97,12 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
         *("latex", "protection"),
-        *("paper", "papertext", "plots", "site"),
+        *("paper", "papertext", "plottables", "plots", "site"),
     ),
     "boardtasks": None,
     "entries": None,
     "boards": None,
+    "boardfigures": None,
     "paperboard": None,
     "pipeline": None,
     "scaffold": None,

@@ -124,4 +124,3 @@ def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named
             _file_name("stanford", f"{risk:g}", prior_group),
             partial(draw_stanford, told=told, limit_m=FIX_M),
         )
-

@@ -223,9 +223,7 @@ def by_place(
     )
 
 
-def _at_place(
-    contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, place: str, draws: int
-) -> PlaceDifference:
+def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, place: str, draws: int) -> PlaceDifference:
     blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
     drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=draws)
     if contrast.metric == "primary":

@@ -47,7 +47,7 @@ def draw_steps(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """
     first = rows.iloc[0]
     note = f"Strength 0: the controls, the same places with nothing done to the view. {_INTERVALS}"
-    _draw_lines(path, rows, shown, f"Success against strength: {_of(first)}", note, ("strength", str(first["unit"])))
+    _draw_lines(path, rows, shown, f"Success against strength: {_of(first)}", note, ("strength", str(first["strength_unit"])))
 
 
 def draw_ages(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -210,7 +210,9 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
         From `contrasts.by_place`.
     """
     is_mean = contrast.metric == "primary"
-    what = PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_mean else "area under risk against coverage"
+    what = (
+        PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_mean else "area under risk against coverage"
+    )
     better = f"right of 0: {contrast.first} is better" if is_mean else f"left of 0: {contrast.first} is better"
     least = contrast.min_effect * (1.0 if is_mean else abs(finding.second_value))
     kinds = f", kinds {', '.join(contrast.kinds)}" if contrast.kinds else ""
@@ -267,9 +269,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     first = rows.iloc[0]
     cells = [(name, mixture) for name in names for mixture in mixtures]
     columns = min(_ACROSS, len(cells)) if len(mixtures) == 1 else len(mixtures)
-    pooled = (
-        " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
-    )
+    pooled = " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
     about = Page(
         title=f"Risk against coverage: {_of(first)}",
         note=(
@@ -424,7 +424,12 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_
         for line, name in zip(charts, names, strict=True):
             for chart, method in zip(line, methods, strict=True):
                 item = told.get((name, method))
-                chart.set_title(f"{name}, {method}" + ("" if item is None else f"\nn {len(item.level_m)}"), fontsize=8, loc="left", pad=3)
+                chart.set_title(
+                    f"{name}, {method}" + ("" if item is None else f"\nn {len(item.level_m)}"),
+                    fontsize=8,
+                    loc="left",
+                    pad=3,
+                )
                 _stanford_axes(chart, limit_m)
                 if item is not None:
                     _stanford(chart, item, cells[name, method], limit_m, most)

@@ -88,12 +88,12 @@ def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]
     Returns
     -------
     pandas.DataFrame
-        Rows of the leaderboard with the columns kind, strength, unit and view_cells; controls stand at strength 0 of
+        Rows of the leaderboard with the columns kind, strength, strength_unit and view_cells; controls stand at strength 0 of
         each kind. A size of view is a part of its own: not every size has every step.
     """
     places = pd.DataFrame(_ladders(queries))
     if places.empty:
-        return pd.DataFrame(columns=[*table.columns, "kind", "strength", "unit", "view_cells"])
+        return pd.DataFrame(columns=[*table.columns, "kind", "strength", "strength_unit", "view_cells"])
     rows = table[(table["rejector"] == "") & table["matcher"].isin(list(shown)) & table["value"].notna()]
     return _primary(rows).merge(places, on=[*GROUP, "stratum"], how="inner")
 
@@ -113,7 +113,7 @@ def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
         for kind, mine in stress.groupby("kind", sort=True):
             if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
                 continue
-            said = {**dict(zip(GROUP, key, strict=True)), "kind": kind, "unit": mine["strength_unit"].iloc[0]}
+            said = {**dict(zip(GROUP, key, strict=True)), "kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
             steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})
             for strength, size in steps:
                 name = step_name(str(kind), strength, size)
@@ -123,9 +123,7 @@ def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
                 yield {**said, "stratum": name, "strength": 0.0, "view_cells": size}
 
 
-def ages_frame(
-    steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str, Mapping[str, float]]
-) -> pd.DataFrame:
+def ages_frame(steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
     """Those steps that are ages of a map, with the ages that the maps really had.
 
     Parameters

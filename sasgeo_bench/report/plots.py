@@ -27,6 +27,7 @@ _INTERVALS: Final = (
     "n: queries of each point."
 )
 _ACROSS: Final = 4  # panels beside each other
+_HALVES: Final = (0.0, 0.5, 1.0)
 _DODGE: Final = 0.011  # of an axis, between two matchers at one step
 
 
@@ -92,13 +93,13 @@ def _draw_lines(
         for line, kind in zip(charts, kinds, strict=True):
             for chart, size in zip(line, sizes, strict=True):
                 mine = rows[(rows["kind"] == kind) & (rows["view_cells"] == size)]
-                chart.set_title(f"{kind}, view of {size} cells", fontsize=8.5, loc="left", pad=4)
-                chart.set_xlim(-0.06 * high, 1.08 * high)
+                chart.set_title(f"{kind}, view of {size:g} cells", fontsize=8.5, loc="left", pad=4)
+                chart.set_xlim(-0.1 * high, 1.1 * high)
                 _dress_share(chart)
                 if chart is not line[0]:
                     chart.tick_params(labelleft=False)
-                if mine.empty:
-                    chart.text(0.5, 0.5, "none drawn", ha="center", color=GREY, transform=chart.transAxes)
+                if mine.empty:  # not every kind is drawn at every size
+                    chart.set_visible(False)
                 for number, name in enumerate(names):
                     shift = _DODGE * high * (number - (len(names) - 1) / 2)
                     _line(chart, mine[mine["matcher"] == name].sort_values(column), column, number, shift)
@@ -128,7 +129,7 @@ def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
     """How many queries each step has, at the foot of a panel."""
     for at, part in mine.groupby(column, sort=True):
         counts = sorted(set(part["n"]))
-        text = f"n {counts[0]}" if len(counts) == 1 else f"n {counts[0]}-{counts[-1]}"
+        text = f"n {counts[0]:g}" if len(counts) == 1 else f"n {counts[0]:g}-{counts[-1]:g}"
         chart.text(float(str(at)), -0.115, text, fontsize=5.5, ha="center", color=GREY)
         if column == "age_years":
             ends = part.iloc[0]
@@ -140,7 +141,7 @@ def _label_below(charts: Sequence[Axes], label: str) -> None:
     boxes = [chart.get_position() for chart in charts]
     figure = charts[0].figure
     height = figure.get_figheight()  # type: ignore[union-attr]
-    figure.text((boxes[0].x0 + boxes[-1].x1) / 2, boxes[0].y0 - 0.42 / height, label, ha="center", fontsize=8.5)
+    figure.text((boxes[0].x0 + boxes[-1].x1) / 2, boxes[0].y0 - 0.42 / height, label, ha="center", va="center", fontsize=8.5)
 
 
 def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -165,6 +166,7 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         columns=columns,
         panel_inches=(1.9, 0.3 + 0.19 * len(names)),
         left_inches=0.35 + 0.075 * max(map(len, names)),
+        gap_inches=0.42,
         row_gap_inches=0.62,
     )
     with page(path, about) as charts:
@@ -175,7 +177,8 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
                 continue
             mine = rows[rows["suite"] == suites[number]]
             counts = mine.iloc[0]
-            chart.set_title(f"{suites[number]}\nn {counts['n']}, {counts['blocks']} blocks", fontsize=8, loc="left")
+            head = f"{suites[number]}\nn {counts['n']:g}, {counts['blocks']:g} blocks"
+            chart.set_title(head, fontsize=8, loc="left")
             _bars(chart, mine, names)
             if number % columns:
                 chart.set_yticklabels([])
@@ -192,7 +195,7 @@ def _bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
     chart.set_yticks(range(len(names)), list(names))
     chart.set_ylim(len(names) - 0.4, -0.6)
     chart.set_xlim(0.0, 1.0)
-    chart.set_xticks([0.0, 0.5, 1.0])
+    chart.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])
     chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
     chart.tick_params(axis="y", length=0)
 
@@ -246,7 +249,7 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
         chart.set_xlim(-1.06 * max([*ends, least]), 1.06 * max([*ends, least]))
         chart.tick_params(axis="y", length=0)
         chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
-        _label_below(charts[0], f"difference of {what}; {better}")
+        _label_below(charts[0], f"difference of {what}\n{better}")
 
 
 # --- what is known of the answers -------------------------------------------------------------------------------------
@@ -297,11 +300,11 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             chart.set_title(f"{head}\n{_counts(mine)}", fontsize=7.5, loc="left", pad=3)
             _risk_lines(chart, mine, rejectors)
             chart.set_xlim(0.0, 1.0)
+            chart.set_xticks(_HALVES)
             chart.set_ylim(0.0, max(high, 0.02))
             chart.grid(visible=True, color=FAINT, lw=0.6)
-            if number % columns:
-                chart.tick_params(labelleft=False)
-            else:
+            chart.tick_params(labelleft=number % columns == 0, labelbottom=number + columns >= len(cells))
+            if number % columns == 0:
                 chart.set_ylabel("risk\n(share of accepted)")
         _label_below(charts[-1], "coverage (share of queries accepted)")
 
@@ -341,8 +344,8 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
     about = Page(
         title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
         note=(
-            "Answers alone, in ten bins with equally many of them where P differs; the small number is n, the answers "
-            "of a bin. Lines: Wilson's 95 % intervals of as many trials as the bin has sites. On the diagonal answers "
+            "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; beside a point, where "
+            "there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has sites. On the diagonal answers "
             "are false as often as was said; above it more often."
         ),
         rows=len(names),
@@ -354,16 +357,23 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
         for line, name in zip(charts, names, strict=True):
             for chart, rejector in zip(line, rejectors, strict=True):
                 mine = rows[(rows["matcher"] == name) & (rows["rejector"] == rejector)]
-                chart.set_title(f"{name}\nx {rejector}, n {mine['n'].sum()}", fontsize=7.5, loc="left", pad=3)
+                chart.set_title(f"{name} x {rejector}\n{_bin_counts(mine)}", fontsize=7, loc="left", pad=3)
                 chart.plot([0, 1], [0, 1], color="#999999", lw=0.8)
                 _reliable(chart, mine)
                 chart.set_xlim(-0.03, 1.03)
                 chart.set_ylim(-0.03, 1.03)
+                chart.set_xticks(_HALVES)
+                chart.set_yticks(_HALVES)
                 chart.grid(visible=True, color=FAINT, lw=0.6)
-                if chart is not line[0]:
-                    chart.tick_params(labelleft=False)
+                chart.tick_params(labelleft=chart is line[0], labelbottom=line is charts[-1])
             line[0].set_ylabel("false (share of answers)")
         _label_below(charts[-1], "said to be false (P, mean of the bin)")
+
+
+def _bin_counts(mine: pd.DataFrame) -> str:
+    """How many answers there are, and in each bin."""
+    counts = mine["n"]
+    return f"n {counts.sum():g}, {counts.min():g}-{counts.max():g} in each of {len(mine)} bins" if len(mine) else ""
 
 
 def _reliable(chart: Axes, mine: pd.DataFrame) -> None:
@@ -424,19 +434,21 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_
         for line, name in zip(charts, names, strict=True):
             for chart, method in zip(line, methods, strict=True):
                 item = told.get((name, method))
-                chart.set_title(
-                    f"{name}, {method}" + ("" if item is None else f"\nn {len(item.level_m)}"),
-                    fontsize=8,
-                    loc="left",
-                    pad=3,
-                )
+                chart.set_title(f"{name}, {method}\n{_available(item, limit_m)}", fontsize=8, loc="left", pad=3)
                 _stanford_axes(chart, limit_m)
                 if item is not None:
                     _stanford(chart, item, cells[name, method], limit_m, most)
-                if chart is not line[0]:
-                    chart.tick_params(labelleft=False)
+                chart.tick_params(labelleft=chart is line[0], labelbottom=line is charts[-1])
             line[0].set_ylabel("protection level (m)")
         _label_below(charts[-1], "position error (m)")
+
+
+def _available(item: ToldLevels | None, limit_m: float) -> str:
+    """How many queries there are, and of how many there is a level that holds and can be flown with."""
+    if item is None:
+        return "tells none"
+    total, count = len(item.level_m), stanford_areas(item, limit_m)["available"]
+    return f"n {total}, available {count} ({count / max(total, 1):.1%})"
 
 
 def _stanford_axes(chart: Axes, limit_m: float) -> None:
@@ -465,14 +477,16 @@ def _stanford(chart: Axes, item: ToldLevels, cells: pd.DataFrame, limit_m: float
         cmap=colormaps["Blues"],
         norm=LogNorm(vmin=0.4, vmax=max(most, 2)),
         marker="s",
-        s=9,
+        s=13,
         linewidths=0,
     )
     total = len(item.level_m)
-    at = {"unavailable": (0.04, 0.93), "available": (0.04, 0.5), "misleading": (0.3, 0.03), "hazardous": (0.99, 0.3)}
-    for area, count in stanford_areas(item, limit_m).items():
+    at = {"unavailable": (0.04, 0.93), "misleading": (0.3, 0.03), "hazardous": (0.99, 0.3)}
+    counts = stanford_areas(item, limit_m)
+    for area, place in at.items():
+        count = counts[area]
         chart.text(
-            *at[area],
+            *place,
             f"{area} {count}\n({count / max(total, 1):.1%})",
             transform=chart.transAxes,
             fontsize=5.8,

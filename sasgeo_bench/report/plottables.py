@@ -25,7 +25,7 @@ AS_DRAWN: Final = "as drawn"
 AGE: Final = "age_years"  # as truths say that it was measured
 GROUP: Final = ("suite", "track", "prior_group")
 _MOST_POINTS: Final = 80  # of a curve: more cannot be seen, and make a file large
-_CELLS_PER_DECADE: Final = 10
+_CELLS_PER_DECADE: Final = 8
 LEAST_M: Final = 0.1  # what is less is drawn here
 MOST_M: Final = 1000.0  # what is more, or infinite, is drawn beyond
 BEYOND_M: Final = 1500.0
@@ -264,7 +264,7 @@ def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[dict[str, float]]
 
 
 def stanford_cells(told: ToldLevels) -> pd.DataFrame:
-    """Queries counted in cells of error and level, ten to a decade on each side.
+    """Queries counted in cells of error and level, eight to a decade on each side.
 
     Returns
     -------
@@ -278,7 +278,7 @@ def stanford_cells(told: ToldLevels) -> pd.DataFrame:
 def _middles(values_m: Floats) -> Floats:
     """Middle of the cell of each value."""
     within = np.log10(np.clip(values_m, LEAST_M, MOST_M))
-    step = np.minimum(np.floor(within * _CELLS_PER_DECADE), np.log10(MOST_M) * _CELLS_PER_DECADE - 1)
+    step = np.minimum(np.floor(within * _CELLS_PER_DECADE), round(np.log10(MOST_M) * _CELLS_PER_DECADE) - 1)
     middles = 10 ** ((step + 0.5) / _CELLS_PER_DECADE)
     return np.asarray(np.where(values_m > MOST_M, BEYOND_M, middles))
 

@@ -48,7 +48,9 @@ def draw_steps(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """
     first = rows.iloc[0]
     note = f"Strength 0: the controls, the same places with nothing done to the view. {_INTERVALS}"
-    _draw_lines(path, rows, shown, f"Success against strength: {_of(first)}", note, ("strength", str(first["strength_unit"])))
+    _draw_lines(
+        path, rows, shown, f"Success against strength: {_of(first)}", note, ("strength", str(first["strength_unit"]))
+    )
 
 
 def draw_ages(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -141,7 +143,9 @@ def _label_below(charts: Sequence[Axes], label: str) -> None:
     boxes = [chart.get_position() for chart in charts]
     figure = charts[0].figure
     height = figure.get_figheight()  # type: ignore[union-attr]
-    figure.text((boxes[0].x0 + boxes[-1].x1) / 2, boxes[0].y0 - 0.42 / height, label, ha="center", va="center", fontsize=8.5)
+    figure.text(
+        (boxes[0].x0 + boxes[-1].x1) / 2, boxes[0].y0 - 0.42 / height, label, ha="center", va="center", fontsize=8.5
+    )
 
 
 def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -345,8 +349,8 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
         title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
         note=(
             "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; beside a point, where "
-            "there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has sites. On the diagonal answers "
-            "are false as often as was said; above it more often."
+            "there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has sites. On "
+            "the diagonal answers are false as often as was said; above it more often."
         ),
         rows=len(names),
         columns=len(rejectors),

@@ -88,8 +88,8 @@ def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]
     Returns
     -------
     pandas.DataFrame
-        Rows of the leaderboard with the columns kind, strength, strength_unit and view_cells; controls stand at strength 0 of
-        each kind. A size of view is a part of its own: not every size has every step.
+        Rows of the leaderboard with the columns kind, strength, strength_unit and view_cells; controls stand at
+        strength 0 of each kind. A size of view is a part of its own: not every size has every step.
     """
     places = pd.DataFrame(_ladders(queries))
     if places.empty:

@@ -95,6 +95,8 @@ class Board:
     """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
 
     `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
+    `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id.
+    `everyone` are the entries with those who were asked nothing but controls; so are the predictions.
     """
 
     entries: tuple[Entry, ...]
@@ -106,6 +108,9 @@ class Board:
     tasks: tuple[dict[str, Any], ...] = field(default=())
     remarks: tuple[str, ...] = ()
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
+    judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
+    measured: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    everyone: tuple[Entry, ...] = ()
 
 
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
@@ -187,6 +192,9 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         tasks=tuple(task.about for task in tasks),
         remarks=remarks,
         protection=_protection(scores, predictions, request.split),
+        judged={key: frame for key, frame in all_judged.items() if len(frame)},
+        measured={truth.query_id: truth.measured for task in tasks for truth in task.truths},
+        everyone=tuple(item.entry for item in told),
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board

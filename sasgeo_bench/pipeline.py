@@ -8,8 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.packing import pack_board
 from sasgeo_bench.paper import made_paper_task, make_paper_task
 from sasgeo_bench.paper.task import region_name
 from sasgeo_bench.paperboard import paper_extra
@@ -263,7 +265,9 @@ def _silent(line: str) -> None:
     del line
 
 
-def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = None) -> Board:
+def run_pipeline(
+    plan: PipelinePlan, *, tell: Tell, progress: Progress | None = None, results: Path | None = None
+) -> Board:
     """Draw what is missing, run what has no row, score all of it and write the board.
 
     Parameters
@@ -274,6 +278,8 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
         Gets a line for every step.
     progress : Progress, optional
         Is told of every answer.
+    results : Path, optional
+        Folder to store the board in, with the answers and truths it was made of, as <id>/.
 
     Returns
     -------
@@ -284,6 +290,8 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
     ------
     ConfigError
         If no region can carry any of the suites.
+    StoreError
+        As `packing.pack_board` does; the board itself is then written.
     """
     tasks = [*_draw(plan.requests, tell), *_draw_paper(plan, tell)]
     if not tasks:
@@ -293,20 +301,26 @@ def run_pipeline(plan: PipelinePlan, *, tell: Tell, progress: Progress | None = 
     folders = [folder for spec in plan.matchers for folder in _run(plan, spec, [*tasks, *controls], tell, progress)]
     if REFERENCE not in plan.matchers:
         folders += _run(plan, REFERENCE, controls, tell, progress)
-    request_board = ScoreRequest(
+    split = plan.requests[0].split if plan.requests else None
+    contrasts = _contrasts(plan.spec)
+    figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
+    request = ScoreRequest(
         predictions=folders,
         tasks=[*tasks, *controls],
         root=plan.out,
         board=board_folder(plan),
-        split=plan.requests[0].split if plan.requests else None,
+        split=split,
         rejectors=plan.spec.rejectors,
-        contrasts=_contrasts(plan.spec),
+        contrasts=contrasts,
         draws=plan.spec.draws,
         pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
-        extras=() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),),
+        extras=(figures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
     )
-    return make_board(request_board, tell=tell)
+    board = make_board(request, tell=tell)
+    if results is not None:
+        tell(pack_board(board, request, results / plan.spec.id).to_text())
+    return board
 
 
 def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress: Progress | None) -> list[Path]:

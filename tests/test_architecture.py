@@ -67,7 +67,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
-        *("boardfile", "pluginfiles"),
+        *("boardfile", "packfile", "pluginfiles"),
         *(
             "preview",
             "sheet",
@@ -75,6 +75,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
             "lookalikeplot",
             "splitmap",
             "paperplot",
+            "boardplot",
             "ageingplot",
             "ageingfile",
             "ratebookfile",
@@ -89,7 +90,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,
     "sasgeo": (
-        *("rates", "seasons", "temper", "weights", "raster", "distinct"),
+        *("rates", "seasons", "stamps", "temper", "weights", "raster", "distinct"),
         *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
         *("temporal", "joint", "learnt", "arms", "worth", "reading", "lookalike", "learning"),
         *("integrity", "protection", "conformal", "frame", "rejectors", "matchers", "variants"),
@@ -108,11 +109,13 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
         *("latex", "protection"),
-        *("paper", "papertext", "plots", "site"),
+        *("paper", "papertext", "plottables", "plots", "site"),
     ),
     "boardtasks": None,
     "entries": None,
     "boards": None,
+    "boardfigures": None,
+    "packing": None,
     "paperboard": None,
     "pipeline": None,
     "scaffold": None,

@@ -3,16 +3,19 @@
 
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 from rich.table import Table
 
+from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.metrics.draws import DRAWS
+from sasgeo_bench.packing import laid_out, stored_settings
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.split import Split, make_split
@@ -32,7 +35,8 @@ BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 def score_command(  # noqa: PLR0913 - a command has as many flags as its users need
     *,
     predictions: Annotated[
-        list[Path], typer.Option(help="folder with runs in it, or file of predictions; may be repeated")
+        list[Path],
+        typer.Option(help="folder with runs in it or of stored results, or file of predictions; may be repeated"),
     ],
     tasks: Annotated[
         list[Path] | None, typer.Option(help="task folder; may be repeated; default: all that are answered")
@@ -41,12 +45,23 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         Path | None, typer.Option(help="folder of the truths, beside the tasks; default: OUT/truth")
     ] = None,
     name: Annotated[str, typer.Option(help="of the board: OUT/boards/NAME")] = "board",
-    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
+    split: Annotated[
+        str | None,
+        typer.Option(
+            help="id of a shipped split, or a file of your own (*.toml); default: crossfit, or that of stored results"
+        ),
+    ] = None,
     rejector: Annotated[
-        list[str] | None, typer.Option(help="name from list-rejectors, or module:Class; may be repeated")
+        list[str] | None,
+        typer.Option(
+            help="name from list-rejectors, or module:Class; may be repeated; default: none, or those of stored results"
+        ),
     ] = None,
     region_folders: RegionFolders = None,
-    draws: Annotated[int, typer.Option(min=100, help="of the bootstrap")] = DRAWS,
+    draws: Annotated[
+        int | None,
+        typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
+    ] = None,
     out: Out = Path("out"),
 ) -> None:
     """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
@@ -56,17 +71,25 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     if truth is not None and not truth.is_dir():
         message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
         raise ConfigError(message)
+    stored = stored_settings(predictions)
+    chosen = _split(split or stored.split or "crossfit", region_folders or [])
+    figures = partial(figures_extra, tell=tell, contrasts=stored.contrasts, split=chosen)
     request = ScoreRequest(
         predictions=predictions,
         tasks=tasks or (),
         root=out if truth is None else truth.resolve().parent,
         truth=truth,
-        split=_split(split, region_folders or []),
-        rejectors=rejector or (),
+        split=chosen,
+        contrasts=stored.contrasts,
+        rejectors=rejector or stored.rejectors,
         board=out / "boards" / name,
-        draws=draws,
+        draws=draws or stored.draws,
+        by_region=stored.by_region,
+        pipeline=stored.pipeline,
+        extras=(figures,),
     )
-    board = make_board(request, tell=tell)
+    with laid_out(request) as request_laid:
+        board = make_board(request_laid, tell=tell)
     show_board(board)
     typer.echo(str(request.board))
     _check_controls(board)
@@ -85,6 +108,9 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
+    results: Annotated[
+        Path | None, typer.Option(help="folder to store the board in with all it was made of, at most 20 MB: DIR/<id>/")
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
     ] = False,
@@ -106,9 +132,9 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         return
     if sys.stderr.isatty():
         with Bars() as bars:
-            board = run_pipeline(plan, tell=tell, progress=bars)
+            board = run_pipeline(plan, tell=tell, progress=bars, results=results)
     else:
-        board = run_pipeline(plan, tell=tell)
+        board = run_pipeline(plan, tell=tell, results=results)
     show_board(board)
     typer.echo(str(board_folder(plan)))
     tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.metrics.base import Bools, Floats, Metric, check_column, check_weights, weighted_mean
+from sasgeo_bench.metrics.base import Bools, Floats, Ints, Metric, check_column, check_weights, weighted_mean
 from sasgeo_bench.metrics.decisions import Answers, check_probabilities
 
 BINS: Final = 10
@@ -129,12 +129,37 @@ def calibration_error(answers: Answers, weights: ArrayLike | None = None, *, bin
     if not _all_say(answers) or not counts.any():
         return float("nan")
     confidence, right, mass = answers.confidence[counts], answers.is_right[counts], mass[counts]
+    at = equal_mass_bins(confidence, mass, bins=bins)
+    gap = np.bincount(at, weights=mass * (confidence - right), minlength=bins)
+    return float(np.abs(gap).sum() / mass.sum())
+
+
+def equal_mass_bins(confidence: Floats, mass: Floats | None = None, *, bins: int = BINS) -> Ints:
+    """Bin of each confidence, shape (N,): bins of equal mass, of which some may be empty.
+
+    Parameters
+    ----------
+    confidence : ndarray of float, shape (N,)
+        Finite.
+    mass : ndarray of float, shape (N,), optional
+        Positive; 1 unless given.
+    bins : int
+        How many at most. Equal confidences share the one in which the middle of their mass falls.
+
+    Returns
+    -------
+    ndarray of int, shape (N,)
+        From 0, the least confident first.
+
+    Examples
+    --------
+    >>> equal_mass_bins(np.array([0.9, 0.1, 0.9, 0.9]), bins=2).tolist()
+    [1, 0, 1, 1]
+    """
     values, group = np.unique(confidence, return_inverse=True)
     each = np.bincount(group, weights=mass, minlength=len(values))
     middle = (np.cumsum(each) - each / 2) / each.sum()
-    at = np.minimum((middle * bins).astype(np.int64), bins - 1)[group]
-    gap = np.bincount(at, weights=mass * (confidence - right), minlength=bins)
-    return float(np.abs(gap).sum() / mass.sum())
+    return np.asarray(np.minimum((middle * bins).astype(np.int64), bins - 1)[group], dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

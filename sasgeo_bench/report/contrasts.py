@@ -16,12 +16,13 @@ from sasgeo_bench.metrics.base import Floats
 from sasgeo_bench.metrics.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact
 from sasgeo_bench.metrics.decisions import Answers
 from sasgeo_bench.metrics.draws import DRAWS, ClusterDraws
-from sasgeo_bench.metrics.integrity import aurc
+from sasgeo_bench.metrics.integrity import aurc, drawn_areas
 from sasgeo_bench.metrics.intervals import (
     Interval,
     difference_interval,
     effective_count,
     mean_difference,
+    percentile_interval,
     statistic_interval,
     wilson,
 )
@@ -151,6 +152,17 @@ def _tested(
     judged: Mapping[tuple[str, str], pd.DataFrame],
     draws: int,
 ) -> Finding:
+    first, second = _pair(contrast, scores, judged)
+    if first.empty:
+        return _nothing(contrast)
+    is_mean = contrast.metric == "primary"
+    return _means(contrast, first, second, draws) if is_mean else _areas(contrast, first, second)
+
+
+def _pair(
+    contrast: Contrast, scores: Mapping[str, pd.DataFrame], judged: Mapping[tuple[str, str], pd.DataFrame]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of both sides, the same queries in the same order."""
     is_mean = contrast.metric == "primary"
     known: Mapping[str, pd.DataFrame] = scores if is_mean else {" x ".join(key): item for key, item in judged.items()}
     frames = []
@@ -162,9 +174,77 @@ def _tested(
         frames.append(_chosen(contrast, known[name]))
     shared = sorted(set(frames[0]["query_id"]) & set(frames[1]["query_id"]))
     first, second = (frame.set_index("query_id", drop=False).loc[shared] for frame in frames)
-    if first.empty:
-        return _nothing(contrast)
-    return _means(contrast, first, second, draws) if is_mean else _areas(contrast, first, second)
+    return first, second
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceDifference:
+    """A contrast at one place: first less second with its 95 % interval, and of how much it is."""
+
+    place: str
+    n: int
+    blocks: int
+    difference: float
+    lo: float
+    hi: float
+
+
+def by_place(
+    contrast: Contrast,
+    scores: Mapping[str, pd.DataFrame],
+    judged: Mapping[tuple[str, str], pd.DataFrame],
+    *,
+    draws: int = SLOW_DRAWS,
+) -> tuple[PlaceDifference, ...]:
+    """A contrast place by place, to see whether few of them make it; no test, and no part of the registered one.
+
+    Parameters
+    ----------
+    contrast, scores, judged
+        As of `hold_contrasts`.
+    draws : int
+        Of the bootstrap within each place.
+
+    Returns
+    -------
+    tuple of PlaceDifference
+        By name of the place.
+
+    Raises
+    ------
+    ConfigError
+        As `hold_contrasts` does.
+    """
+    first, second = _pair(contrast, scores, judged)
+    places = first["place"].to_numpy(str)
+    return tuple(
+        _at_place(contrast, first[places == place], second[places == place], str(place), draws)
+        for place in np.unique(places)
+    )
+
+
+def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, place: str, draws: int) -> PlaceDifference:
+    blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
+    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=draws)
+    if contrast.metric == "primary":
+        ours, theirs = (primary_of(contrast.track).values(frame) for frame in (first, second))
+        apart = ours - theirs
+        sides = (float(np.maximum(apart, 0.0).mean()), float(np.maximum(-apart, 0.0).mean()))
+        found = mean_difference(ours, theirs, drawn)
+    else:
+        both = [answers_of(frame) for frame in (first, second)]
+        sides = (aurc(both[0]), aurc(both[1]))
+        areas = [np.concatenate([drawn_areas(some, row).aurc for row in drawn.weights()]) for some in both]
+        found = percentile_interval(sides[0] - sides[1], areas[0] - areas[1])
+    interval = _guarded(found, sides, drawn, effective_count(sites))
+    return PlaceDifference(
+        place=place,
+        n=len(first),
+        blocks=len(set(blocks)),
+        difference=interval.value,
+        lo=interval.lo,
+        hi=interval.hi,
+    )
 
 
 def _chosen(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:

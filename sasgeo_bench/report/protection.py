@@ -2,10 +2,12 @@
 """Rows that say whether protection levels hold: a Stanford diagram counted for each method, risk and alert limit."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.metrics.intervals import effective_count
@@ -18,6 +20,8 @@ from sasgeo_bench.split import Split
 
 ALERT_LIMITS_M: Final = (10.0, FIX_M, 50.0)
 CONFORMAL: Final = "conformal"  # the method whose levels are fitted here
+Strings = NDArray[np.str_]
+
 _AREAS: Final = ("available", "unavailable", "misleading", "hazardous", "exceeded")
 COLUMNS: Final = (
     *("matcher", "prior_group", "method", "risk", "alert_limit_m", "n", "sites"),
@@ -56,29 +60,86 @@ def protection_frame(
     >>> len(protection_frame("mine", score_task([], [], {}), {}))
     0
     """
-    usable = scores[(scores["status"] != NOT_APPLICABLE) & (scores["track"] == "localization")]
     rows = [
-        {"matcher": matcher, "prior_group": prior_group, **row}
-        for prior_group, group in usable.groupby("prior_group", sort=True)
-        for row in _rows(group, predictions, split)
+        {"matcher": matcher, "prior_group": item.prior_group, **row}
+        for item in told_levels(scores, predictions, split)
+        for row in _counted(item)
     ]
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def _rows(group: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None) -> Iterator[dict[str, Any]]:
-    """Rows of one prior group."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToldLevels:
+    """Protection levels of one method at one risk, beside the errors; arrays have shape (N,).
+
+    Parameters
+    ----------
+    prior_group, method : str
+        Of which queries, and how the levels are found.
+    risk : float
+        The levels are stated for.
+    level_m, error_m : ndarray of float
+        Metres; infinite where there is none, see `protection_frame`.
+    sites : ndarray of str
+        `pair_id` of each query.
+    """
+
+    prior_group: str
+    method: str
+    risk: float
+    level_m: Floats
+    error_m: Floats
+    sites: Strings
+
+
+def told_levels(
+    scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
+) -> Iterator[ToldLevels]:
+    """Protection levels of one matcher, query by query; parameters as of `protection_frame`.
+
+    Yields
+    ------
+    ToldLevels
+        For each prior group, risk and method of which some answer tells a level.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.score import score_task
+    >>> list(told_levels(score_task([], [], {}), {}))
+    []
+    """
+    usable = scores[(scores["status"] != NOT_APPLICABLE) & (scores["track"] == "localization")]
+    for prior_group, group in usable.groupby("prior_group", sort=True):
+        yield from _levels_of_group(str(prior_group), group, predictions, split)
+
+
+def _levels_of_group(
+    prior_group: str, group: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None
+) -> Iterator[ToldLevels]:
     is_holdout = split is not None and split.spec.kind == "holdout"
     is_tested = (group["part"] == "test").to_numpy(bool) if is_holdout else np.ones(len(group), dtype=bool)
     error_m = _errors_m(group)
+    sites = group["pair_id"].to_numpy(str)
+
+    def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ToldLevels:
+        """The queries that count."""
+        return ToldLevels(
+            prior_group=prior_group,
+            method=method,
+            risk=risk,
+            level_m=level_m[counts],
+            error_m=error_m[counts],
+            sites=sites[counts],
+        )
+
     for risk in RISKS:
         told = {method: _told(group, predictions, level_name(method, risk)) for method in METHODS}
         for method, level_m in told.items():
             if np.isfinite(level_m).any():
-                yield from _counted(method, risk, level_m[is_tested], error_m[is_tested], group[is_tested])
+                yield of(method, risk, level_m, is_tested)
         scale_m = _told(group, predictions, SCALE)
         if split is not None and np.isfinite(scale_m).any():
-            level_m, is_fitted = _conformal(group, split, scale_m, error_m, risk)
-            yield from _counted(CONFORMAL, risk, level_m[is_fitted], error_m[is_fitted], group[is_fitted])
+            yield of(CONFORMAL, risk, *_conformal(group, split, scale_m, error_m, risk))
 
 
 def _errors_m(group: pd.DataFrame) -> Floats:
@@ -108,17 +169,16 @@ def _conformal(
     return level_m, is_fitted
 
 
-def _counted(
-    method: str, risk: float, level_m: Floats, error_m: Floats, part: pd.DataFrame
-) -> Iterator[dict[str, Any]]:
+def _counted(told: ToldLevels) -> Iterator[dict[str, Any]]:
     """A row for each alert limit; none where nothing was tested."""
-    if not len(part):
+    if not len(told.level_m):
         return
-    sites = effective_count(np.unique(part["pair_id"], return_inverse=True)[1])
+    sites = effective_count(np.unique(told.sites, return_inverse=True)[1])
     for limit_m in ALERT_LIMITS_M:
-        counts = stanford_counts(level_m, error_m, limit_m, trials=sites)
-        row = {"method": method, "risk": risk, "alert_limit_m": limit_m, "n": len(part), "sites": sites}
-        yield row | _shares(counts) | {"supports": _supports(counts, risk)}
+        counts = stanford_counts(told.level_m, told.error_m, limit_m, trials=sites)
+        row = {"method": told.method, "risk": told.risk, "alert_limit_m": limit_m}
+        row |= {"n": len(told.level_m), "sites": sites}
+        yield row | _shares(counts) | {"supports": _supports(counts, told.risk)}
 
 
 def _shares(counts: StanfordCounts) -> dict[str, float]:

@@ -49,12 +49,34 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
         steps = sorted({(step, size) for step, size in zip(strength[mine], cells[mine], strict=True)})
         if 1 < len(steps) <= _MOST_STEPS:
             for step, size in steps:
-                yield f"{one} {step:g}, {size} cells", mine & (strength == step) & (cells == size)
+                yield step_name(one, step, size), mine & (strength == step) & (cells == size)
     sizes = sorted(set(cells[role == CONTROL]))
     if len(sizes) > 1:
         for size in sizes:
-            yield f"{CONTROL}, {size} cells", (role == CONTROL) & (cells == size)
+            yield control_name(size), (role == CONTROL) & (cells == size)
     yield from _bins(scores, role != CONTROL)
+
+
+def step_name(kind: str, step: float, view_cells: int) -> str:
+    """Name of one step of a kind at one size of view, of a kind that has several of them.
+
+    Examples
+    --------
+    >>> step_name("G1", 5.0, 96)
+    'G1 5, 96 cells'
+    """
+    return f"{kind} {step:g}, {view_cells} cells"
+
+
+def control_name(view_cells: int) -> str:
+    """Name of the controls at one size of view, of a suite that has several sizes.
+
+    Examples
+    --------
+    >>> control_name(96)
+    'control, 96 cells'
+    """
+    return f"{CONTROL}, {view_cells} cells"
 
 
 def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:

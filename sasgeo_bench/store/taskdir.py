@@ -25,6 +25,7 @@ from sasgeo_bench.store.taskrows import (
     HEAD_SCHEMA,
     QUERY_SCHEMA,
     TRUTH_SCHEMA,
+    VIEW_BYTES,
     asked_sha256,
     poses_of,
     query_of,
@@ -360,8 +361,12 @@ def read_ids(folder: Path) -> list[str]:
 def read_view_bytes(folder: Path) -> dict[str, int]:
     """Bytes of what each query shows, as it travels: the packed view, confidences and vectors, nothing compressed.
 
-    The size of a packed view follows from its shape, so that no view is read.
+    The size of a packed view follows from its shape, so that no view is read. Stored results say it.
     """
+    with _named(folder / QUERIES):
+        if VIEW_BYTES in pq.read_schema(folder / QUERIES).names:
+            table = pq.read_table(folder / QUERIES, columns=["query_id", VIEW_BYTES])
+            return dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
     found: dict[str, int] = {}
     columns = ["query_id", "rows", "cols", "classes", "confidence", "vectors"]
     with _named(folder / QUERIES):

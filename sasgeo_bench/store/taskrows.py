@@ -68,6 +68,7 @@ QUERY_SCHEMA: Final = pa.schema(
 
 # What is asked, in one word: an answer says it too, so that it is taken for that query on that map and for no other.
 ASKED: Final = "asked_sha256"
+VIEW_BYTES: Final = "view_bytes"  # column of stored results, which hold no views: bytes that each of them has
 FILE_SCHEMA: Final = QUERY_SCHEMA.append(pa.field(ASKED, pa.string()))
 
 

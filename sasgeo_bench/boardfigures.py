@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures that a board has, by name: what there are data for is drawn, and of the rest a line says why not."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.boards import Board, Tell
+from sasgeo_bench.report.contrasts import Contrast, by_place
+from sasgeo_bench.report.plots import (
+    draw_ages,
+    draw_bars,
+    draw_forest,
+    draw_reliability,
+    draw_risk,
+    draw_stanford,
+    draw_steps,
+)
+from sasgeo_bench.report.plottables import (
+    GROUP,
+    ages_frame,
+    queries_of,
+    reliability_frame,
+    risk_frame,
+    shown_matchers,
+    steps_frame,
+    stress_frame,
+)
+from sasgeo_bench.report.protection import ToldLevels, told_levels
+from sasgeo_bench.score import FIX_M
+from sasgeo_bench.split import Split
+from sasgeo_bench.store.boardfile import Extra
+
+Draw = Callable[[Path], None]
+Named = Iterator[tuple[str, Draw]]
+
+_PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
+
+
+def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
+    """Figures of a board, as SVG.
+
+    Parameters
+    ----------
+    board : Board
+        In memory.
+    tell : callable
+        Gets a line for each kind of figure that there are no data for.
+    contrasts : sequence of Contrast
+        Those that were registered, as of the board.
+    split : Split, optional
+        Of the board: says which places calibrate conformal protection levels.
+    """
+    shown = shown_matchers(board.table, contrasts)
+    queries = queries_of(board.scores)
+    steps = steps_frame(board.table, queries, shown)
+    ages = ages_frame(steps, queries, board.measured)
+    # An age is no other strength: where maps have ages, those are the axis.
+    others = steps[~steps["suite"].isin(set(ages["suite"]))]
+    kinds: dict[str, Named] = {
+        "success against the age of the map": _each("age", ages, GROUP, draw_ages, shown),
+        "success against strength": _each("strength", others, GROUP, draw_steps, shown),
+        "success under stress": _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
+        "differences by place": _forests(board, contrasts),
+        "risk against coverage": _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
+        "reliability": _each(
+            "reliability",
+            reliability_frame(board.judged, _calibrated(board.table), shown),
+            GROUP[1:],
+            draw_reliability,
+            shown,
+        ),
+        "protection levels against errors": _stanfords(board, shown, split),
+    }
+    found: dict[str, Draw] = {}
+    for kind, named in kinds.items():
+        drawn = {f"{name}.svg": draw for name, draw in named}
+        if not drawn:
+            tell(f"no figure of {kind}: the board holds nothing to draw there")
+        found |= drawn
+    return Extra(figures=found)
+
+
+def _file_name(*parts: str) -> str:
+    return _PLAIN.sub("-", "-".join(parts)).strip("-").lower()
+
+
+def _each(
+    name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., None], shown: Sequence[str]
+) -> Named:
+    """A figure for each group of rows; prior groups are never together."""
+    for key, part in rows.groupby(list(columns), sort=True):
+        yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
+
+
+def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
+    """Matcher x rejector that gives probabilities: it is judged as such."""
+    rows = table[table["metric"] == "ece"]
+    return set(zip(rows["matcher"], rows["rejector"], strict=True))
+
+
+def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
+    for contrast, finding in zip(contrasts, board.findings, strict=True):
+        places = by_place(contrast, board.scores, board.judged) if finding.n else ()
+        if places:
+            yield (
+                _file_name("contrast", contrast.name),
+                partial(draw_forest, contrast=contrast, finding=finding, places=places),
+            )
+
+
+def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named:
+    found: dict[tuple[str, float], dict[tuple[str, str], ToldLevels]] = {}
+    for matcher in (name for name in shown if name in board.scores):
+        for item in told_levels(board.scores[matcher], board.predictions[matcher], split):
+            if len(item.level_m):
+                found.setdefault((item.prior_group, item.risk), {})[matcher, item.method] = item
+    for (prior_group, risk), told in sorted(found.items()):
+        yield (
+            _file_name("stanford", f"{risk:g}", prior_group),
+            partial(draw_stanford, told=told, limit_m=FIX_M),
+        )

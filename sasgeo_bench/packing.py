@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board with all it was made of -> stored results, and stored results -> what a board is made of."""
+
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from sasgeo_bench.boards import Board, ScoreRequest
+from sasgeo_bench.entries import Entry
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.metrics.draws import DRAWS
+from sasgeo_bench.report.contrasts import Contrast
+from sasgeo_bench.store.learnedfile import LearnedSaid
+from sasgeo_bench.store.packfile import (
+    MOST_BYTES,
+    Packed,
+    StoredRun,
+    TaskFolders,
+    is_pack,
+    read_settings,
+    unpack,
+    write_pack,
+)
+from sasgeo_bench.store.taskdir import read_ids
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stored:
+    """What came of storing a board."""
+
+    folder: Path
+    packed: Packed
+
+    def to_text(self) -> str:
+        """In a line: how large it is, what a prediction takes, and what was left out."""
+        mine = self.packed
+        each = mine.prediction_bytes / max(mine.predictions, 1)
+        left_out = f"; left out: {mine.dropped}" if mine.dropped else ""
+        return (
+            f"{self.folder}: {mine.total_bytes / 1e6:.2f} MB, of these {mine.prediction_bytes / 1e6:.2f} MB for "
+            f"{counted(mine.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
+        )
+
+
+def pack_board(board: Board, request: ScoreRequest, folder: Path, *, most_bytes: int = MOST_BYTES) -> Stored:
+    """Store a board that was just written.
+
+    Parameters
+    ----------
+    board, request : Board, ScoreRequest
+        What came of what was asked for.
+    folder : Path
+        To write; older results there are replaced.
+    most_bytes : int
+        Of all files together.
+
+    Raises
+    ------
+    ConfigError
+        If a contestant is a file of predictions: nobody can say who answered.
+    StoreError
+        If it would be too large, or cannot be written; what was there is as it was.
+    """
+    submitted = next((entry.name for entry in board.everyone if not entry.runs), None)
+    if submitted is not None:
+        message = f"{submitted} is a file of predictions: only boards of runs are stored"
+        raise ConfigError(message)
+    truth = request.truth or request.root / "truth"
+    names = [(str(about["suite"]), str(about["region"])) for about in board.tasks]
+    tasks = [
+        TaskFolders(
+            task=request.root / "tasks" / suite / region,
+            truth=truth / suite / region,
+            region=request.root / "regions" / region,
+        )
+        for suite, region in names
+    ]
+    ids = {name: read_ids(item.task) for name, item in zip(names, tasks, strict=True)}
+    runs = {entry.name: list(_runs_of(entry, board, ids)) for entry in board.everyone}
+    packed = write_pack(
+        folder, board=request.board, tasks=tasks, runs=runs, settings=_settings_of(request), most_bytes=most_bytes
+    )
+    return Stored(folder=folder, packed=packed)
+
+
+def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
+    mine = board.predictions[entry.name]
+    for source, about in zip(entry.sources, entry.runs, strict=True):
+        said = LearnedSaid.of(about)
+        named = ids[about["suite"], about["region"]]
+        yield StoredRun(
+            about=about,
+            predictions=[mine[name] for name in named if name in mine],
+            learned=None if said is None or said.file is None else source.parents[1] / said.file,
+        )
+
+
+def _settings_of(request: ScoreRequest) -> dict[str, Any]:
+    return {
+        "split": None if request.split is None else request.split.spec.id,
+        "rejectors": list(request.rejectors),
+        "contrasts": [asdict(item) for item in request.contrasts],
+        "draws": request.draws,
+        "by_region": sorted(request.by_region),
+        "pipeline": dict(request.pipeline),
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How results were scored that are stored; without any, how anything is."""
+
+    split: str | None = None
+    rejectors: Sequence[str] = ()
+    contrasts: Sequence[Contrast] = ()
+    draws: int = DRAWS
+    by_region: Collection[str] = ()
+    pipeline: Mapping[str, str] = field(default_factory=dict)
+
+
+def stored_settings(predictions: Sequence[Path]) -> Settings:
+    """How the stored results among some predictions were scored.
+
+    Raises
+    ------
+    ConfigError
+        If there are two: their tasks may differ.
+    StoreError
+        If they are damaged.
+
+    Examples
+    --------
+    >>> stored_settings([Path("nowhere")]).draws
+    10000
+    """
+    stored = [path for path in predictions if is_pack(path)]
+    if len(stored) > 1:
+        message = f"{stored[0]} and {stored[1]} are both stored results: name one, beside runs and files of your own"
+        raise ConfigError(message)
+    if not stored:
+        return Settings()
+    said = read_settings(stored[0])
+    try:
+        return Settings(
+            split=said["split"],
+            rejectors=said["rejectors"],
+            contrasts=tuple(
+                Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])})
+                for item in said["contrasts"]
+            ),
+            draws=int(said["draws"]),
+            by_region=said["by_region"],
+            pipeline=said["pipeline"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        message = f"{stored[0]} does not say how it was scored ({error!r}): fetch it again"
+        raise StoreError(message) from error
+
+
+@contextmanager
+def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
+    """Yield the request with stored results among its predictions laid out as runs, tasks and truths.
+
+    They lie in a folder of the system's that goes when the block ends.
+
+    Raises
+    ------
+    ConfigError
+        If tasks are named beside stored results, which hold their own.
+    StoreError
+        If the results are damaged.
+    """
+    stored = next((path for path in request.predictions if is_pack(path)), None)
+    if stored is None:
+        yield request
+        return
+    if request.tasks:
+        message = f"{stored} are stored results, which hold their own tasks: leave --tasks away"
+        raise ConfigError(message)
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+        found = unpack(stored, Path(folder))
+        others = [path for path in request.predictions if path != stored]
+        yield replace(
+            request,
+            predictions=[*found.runs, *others],
+            tasks=found.tasks,
+            root=found.root,
+            truth=found.root / "truth",
+        )

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stored results: scored again they give the same board, they are small, and are there whole or not at all."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.boards import ScoreRequest
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.packing import laid_out, pack_board, stored_settings
+from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.store import packfile
+from sasgeo_bench.store.packfile import read_settings
+from sasgeo_bench.tomlfile import parse_toml
+
+PIPELINE = """
+id = "kept"
+title = "Kept"
+split = "crossfit"
+regions = ["town-suburb", "town-agricultural"]
+matchers = ["learners:Counts", "random"]
+rejectors = ["margin_nms"]
+draws = 100
+
+[[task]]
+suites = ["clean"]
+sites = 1
+
+[learning]
+suites = ["clean"]
+most = 5
+
+[[contrast]]
+name = "nothing"
+first = "random"
+second = "prior_centre"
+suites = ["clean"]
+"""
+TABLES = ("leaderboard", "scores", "contrasts", "controls")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory, few_controls):  # noqa: ARG001
+    """A board of a pipeline with its stored results, and what was told."""
+    out, lines = tmp_path_factory.mktemp("packing"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent / "run"))
+        plan = plan_pipeline(parse_toml(PIPELINE, PipelineFile, source="kept.toml"), out=out / "out", tell=lines.append)
+        board = run_pipeline(plan, tell=lines.append, results=out / "results")
+    return board, plan, out / "results" / "kept", lines
+
+
+def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path):
+    _, plan, folder, _ = kept
+    code, _, err = program("score", "--predictions", folder, "--truth", folder, "--name", "again", "--out", tmp_path)
+    assert code == 0, err
+    first, again = plan.out / "boards" / "kept", tmp_path / "boards" / "again"
+    assert {path.name for path in first.iterdir()} == {path.name for path in again.iterdir()}
+    for name in (*(f"{table}.parquet" for table in TABLES), "leaderboard.csv", "leaderboard.md", "board.json"):
+        assert (first / name).read_bytes() == (again / name).read_bytes(), name
+    for path in (first / "figures").iterdir():
+        assert path.read_bytes() == (again / "figures" / path.name).read_bytes(), path.name
+
+
+def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
+    board, plan, folder, lines = kept
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        *(f"{table}.parquet" for table in (*TABLES, "runs", "tasks", "queries", "truths")),
+        *("leaderboard.csv.gz", "leaderboard.md", "leaderboard.tex", "board.json", "pack.json"),
+        *("figures", "predictions", "learned"),
+    }
+    pd.testing.assert_frame_equal(
+        pd.read_csv(folder / "leaderboard.csv.gz"), pd.read_csv(plan.out / "boards" / "kept" / "leaderboard.csv")
+    )
+    assert "evidence" not in pq.read_schema(folder / "queries.parquet").names
+    stored = {path.name.rpartition("-")[0] for path in (folder / "predictions").iterdir()}
+    assert stored == {"counts", "random", "prior_centre", "oracle_pose", "fft_vote"}
+    assert len(list((folder / "learned").rglob("*.json"))) == 2  # one of each half
+    count = sum(len(rows) for rows in board.predictions.values())
+    (said,) = [line for line in lines if f"{count} predictions" in line]
+    assert said.startswith(f"{folder}: 0.")
+    assert read_settings(folder)["dropped"] == ""
+
+
+def test_what_is_too_large_is_stored_without_headings_or_refused_and_the_old_one_stays(kept, tmp_path):
+    board, plan, _, _ = kept
+    request = request_of(plan)
+    whole = pack_board(board, request, tmp_path / "kept").packed
+    lean = pack_board(board, request, tmp_path / "kept", most_bytes=whole.total_bytes - 1).packed
+    assert lean.total_bytes < whole.total_bytes
+    assert lean.dropped.startswith("heading and scale of all poses")
+    before = (tmp_path / "kept" / "pack.json").read_bytes()
+    with pytest.raises(
+        StoreError, match=r"would hold 0\.\d MB \(0\.\d MB of predictions\), 0\.001 MB at most: store a"
+    ):
+        pack_board(board, request, tmp_path / "kept", most_bytes=1000)
+    assert (tmp_path / "kept" / "pack.json").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".lock"] == ["kept"]
+
+
+def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
+    board, plan, folder, _ = kept
+    most = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) - 1
+    pack_board(board, request_of(plan), tmp_path / "kept", most_bytes=most)
+    code, _, err = program("score", "--predictions", tmp_path / "kept", "--name", "again", "--out", tmp_path / "out")
+    assert code == 0, err
+    for name in TABLES:
+        first = pd.read_parquet(plan.out / "boards" / "kept" / f"{name}.parquet")
+        pd.testing.assert_frame_equal(first, pd.read_parquet(tmp_path / "out" / "boards" / "again" / f"{name}.parquet"))
+
+
+def request_of(plan):
+    return ScoreRequest(predictions=[], root=plan.out, board=plan.out / "boards" / "kept", split=plan.requests[0].split)
+
+
+def test_a_store_that_is_cut_off_leaves_the_old_one_whole(kept, tmp_path, monkeypatch):
+    board, plan, _, _ = kept
+    pack_board(board, request_of(plan), tmp_path / "kept")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "kept").iterdir() if path.is_file()}
+
+    def cut_off(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(packfile, "_write_predictions", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        pack_board(board, request_of(plan), tmp_path / "kept")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "kept").iterdir() if path.is_file()} == before
+
+
+def test_a_folder_of_something_else_is_not_replaced(kept, tmp_path):
+    board, plan, _, _ = kept
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(StoreError, match="holds something else than stored results"):
+        pack_board(board, request_of(plan), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("pack.json", "holds no sound stored results"), ("truths.parquet", "holds no sound stored results")],
+)
+def test_damaged_results_are_told_in_a_line(kept, tmp_path, name, words, program):
+    board, plan, _, _ = kept
+    pack_board(board, request_of(plan), tmp_path / "kept")
+    (tmp_path / "kept" / name).write_bytes(b"{")
+    code, _, err = program("score", "--predictions", tmp_path / "kept", "--out", tmp_path / "out")
+    assert code == 2
+    assert words in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_name_that_leads_out_is_refused(kept, tmp_path):
+    board, plan, _, _ = kept
+    pack_board(board, request_of(plan), tmp_path / "kept")
+    table = pq.read_table(tmp_path / "kept" / "tasks.parquet")
+    rows = table.to_pylist()
+    rows[0]["task_json"] = json.dumps(json.loads(rows[0]["task_json"]) | {"region": "../../out"})
+    pq.write_table(table.from_pylist(rows, schema=table.schema), tmp_path / "kept" / "tasks.parquet")
+    with (
+        pytest.raises(StoreError, match="is no name of a folder"),
+        laid_out(ScoreRequest(predictions=[tmp_path / "kept"], root=tmp_path, board=tmp_path / "board")),
+    ):
+        pass
+
+
+def test_stored_results_hold_their_own_tasks_and_stand_alone(kept, tmp_path):
+    _, _, folder, _ = kept
+    with (
+        pytest.raises(ConfigError, match="hold their own tasks: leave --tasks away"),
+        laid_out(ScoreRequest(predictions=[folder], tasks=[tmp_path], root=tmp_path, board=tmp_path / "board")),
+    ):
+        pass
+    with pytest.raises(ConfigError, match="are both stored results"):
+        stored_settings([folder, folder])
+    assert [item.name for item in stored_settings([folder]).contrasts] == ["nothing"]

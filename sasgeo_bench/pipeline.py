@@ -365,16 +365,17 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
     mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
     whole = plan_run(_run_request(plan, spec, mine))
     learning = plan.spec.learning
-    if learning is None or not whole.learns or not mine:
-        return [_Go(name="", plan=whole)]
-    halves = {task: _half_of(plan, task) for task in tasks}
-    is_oracle, goes = spec in learning.oracles, []
+    is_oracle = learning is not None and spec in learning.oracles
     if is_oracle and not is_unranked(whole.card.name):
         message = (
             f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
             f"oracles begin with {YARDSTICK}, so that no board ranks them"
         )
         raise ConfigError(message)
+    if learning is None or not whole.learns or not mine:
+        return [_Go(name="", plan=whole)]
+    halves = {task: _half_of(plan, task) for task in tasks}
+    goes = []
     for half in (*HALVES, None):
         asked = [task for task in mine if halves[task] == half]
         train = [

@@ -287,7 +287,7 @@ id = "taught"
 title = "Taught"
 split = "crossfit"
 regions = ["town-suburb", "town-agricultural"]
-matchers = ["learners:Counts", "prior_centre"]
+matchers = ["learners:Counts", "learners:Oracle", "prior_centre"]
 
 [[task]]
 suites = ["clean"]
@@ -296,10 +296,13 @@ sites = 1
 [learning]
 suites = ["clean"]
 most = 5
+oracles = ["learners:Oracle"]
 """
 
 
-def test_each_half_is_asked_after_learning_from_the_other(tmp_path, monkeypatch, few_controls):  # noqa: ARG001
+def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(
+    tmp_path, monkeypatch, few_controls
+):  # noqa: ARG001
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "run"))
     plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
     board = run_pipeline(plan, tell=lambda _: None)
@@ -311,10 +314,16 @@ def test_each_half_is_asked_after_learning_from_the_other(tmp_path, monkeypatch,
         ("town-agricultural",): ["clean/town-suburb", "controls/town-suburb+controls"],
         ("town-suburb",): ["clean/town-agricultural"],
     }
+    assert {tuple(one["trained_on"]): one["asked"] for one in learned["oracle_counts"]} == {
+        ("town-suburb",): ["clean/town-suburb", "controls/town-suburb+controls"],
+        ("town-agricultural",): ["clean/town-agricultural"],
+    }
+    assert board.table.loc[board.table["matcher"] == "oracle_counts", "is_control"].all()
     text = (tmp_path / "boards" / "taught" / "leaderboard.md").read_text(encoding="utf-8")
     assert "learnt from 5 queries of 1 place (town-suburb)." in text
     told = plan.to_text().splitlines()
     assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in told
+    assert "    learners:Oracle: from the half itself, never ranked" in told
     assert "      half a: has learnt from 5 queries of 1 place (town-agricultural)" in told
     assert "      half b: has learnt from 5 queries of 1 place (town-suburb)" in told
 
@@ -326,7 +335,11 @@ def test_each_half_is_asked_after_learning_from_the_other(tmp_path, monkeypatch,
         ('["clean"]\nmost', '["controls"]\nmost', "learning names the suite 'controls', which no"),
         ('["clean"]\nmost', '["clean", "clean"]\nmost', "suite to learn from 'clean' is listed twice"),
         ("most = 5", "most = 0", "greater than or equal to 1"),
-        ("most = 5", 'oracles = ["oracle_x"]', "learning names the oracle 'oracle_x', which is not among 'matchers'"),
+        (
+            'oracles = ["learners:Oracle"]',
+            'oracles = ["oracle_x"]',
+            "learning names the oracle 'oracle_x', which is not among 'matchers'",
+        ),
         ('"crossfit"', '"holdout"', "needs halves, and split 'holdout' is a hold-out: name a cross-fit, or leave"),
     ],
 )
@@ -340,29 +353,12 @@ def test_learning_that_makes_no_sense_is_refused_in_one_line(tmp_path, old, new,
     assert "\n" not in str(error.value)
 
 
-def test_an_oracle_learns_from_what_it_is_asked_and_is_not_ranked(tmp_path, monkeypatch, few_controls):  # noqa: ARG001
+def test_an_oracle_with_a_contestants_name_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "run"))
-    text = LEARNING.replace("learners:Counts", "learners:Oracle") + 'oracles = ["learners:Oracle"]\n'
-    plan = plan_pipeline(parse_toml(text, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
-    assert "    learners:Oracle: from the half itself, never ranked" in plan.to_text().splitlines()
-    board = run_pipeline(plan, tell=lambda _: None)
-    about = json.loads((tmp_path / "boards" / "taught" / "board.json").read_text(encoding="utf-8"))
-    learned = {entry["name"]: entry["learned"] for entry in about["entries"]}
-    assert {tuple(one["trained_on"]): one["asked"] for one in learned["oracle_counts"]} == {
-        ("town-suburb",): ["clean/town-suburb", "controls/town-suburb+controls"],
-        ("town-agricultural",): ["clean/town-agricultural"],
-    }
-    mine = board.table[board.table["matcher"] == "oracle_counts"]
-    assert mine["is_control"].all()
-    assert mine["rank_best"].isna().all()
-
-
-def test_an_oracle_with_a_contestants_name_is_refused(tmp_path, monkeypatch, few_controls):  # noqa: ARG001
-    monkeypatch.syspath_prepend(str(Path(__file__).parent / "run"))
-    text = LEARNING + 'oracles = ["learners:Counts"]\n'
+    text = LEARNING.replace('["learners:Oracle"]', '["learners:Counts"]')
     plan = plan_pipeline(parse_toml(text, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
     with pytest.raises(ConfigError, match="the names of oracles begin with oracle_, so that no board ranks them"):
-        run_pipeline(plan, tell=lambda _: None)
+        plan.to_text()
 
 
 def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():

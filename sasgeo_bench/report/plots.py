@@ -241,7 +241,9 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
         chart.axhline(len(places) - 0.3, color=FAINT, lw=0.8)
         chart.set_yticks([*range(len(places)), foot], labels)
         chart.set_ylim(foot + 0.6, -0.7)
-        ends = [abs(end) for one in (*places, finding) for end in (one.lo, one.hi, one.difference) if np.isfinite(end)]
+        drawn = [(one.lo, one.hi, one.difference) for one in places]
+        drawn.append((finding.lo, finding.hi, finding.difference))
+        ends = [abs(end) for three in drawn for end in three if np.isfinite(end)]
         chart.set_xlim(-1.06 * max([*ends, least]), 1.06 * max([*ends, least]))
         chart.tick_params(axis="y", length=0)
         chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)

@@ -8,7 +8,7 @@ from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query, Track, Truth
+from sasgeo_bench.query import Head, Query, Track, Truth
 from sasgeo_bench.region import Region
 
 Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
@@ -201,14 +201,14 @@ def check_learned(learned: object) -> str:
     return learned
 
 
-def check_match(match: object, query: Query, *, top_k: int) -> Match:
+def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
     """Hold an answer to what an answer must be.
 
     Parameters
     ----------
     match : object
         What a matcher returned.
-    query : Query
+    query : Query or Head
         What it was asked.
     top_k : int
         How many poses it may give.

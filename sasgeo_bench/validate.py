@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import MatchError, PoseError, StoreError, counted
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
-from sasgeo_bench.query import Query
+from sasgeo_bench.query import Head
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.runrows import differing_columns, prediction_of
@@ -115,14 +115,14 @@ def _asked(tasks: Sequence[Path]) -> dict[str, str]:
     return {name: said for task in tasks for name, said in taskdir.read_asked(task).items()}
 
 
-def _queries(task: Path) -> Iterator[Query]:
-    """Queries of a task that this program can read."""
+def _queries(task: Path) -> Iterator[Head]:
+    """Queries of a task that this program can read; what was seen is no matter, and stored results hold none of it."""
     taskdir.read_task(task)
-    yield from taskdir.read_queries(task)
+    yield from taskdir.read_heads(task)
 
 
 def _row_faults(
-    file: str, row: int, item: Mapping[str, Any], queries: Mapping[str, Query], seen: dict[str, str]
+    file: str, row: int, item: Mapping[str, Any], queries: Mapping[str, Head], seen: dict[str, str]
 ) -> Iterator[Violation]:
     name = item["query_id"]
     if name not in queries:
@@ -156,7 +156,7 @@ def _row_faults(
     yield from _answer_faults(file, row, item, queries[name])
 
 
-def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Query) -> Iterator[Violation]:
+def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Head) -> Iterator[Violation]:
     """What is wrong with the answer itself."""
     empty = next((at for at, one in enumerate(item["candidates"] or ()) if one is None or None in one.values()), None)
     if empty is not None:

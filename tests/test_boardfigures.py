@@ -190,7 +190,7 @@ def test_many_matchers_are_cut_to_those_of_contrasts_and_a_few_beside_them():
 
 
 def test_bins_of_a_reliability_figure_make_up_the_calibration_error(board):
-    rows = reliability_frame(board.judged, {("graph", "sure"): 0.0}, ["graph"])
+    rows = reliability_frame(board.judged, {("graph", "sure")}, ["graph"])
     assert rows["n"].sum() == COUNT
     error = (rows["n"] * (rows["predicted"] - rows["observed"]).abs()).sum() / COUNT
     assert error == pytest.approx(calibration_error(answers_of(board.judged["graph", "sure"])))

@@ -22,7 +22,7 @@ id = "kept"
 title = "Kept"
 split = "crossfit"
 regions = ["town-suburb", "town-agricultural"]
-matchers = ["learners:Counts", "random"]
+matchers = ["learners:Counts", "random", "prior_centre"]
 rejectors = ["margin_nms"]
 draws = 100
 

@@ -88,7 +88,9 @@ def _draw_lines(
     column, label = axis
     names = _there(rows, shown)
     kinds, sizes = (sorted(set(rows[name])) for name in ("kind", "view_cells"))
-    about = Page(title=title, note=note, rows=len(kinds), columns=len(sizes), keys=names, gap_inches=0.25)
+    about = Page(
+        title=title, note=note, below=label, rows=len(kinds), columns=len(sizes), keys=names, gap_inches=0.25
+    )
     measure = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
     high = max(1.0, float(rows[column].max()))
     with page(path, about) as charts:
@@ -107,7 +109,6 @@ def _draw_lines(
                     _line(chart, mine[mine["matcher"] == name].sort_values(column), column, number, shift)
                 _write_counts(chart, mine, column)
             line[0].set_ylabel(measure)
-        _label_below(charts[-1], label)
 
 
 def _dress_share(chart: Axes) -> None:
@@ -138,16 +139,6 @@ def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
             chart.plot([ends["age_least"], ends["age_most"]], [-0.045, -0.045], color="#999999", lw=2.2)
 
 
-def _label_below(charts: Sequence[Axes], label: str) -> None:
-    """Name the axis of a row of panels once, under its middle."""
-    boxes = [chart.get_position() for chart in charts]
-    figure = charts[0].figure
-    height = figure.get_figheight()  # type: ignore[union-attr]
-    figure.text(
-        (boxes[0].x0 + boxes[-1].x1) / 2, boxes[0].y0 - 0.42 / height, label, ha="center", va="center", fontsize=8.5
-    )
-
-
 def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """Draw the success of each matcher on the stresses of each suite as bars with intervals.
 
@@ -166,6 +157,7 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     about = Page(
         title=f"Success under stress, suite by suite: {first['track']}, prior {first['prior_group']}",
         note=_INTERVALS.replace("each point", "each bar"),
+        below=PRIMARY[primary_of(str(first["track"])).name].replace("\n", " "),
         rows=-(-len(suites) // columns),
         columns=columns,
         panel_inches=(1.9, 0.3 + 0.19 * len(names)),
@@ -186,7 +178,6 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             _bars(chart, mine, names)
             if number % columns:
                 chart.set_yticklabels([])
-        _label_below(charts[-1], PRIMARY[primary_of(str(first["track"])).name].replace("\n", " "))
 
 
 def _bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
@@ -233,6 +224,7 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
             f"{least:.3g} either way. The registered test is of all places together: {finding.verdict} "
             f"(adjusted p {finding.p_holm:.3g}). Single places are no tests."
         ),
+        below=f"difference of {what}\n{better}",
         panel_inches=(4.6, 0.3 + 0.2 * len(labels)),
         left_inches=0.3 + 0.07 * max(map(len, labels)),
     )
@@ -249,11 +241,12 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
         chart.axhline(len(places) - 0.3, color=FAINT, lw=0.8)
         chart.set_yticks([*range(len(places)), foot], labels)
         chart.set_ylim(foot + 0.6, -0.7)
-        ends = [abs(end) for one in (*places, finding) for end in (one.lo, one.hi, one.difference) if np.isfinite(end)]
+        drawn = [(one.lo, one.hi, one.difference) for one in places]
+        drawn.append((finding.lo, finding.hi, finding.difference))
+        ends = [abs(end) for three in drawn for end in three if np.isfinite(end)]
         chart.set_xlim(-1.06 * max([*ends, least]), 1.06 * max([*ends, least]))
         chart.tick_params(axis="y", length=0)
         chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
-        _label_below(charts[0], f"difference of {what}\n{better}")
 
 
 # --- what is known of the answers -------------------------------------------------------------------------------------
@@ -284,6 +277,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             "places. Risk: false fixes among the accepted; coverage: accepted among all n queries, absent places among "
             f"them; a line ends where all answers are accepted.{pooled} Areas under the lines: leaderboard.md."
         ),
+        below="coverage (share of queries accepted)",
         rows=-(-len(cells) // columns),
         columns=columns,
         keys=rejectors,
@@ -310,7 +304,6 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             chart.tick_params(labelleft=number % columns == 0, labelbottom=number + columns >= len(cells))
             if number % columns == 0:
                 chart.set_ylabel("risk\n(share of accepted)")
-        _label_below(charts[-1], "coverage (share of queries accepted)")
 
 
 def _counts(mine: pd.DataFrame) -> str:
@@ -348,10 +341,11 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
     about = Page(
         title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
         note=(
-            "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; beside a point, where "
-            "there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has sites. On "
-            "the diagonal answers are false as often as was said; above it more often."
+            "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; beside a point, "
+            "where there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has "
+            "sites. On the diagonal answers are false as often as was said; above it more often."
         ),
+        below="said to be false (P, mean of the bin)",
         rows=len(names),
         columns=len(rejectors),
         panel_inches=(2.0, 1.9),
@@ -371,7 +365,6 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
                 chart.grid(visible=True, color=FAINT, lw=0.6)
                 chart.tick_params(labelleft=chart is line[0], labelbottom=line is charts[-1])
             line[0].set_ylabel("false (share of answers)")
-        _label_below(charts[-1], "said to be false (P, mean of the bin)")
 
 
 def _bin_counts(mine: pd.DataFrame) -> str:
@@ -429,6 +422,7 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_
             "Shares of all n queries, absent places among them with infinite error. "
             f"Darker cells hold more queries, the darkest {most}; what is beyond 1 km, or none, lies on the margin."
         ),
+        below="position error (m)",
         rows=len(names),
         columns=len(methods),
         panel_inches=(2.25, 2.1),
@@ -444,7 +438,6 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_
                     _stanford(chart, item, cells[name, method], limit_m, most)
                 chart.tick_params(labelleft=chart is line[0], labelbottom=line is charts[-1])
             line[0].set_ylabel("protection level (m)")
-        _label_below(charts[-1], "position error (m)")
 
 
 def _available(item: ToldLevels | None, limit_m: float) -> str:

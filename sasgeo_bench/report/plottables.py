@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the figures of a board show, as tables: one row for each point, bar or cell that is drawn."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -209,7 +209,7 @@ def _thinned(coverage: Floats) -> Ints:
 
 
 def reliability_frame(
-    judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Mapping[tuple[str, str], float], shown: Sequence[str]
+    judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
 ) -> pd.DataFrame:
     """How often answers are false, by how likely they were said to be; all suites of a track and prior group together.
 

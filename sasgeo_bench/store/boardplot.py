@@ -28,6 +28,7 @@ FAINT: Final = "#dddddd"
 _DPI: Final = 110
 _NUMBERS: Final = re.compile(r' (?:d|x|y|x1|x2|y1|y2|points)="[^"]*"')
 _DIGITS: Final = re.compile(r"(\.\d\d)\d+")
+_LABEL_POINTS: Final = 8.5
 _LINE_INCHES: Final = 0.155  # of a note
 _KEY_INCHES: Final = 0.2
 _LETTERS: Final = 15.5  # of a note, on an inch
@@ -75,6 +76,8 @@ class Page:
     ----------
     title, note : str
         Above and below; both are broken into lines.
+    below : str
+        What the axes across are of; written once, under the middle of the panels.
     rows, columns : int
         Panels down and across.
     panel_inches : (float, float)
@@ -91,6 +94,7 @@ class Page:
 
     title: str
     note: str
+    below: str
     rows: int = 1
     columns: int = 1
     panel_inches: tuple[float, float] = (2.4, 2.1)
@@ -148,6 +152,10 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
                 for column in range(about.columns)
             ]
             charts.append([figure.add_axes(_share_of(box, width, height)) for box in boxes])
+        middle = about.left_inches + (about.columns * (wide + about.gap_inches) - about.gap_inches) / 2
+        figure.text(
+            middle / width, (bottom - 0.42) / height, about.below, ha="center", va="center", fontsize=_LABEL_POINTS
+        )
         yield charts
         if path.suffix == ".svg":
             drawn = io.StringIO()

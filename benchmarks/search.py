@@ -5,10 +5,11 @@
     .venv/bin/python benchmarks/search.py --out out --agree 100         # how often both agree; hours at full size
     .venv/bin/python benchmarks/search.py --out out --agree 20 --size 1024 --view 128 --step 2     # much less
 
-Needs the region at two dates: `make build-region REGION=vaduz` and the same with DATE=2015-07-27. The map is searched
-as the scorer does: cells of 2 m, weights set by hand, all headings, all places, scale known. A view has as many cells
-of `--view-cell` metres as `--view` says; the default is one of the map's cells. Views lie where at least 3 % is drawn:
-`noise-free`, `perceived` with a detector's errors, and `aged`, perceived today and searched for on the old map.
+Builds the region (for `--agree`, at two dates) where it is not in `--out`, from extracts in a folder that --extracts or
+SASGEO_EXTRACTS names. The map is searched as the scorer does: cells of 2 m, weights set by hand, all headings, all
+places, scale known. A view has `--view` cells a side of `--view-cell` metres, by default as large as the map's. Views
+lie where at least 3 % is drawn: `noise-free`, `perceived` with a detector's errors, and `aged`, perceived today and
+searched for on the old map.
 
 Speed: each row is a process of its own that holds the map, searches once to make the pyramid of the map ("first"), and
 then once a view; medians. Its memory is all that was resident at most, imports and map included. Beyond the region the
@@ -21,6 +22,7 @@ best; `left behind` where it would not even then.
 """
 
 import argparse
+import datetime as dt
 import json
 import math
 import os
@@ -40,6 +42,7 @@ import cv2
 import numpy as np
 
 from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.perturb.perception import Perception
 from sasgeo_bench.pose import Pose, Prior
@@ -51,6 +54,7 @@ from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.find import exhaustive, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan
+from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.suites.base import State
 
@@ -77,6 +81,16 @@ KINDS = (
     Kind("perceived", is_noisy=True, is_aged=False),
     Kind("aged", is_noisy=True, is_aged=True),
 )
+
+
+def region_of(name: str, date: dt.date | None, given: argparse.Namespace) -> Region:
+    """Read a region; build it first where it is not there."""
+    folder = given.out / "regions" / (f"{name}@{date}" if date else name)
+    if not folder.exists():
+        spec = read_region_file(find_region_file(name))
+        plan = plan_build(spec, out=given.out, date=date, extract_folders=given.extracts)
+        build_region(plan, tell=lambda _: None, with_preview=False)
+    return read_region(folder)
 
 
 def read(region: Region) -> Reader:
@@ -284,14 +298,15 @@ class Bench:
             f"{' | '.join(f'{value:.2f}' for value in cpu_s)} |"
         )
 
-    def agreements(self, old: Path) -> None:
+    def agreements(self) -> None:
         """Print the table of agreement."""
         given = self.given
         self._head(f"agreement, map {given.size} cells, view {given.view} cells, step {given.step:g} deg")
         head = "queries | n | agree | better | not proposed | left behind | search right | exhaustive right"
         lines = [f"| {head} | CPU s | CPU s |", f"|---{'|---:' * 9}|"]
         chosen = [kind for kind in KINDS if kind.name in given.kinds]
-        aged = read(read_region(old)) if any(kind.is_aged for kind in chosen) else self.reader
+        is_aged = any(kind.is_aged for kind in chosen)
+        aged = read(region_of(given.region, given.old, given)) if is_aged else self.reader
         lines += [self.agreement(kind, aged if kind.is_aged else self.reader) for kind in chosen]
         print("\n".join(lines), flush=True)
 
@@ -334,7 +349,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out"))
     parser.add_argument("--region", default="vaduz")
-    parser.add_argument("--old", default="vaduz@2015-07-27", help="the same region at an older date")
+    parser.add_argument("--old", type=dt.date.fromisoformat, default=dt.date(2015, 7, 27), help="date of the older map")
+    parser.add_argument("--extracts", type=Path, action="append", default=[])
     parser.add_argument("--runs", type=int, default=7, help="views of each row of the tables of cost")
     parser.add_argument("--agree", type=int, default=0, help="views of each kind to compare with the exhaustive search")
     parser.add_argument("--kinds", nargs="+", choices=[kind.name for kind in KINDS], default=[k.name for k in KINDS])
@@ -350,12 +366,12 @@ def main() -> None:
         path, threads, step_deg = given.measure
         print(json.dumps(measured(Path(path), int(threads), float(step_deg))))
         return
-    region = read_region(given.out / "regions" / given.region)
+    region = region_of(given.region, None, given)
     bench = Bench(world=State.of(region), reader=read(region), given=given)
     date = region.manifest.extract.date
     print(f"{given.region} of {date}, {len(region.classes)} classes, medians of {given.runs} views")
     if given.agree:
-        bench.agreements(given.out / "regions" / given.old)
+        bench.agreements()
         return
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
         bench.speed(Path(folder))

@@ -69,6 +69,7 @@ bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, ne
 	$(VENV_PYTHON) benchmarks/run_matcher.py
 	$(VENV_PYTHON) benchmarks/score.py
 	$(VENV_PYTHON) benchmarks/integrity.py
+	$(VENV_PYTHON) benchmarks/search.py --out $(OUT) $(ARGS)
 	$(VENV_PYTHON) benchmarks/build_region.py $(ARGS)
 
 ageing: $(STAMP) ## measure docs/ageing anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS

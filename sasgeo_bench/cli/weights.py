@@ -143,7 +143,7 @@ def find_region(name: str, *, out: Path) -> Region:
 
 
 def _table(wide: pd.DataFrame) -> Table:
-    columns = [f"{name}\n{age:g} y" for name, age in wide.columns]
+    columns = [f"{column[0]}\n{column[1]:g} y" for column in wide.columns]
     table = Table("class", *columns, box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"

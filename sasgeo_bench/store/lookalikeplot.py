@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -30,6 +30,7 @@ _WIDTH: Final = 2 * _LEFT + 4 * _SIDE + 3 * _GAP
 _GREY: Final = "#444444"
 _SHARES: Final = ("share view", "share true place", "share lookalike")
 _SCORES: Final = ("score true place", "score lookalike")
+_WEIGHTS: Final = 2  # of the panels
 _LEAST_SHARE: Final = 5e-4  # that is not 0.0 %
 # Right edges of the columns of numbers, inches from the left: shares, weight, scores.
 _COLUMNS: Final = (2.3, 3.0, 3.7, 4.3, 5.25, 6.05)
@@ -94,11 +95,14 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
     figure = Figure(figsize=(_WIDTH, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     words(figure, sheet.title, sheet.facts)
-    pictures = (paint(sheet.view), paint(sheet.mapped), sheet.weights, paint(sheet.lookalike))
+    pictures: tuple[NDArray[np.generic], ...] = (
+        *(paint(sheet.view), paint(sheet.mapped)),
+        *(sheet.weights, paint(sheet.lookalike)),
+    )
     for at, (picture, title) in enumerate(zip(pictures, sheet.panels, strict=True)):
         box = ((_LEFT + at * (_SIDE + _GAP)) / _WIDTH, below / height, _SIDE / _WIDTH, _SIDE / height)
         chart = figure.add_axes(box)
-        is_weight = picture is sheet.weights
+        is_weight = at == _WEIGHTS
         drawn = picture_of(chart, picture, sheet.view.size_m, title, top=sheet.top if is_weight else None)
         if at == 0:
             scale_bar(chart, *sheet.view.size_m)
@@ -116,9 +120,21 @@ def _told(scores: pd.DataFrame) -> list[str]:
     return scores.index[(scores[list(_SHARES)] >= _LEAST_SHARE).any(axis=1)].tolist()
 
 
-def _text(figure: Figure, left: float, up: float, text: str, *, size: float = 8.0, **more: str) -> None:
+def _text(  # noqa: PLR0913 - a line of text has as many looks
+    figure: Figure,
+    left: float,
+    up: float,
+    text: str,
+    *,
+    size: float = 8.0,
+    color: str = "#000000",
+    ha: Literal["left", "right"] = "left",
+    is_bold: bool = False,
+) -> None:
     """Words at a place in inches from the lower left corner."""
-    figure.text(left / _WIDTH, up / figure.get_figheight(), text, fontsize=size, va="baseline", **more)
+    weight = "bold" if is_bold else "normal"
+    at = (left / _WIDTH, up / figure.get_figheight())
+    figure.text(*at, text, fontsize=size, va="baseline", color=color, ha=ha, fontweight=weight)
 
 
 def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: float) -> None:
@@ -129,6 +145,7 @@ def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: 
     for right, head in zip(_COLUMNS, heads, strict=True):
         _text(figure, right, top - _ROW, head, ha="right", color=_GREY)
     titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
+    told = sheet.scores.to_dict("index")
     for number, name in enumerate(rows):
         up = top - _ROW * (number + 2)
         said, colour = titles[name]
@@ -136,7 +153,7 @@ def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: 
         size = (0.14 / _WIDTH, 0.1 / figure.get_figheight())
         figure.add_artist(Rectangle(box, *size, facecolor=colour, edgecolor="#666666", lw=0.4))
         _text(figure, _LEFT + 0.2, up, said)
-        row = sheet.scores.loc[name]
+        row: dict[str, float] = told[name]
         values = (
             *(f"{100 * row[column]:.1f}" for column in _SHARES),
             f"{sheet.worth[name]:.2f}",
@@ -154,10 +171,10 @@ def _term_rows(figure: Figure, sheet: LookalikeSheet, *, top: float) -> None:
     _text(figure, left, top, "terms of Eq. 11, nats", color=_GREY)
     for number, (name, values) in enumerate(zip(sheet.terms.index, sheet.terms.to_numpy(), strict=True)):
         up = top - _ROW * (number + 1)
-        weight = "bold" if number == len(sheet.terms) - 1 else "normal"
-        _text(figure, left, up, name, fontweight=weight)
+        is_bold = number == len(sheet.terms) - 1
+        _text(figure, left, up, name, is_bold=is_bold)
         for right, value in zip(rights, (*values, values[0] - values[1]), strict=True):
-            _text(figure, right, up, _signed(value), ha="right", fontweight=weight)
+            _text(figure, right, up, _signed(value), ha="right", is_bold=is_bold)
     for number, line in enumerate(wrap(sheet.note, _NOTE_CHARS)):
         _text(figure, left, top - _ROW * (len(sheet.terms) + 1.6 + 0.85 * number), line, size=7.5, color=_GREY)
 

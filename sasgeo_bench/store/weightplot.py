@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.store.preview import north_arrow, scale_bar
 from sasgeo_bench.store.sheet import GROUND, HIDDEN, paint
@@ -73,7 +73,7 @@ def shrunk(layers: NDArray[np.uint8], *, most_cells: int = _MOST_CELLS) -> NDArr
     factor = _factor(layers.shape[1:], most_cells)
     known = [np.where(layer == PRESENT, 2, np.where(layer > PRESENT, 0, 1)).astype(np.uint8) for layer in layers]
     most = np.stack([_blocks(layer, factor).max(axis=(1, 3)) for layer in known])
-    return np.array([UNKNOWN, 0, PRESENT], dtype=np.uint8)[most]
+    return np.asarray(np.array([UNKNOWN, ABSENT, PRESENT], dtype=np.uint8)[most], dtype=np.uint8)
 
 
 def _factor(shape: tuple[int, ...], most_cells: int) -> int:

@@ -35,18 +35,18 @@ from sasgeo_bench.store.regiondir import MANIFEST, read_region
 from sasgeo_bench.store.weightplot import WeightSheet, draw_weights, top_of
 from sasgeo_bench.taxonomy import load_taxonomy
 
-# Column of the table, what it says, what it is multiplied with. By hand the gains of Eq. 7 repeat sigma.
+# Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
 WORTH: Final = (
     "worth",
     "worth of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
     1,
 )
-INFORMATION: Final = ("information", "information between map and view: thousandths of a nat a cell", 1000)
+INFORMATION: Final = ("information", "information between map and view: thousandths of a nat a cell", 1000, 1)
 GAINS: Final = (
-    ("agree", "gain where mapped and seen (Eq. 7): nats a cell", 1),
-    ("extra", "gain where seen and not mapped: nats a cell", 1),
-    ("missed", "gain where mapped and seen to be absent: nats a cell", 1),
-    ("quiet", "gain where neither mapped nor seen: nats a cell", 1),
+    ("agree", "gain where mapped and seen (Eq. 7): nats a cell", 1, 2),
+    ("extra", "gain where seen and not mapped: nats a cell", 1, 2),
+    ("missed", "gain where mapped and seen to be absent: nats a cell", 1, 2),
+    ("quiet", "gain where neither mapped nor seen: nats a cell", 1, 2),
 )
 Learned = Annotated[
     Path | None, typer.Option(help="what a matcher has learnt: out/runs/<matcher>/<hash>/learned/<sha>.json")
@@ -78,9 +78,9 @@ def weights_command(
         name: worth_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
         for name, (known, arm) in arms.items()
     }
-    for column, title, factor in (WORTH, *(GAINS if learnt else ()), INFORMATION):
+    for column, title, factor, digits in (WORTH, *(GAINS if learnt else ()), INFORMATION):
         typer.echo(title)
-        print_table(_table(side_by_side(tables, column) * factor))
+        print_table(_table(side_by_side(tables, column) * factor, digits))
     if place is not None:
         for path in _drawn(place, *list(arms.values())[-1], ages=ages or [0.0], season=season, out=out):
             typer.echo(f"map of weights: {path}")
@@ -142,13 +142,13 @@ def find_region(name: str, *, out: Path) -> Region:
     return region
 
 
-def _table(wide: pd.DataFrame) -> Table:
+def _table(wide: pd.DataFrame, digits: int) -> Table:
     columns = [f"{column[0]}\n{column[1]:g} y" for column in wide.columns]
     table = Table("class", *columns, box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
     for name, row in zip(wide.index, wide.to_numpy(), strict=True):
-        table.add_row(name, *(f"{value:.2f}" for value in row))
+        table.add_row(name, *(f"{value:.{digits}f}" for value in row))
     return table
 
 

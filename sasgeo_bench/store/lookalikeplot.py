@@ -153,7 +153,7 @@ def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: 
         size = (0.14 / _WIDTH, 0.1 / figure.get_figheight())
         figure.add_artist(Rectangle(box, *size, facecolor=colour, edgecolor="#666666", lw=0.4))
         _text(figure, _LEFT + 0.2, up, said)
-        row: dict[str, float] = told[name]
+        row = told[name]
         values = (
             *(f"{100 * row[column]:.1f}" for column in _SHARES),
             f"{sheet.worth[name]:.2f}",

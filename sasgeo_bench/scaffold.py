@@ -17,7 +17,7 @@ _TAKEN: Final = frozenset(
         *sys.stdlib_module_names,
         *("affine", "cv2", "filelock", "geopandas", "matplotlib", "numpy", "osmium", "pandas", "pooch", "psutil"),
         *("pyarrow", "pydantic", "pyproj", "rasterio", "rich", "scipy", "shapely", "tqdm", "typer", "click"),
-        *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "sklearn", "statsmodels"),
+        *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
         *("hatchling", "hypothesis", "pip", "pytest", "setuptools"),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),
     }

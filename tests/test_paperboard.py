@@ -81,9 +81,8 @@ def test_the_board_holds_table_trials_and_figures(made):
     assert "no OSM data" in text
     assert "| Global descriptor | 0.586 [0.520, 0.649] |" in text
     assert "oracle_pose" in text
-    assert sorted(path.name for path in (folder / "figures").iterdir()) == [
-        f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")
-    ]
+    drawn = {path.name for path in (folder / "figures").iterdir()}  # beside those that every board has
+    assert {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} <= drawn
 
 
 def test_several_seeds_are_resampled_by_seed_one_by_its_tiles(made):

@@ -88,9 +88,7 @@ def _draw_lines(
     column, label = axis
     names = _there(rows, shown)
     kinds, sizes = (sorted(set(rows[name])) for name in ("kind", "view_cells"))
-    about = Page(
-        title=title, note=note, below=label, rows=len(kinds), columns=len(sizes), keys=names, gap_inches=0.25
-    )
+    about = Page(title=title, note=note, below=label, rows=len(kinds), columns=len(sizes), keys=names, gap_inches=0.25)
     measure = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
     high = max(1.0, float(rows[column].max()))
     with page(path, about) as charts:

@@ -117,19 +117,13 @@ def write_pack(
             _squeeze(scratch / _CSV)
             _write_tasks(scratch, tasks)
             _write_runs(scratch, runs)
-            fixed = _bytes_of(scratch)
-            found, dropped = _write_predictions(scratch, runs, is_lean=False), ""
-            if fixed + found > most_bytes:
-                found, dropped = _write_predictions(scratch, runs, is_lean=True), _DROPPED
-            content = {
-                "schema_version": SCHEMA_VERSION,
-                **settings,
-                "dropped": dropped,
-                "contestants": list(runs),
-                "licence": LICENCE,
-                "attribution": ATTRIBUTION,
-            }
-            (scratch / PACK).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+            said, dropped = {**settings, "contestants": list(runs)}, ""
+            found = _write_predictions(scratch, runs, is_lean=False)
+            _write_settings(scratch, said, dropped)
+            if _bytes_of(scratch) > most_bytes:
+                dropped = _DROPPED
+                found = _write_predictions(scratch, runs, is_lean=True)
+                _write_settings(scratch, said, dropped)
             total = _bytes_of(scratch)
             _check_size(folder, total, found, most_bytes)
     except SasgeoError:
@@ -142,6 +136,17 @@ def write_pack(
         raise StoreError(message) from error
     count = sum(len(run.predictions) for listed in runs.values() for run in listed)
     return Packed(total_bytes=total, prediction_bytes=found, predictions=count, dropped=dropped)
+
+
+def _write_settings(folder: Path, said: Mapping[str, Any], dropped: str) -> None:
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        **said,
+        "dropped": dropped,
+        "licence": LICENCE,
+        "attribution": ATTRIBUTION,
+    }
+    (folder / PACK).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _check_replaced(folder: Path) -> None:

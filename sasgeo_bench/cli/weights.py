@@ -40,6 +40,7 @@ WORTH: Final = (
     "worth",
     "worth of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
     1,
+    2,
 )
 INFORMATION: Final = ("information", "information between map and view: thousandths of a nat a cell", 1000, 1)
 GAINS: Final = (

@@ -33,8 +33,8 @@ NOTE: Final = (
     "The place was chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one with "
     "the nearest lookalike. A lookalike is the place nearest by the shares of all classes, at least three footprint "
     "radii away; these two differ by {apart:.2f} standard deviations over the map. Scores are those of the best pose "
-    "within 24 m of each place, at any heading. What is seen and not mapped counts against both; the raster term sums "
-    "all classes, those not listed too, times its weight."
+    "within 24 m of each place, at any heading. What is seen and not mapped counts against both. The raster term is "
+    "the weighted sum of all classes, listed or not."
 )
 _CHUNK: Final = 256
 _NOTHING: Final = 1e-9

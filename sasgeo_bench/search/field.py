@@ -17,16 +17,17 @@ from sasgeo_bench.pose import Pose
 FULL: Final = 255  # of a field: the map has it for certain
 
 _AXES: Final = 3
+_THIN: Final = 0.5  # of what a class covers once it is spread: a class of less before is lines or small things
 _NOTHING: Final = 1e-9
 Value = TypeVar("Value", np.float32, np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """A field in cells of `factor` of its own, each class spread by half of one: what is near counts as there.
+    """A field in cells of `factor` of its own, thin classes spread by half of one: what is near counts as there.
 
     `layers` is uint8 of shape (K + 1, rows, cols), the last one what is known; `thinner`, shape (K + 1,), is the share
-    of the spread area that each class had before.
+    of the spread area that each class had before, 1 where it is not spread.
     """
 
     factor: int
@@ -166,18 +167,28 @@ class Template:
 
 
 def _level(field: Field, factor: int) -> Level:
-    """Spread each class by half a large cell, then take means."""
+    """Spread each thin class by half a large cell, then take means."""
     grid = field.grid.coarsen(factor)
-    bands = [*field.layers, field.known]
     if factor == 1:
-        return Level(factor=1, grid=grid, layers=np.stack(bands), thinner=np.ones(len(bands)))
+        layers = np.concatenate((field.layers, field.known[None]))
+        return Level(factor=1, grid=grid, layers=layers, thinner=np.ones(len(layers)))
     kernel = _disc(factor / 2)
-    spread = [cv2.dilate(band, kernel) for band in field.layers] + [field.known]
-    before, after = (np.array([band.sum(dtype=np.float64) for band in some]) for some in (bands, spread))
+    spread = [_spread(band, kernel) for band in field.layers]
+    bands, thinner = [*(band for band, _ in spread), field.known], [*(share for _, share in spread), 1.0]
     size, around = (grid.cols, grid.rows), ((0, -field.grid.rows % factor), (0, -field.grid.cols % factor))
-    pooled = [cv2.resize(np.pad(band, around), size, interpolation=cv2.INTER_AREA) for band in spread]
-    thinner = before / np.maximum(after, 1.0)
-    return Level(factor=factor, grid=grid, layers=np.stack(pooled), thinner=thinner)
+    pooled = [cv2.resize(np.pad(band, around), size, interpolation=cv2.INTER_AREA) for band in bands]
+    return Level(factor=factor, grid=grid, layers=np.stack(pooled), thinner=np.array(thinner))
+
+
+def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+    """Spread a class, and what share of its area it had before.
+
+    Lines and houses would be lost in a mean of a large cell. Woods and fields are not, and as more of them than there
+    is they outscore the right place: a class that would not grow much stays as it is.
+    """
+    grown = np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
+    share = float(band.sum(dtype=np.float64) / max(grown.sum(dtype=np.float64), 1.0))
+    return (grown, share) if share < _THIN else (band, 1.0)
 
 
 def _disc(radius: float) -> NDArray[np.uint8]:
@@ -188,13 +199,13 @@ def _disc(radius: float) -> NDArray[np.uint8]:
 
 
 def _softened(template: Template, level: Level) -> NDArray[np.float32]:
-    """Bands for a map that is spread: no blame within half a cell of praise, elsewhere as much less as it has grown."""
+    """Bands for a map whose thin classes are spread: no blame beside praise, elsewhere as much less as they grew."""
     bands = template.bands[template.speaking]
     if level.factor == 1:
         return bands
     kernel = _disc(level.grid.cell_size_m / template.cell_size_m / 2)
     for band, at in zip(bands, template.speaking.tolist(), strict=True):
-        if at < len(template.weights):
+        if level.thinner[at] < 1:
             near = cv2.dilate((band > 0).astype(np.uint8), kernel) > 0
             band[band < 0] *= level.thinner[at]
             band[(band < 0) & near] = 0

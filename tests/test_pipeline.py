@@ -300,9 +300,8 @@ oracles = ["learners:Oracle"]
 """
 
 
-def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(
-    tmp_path, monkeypatch, few_controls
-):  # noqa: ARG001
+@pytest.mark.usefixtures("few_controls")
+def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "run"))
     plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
     board = run_pipeline(plan, tell=lambda _: None)

@@ -14,6 +14,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.packing import laid_out, pack_board, stored_settings
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.store import packfile
 from sasgeo_bench.store.packfile import read_settings
 from sasgeo_bench.tomlfile import parse_toml
@@ -116,7 +117,15 @@ def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
 
 
 def request_of(plan):
-    return ScoreRequest(predictions=[], root=plan.out, board=plan.out / "boards" / "kept", split=plan.requests[0].split)
+    return ScoreRequest(
+        predictions=[],
+        root=plan.out,
+        board=plan.out / "boards" / "kept",
+        split=plan.requests[0].split,
+        rejectors=plan.spec.rejectors,
+        contrasts=[Contrast(name="nothing", first="random", second="prior_centre", suites=("clean",))],
+        draws=plan.spec.draws,
+    )
 
 
 def test_a_store_that_is_cut_off_leaves_the_old_one_whole(kept, tmp_path, monkeypatch):

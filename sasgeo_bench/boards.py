@@ -151,12 +151,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     scores = {name: _ranked(frame, whole[name]) for name, frame in everything.items()}
     scores = {name: frame for name, frame in scores.items() if len(frame)}
     entries = tuple(item.entry for item in told if item.entry.name in scores)
-    if not scores:
-        message = (
-            f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
-            "its tasks (--tasks names some)"
-        )
-        raise ConfigError(message)
+    _check_some(scores)
     rows = list(_leaderboards(scores, whole, request.draws))
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
@@ -198,6 +193,15 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _check_some(scores: Mapping[str, pd.DataFrame]) -> None:
+    if not scores:
+        message = (
+            f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
+            "its tasks (--tasks names some)"
+        )
+        raise ConfigError(message)
 
 
 def _remarks(all_judged: Mapping[tuple[str, str], pd.DataFrame], tell: Tell) -> tuple[str, ...]:

@@ -96,6 +96,8 @@ def test_what_is_too_large_is_stored_without_headings_or_refused_and_the_old_one
     lean = pack_board(board, request, tmp_path / "kept", most_bytes=whole.total_bytes - 1).packed
     assert lean.total_bytes < whole.total_bytes
     assert lean.dropped.startswith("heading and scale of all poses")
+    pack_board(board, request, tmp_path / "kept", most_bytes=lean.total_bytes - 1)
+    assert {path.name.partition(".")[2] for path in (tmp_path / "kept" / "figures").iterdir()} == {"svg.gz"}
     before = (tmp_path / "kept" / "pack.json").read_bytes()
     with pytest.raises(
         StoreError, match=r"would hold 0\.\d MB \(0\.\d MB of predictions\), 0\.001 MB at most: store a"

@@ -27,6 +27,8 @@ GREY: Final = "#555555"
 FAINT: Final = "#dddddd"
 _DPI: Final = 110
 _NUMBERS: Final = re.compile(r' (?:d|x|y|x1|x2|y1|y2|points)="[^"]*"')
+_GROUP_NAMES: Final = re.compile(r' id="[A-Za-z2.]+_\d+"')  # nothing refers to them; what is referred to has a hash
+_INDENTS: Final = re.compile(r"\n +")
 _DIGITS: Final = re.compile(r"(\.\d\d)\d+")
 _LABEL_POINTS: Final = 8.5
 _LINE_INCHES: Final = 0.155  # of a note
@@ -167,8 +169,9 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
 
 
 def _rounded(svg: str) -> str:
-    """An SVG with hundredths of a point at most: a third of the bytes say no more."""
-    return _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), svg)
+    """An SVG with hundredths of a point at most, without indents and names of groups: a third of it says no more."""
+    plain = _INDENTS.sub("\n", _GROUP_NAMES.sub("", svg))
+    return _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), plain)
 
 
 def _share_of(box: tuple[float, float, float, float], width: float, height: float) -> tuple[float, float, float, float]:

@@ -24,7 +24,7 @@ from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.boardfile import LEADERBOARD
+from sasgeo_bench.store.boardfile import FIGURES, LEADERBOARD
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.regiondir import MANIFEST, fresh_folder, locked
 from sasgeo_bench.store.runrows import PREDICTION_SCHEMA, prediction_row
@@ -97,7 +97,8 @@ def write_pack(
     settings : mapping
         How it was scored.
     most_bytes : int
-        Of all files together. What is larger is written without headings and scales of the poses beside the first.
+        Of all files together. What is larger is written without headings and scales of the poses beside the first, and
+        then with figures as .svg.gz.
 
     Returns
     -------
@@ -124,6 +125,9 @@ def write_pack(
                 dropped = _DROPPED
                 found = _write_predictions(scratch, runs, is_lean=True)
                 _write_settings(scratch, said, dropped)
+            if _bytes_of(scratch) > most_bytes:  # they are drawn again where results are scored
+                for figure in sorted((scratch / FIGURES).glob("*.svg")):
+                    _squeeze(figure)
             total = _bytes_of(scratch)
             _check_size(folder, total, found, most_bytes)
     except SasgeoError:

@@ -24,7 +24,7 @@ Value = TypeVar("Value", np.float32, np.uint8)
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """A field in cells of `factor` of its own, thin classes spread by half of one: what is near counts as there.
+    """A field in cells of `factor` of its own, thin classes spread by one: what is near counts as there.
 
     `layers` is uint8 of shape (K + 1, rows, cols), the last one what is known; `thinner`, shape (K + 1,), is the share
     of the spread area that each class had before, 1 where it is not spread.
@@ -167,12 +167,12 @@ class Template:
 
 
 def _level(field: Field, factor: int) -> Level:
-    """Spread each thin class by half a large cell, then take means."""
+    """Spread each thin class by a large cell, then take means."""
     grid = field.grid.coarsen(factor)
     if factor == 1:
         layers = np.concatenate((field.layers, field.known[None]))
         return Level(factor=1, grid=grid, layers=layers, thinner=np.ones(len(layers)))
-    kernel = _disc(factor / 2)
+    kernel = _disc(factor)
     spread = [_spread(band, kernel) for band in field.layers]
     bands, thinner = [*(band for band, _ in spread), field.known], [*(share for _, share in spread), 1.0]
     size, around = (grid.cols, grid.rows), ((0, -field.grid.rows % factor), (0, -field.grid.cols % factor))
@@ -183,8 +183,9 @@ def _level(field: Field, factor: int) -> Level:
 def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
     """Spread a class, and what share of its area it had before.
 
-    Lines and houses would be lost in a mean of a large cell. Woods and fields are not, and as more of them than there
-    is they outscore the right place: a class that would not grow much stays as it is.
+    What the view shows may lie a cell off, by place and by heading: lines and houses would be missed there. Woods and
+    fields hardly would, and with more of them than there is any wood outscores the right place: a class that would not
+    grow much stays as it is.
     """
     grown = np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
     share = float(band.sum(dtype=np.float64) / max(grown.sum(dtype=np.float64), 1.0))
@@ -203,7 +204,7 @@ def _softened(template: Template, level: Level) -> NDArray[np.float32]:
     bands = template.bands[template.speaking]
     if level.factor == 1:
         return bands
-    kernel = _disc(level.grid.cell_size_m / template.cell_size_m / 2)
+    kernel = _disc(level.grid.cell_size_m / template.cell_size_m)
     for band, at in zip(bands, template.speaking.tolist(), strict=True):
         if level.thinner[at] < 1:
             near = cv2.dilate((band > 0).astype(np.uint8), kernel) > 0

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import product
 from threading import Lock
 from typing import Final, Self
 
@@ -154,16 +155,22 @@ class _Peaks:
 
     def apart(self, most: int, turns: Turns) -> list[int]:
         """Which are best, none of them next to a better one in place, heading and scale at once."""
-        left = np.ones(len(self.score), dtype=bool)
         chosen: list[int] = []
-        while len(chosen) < most and left.any():
-            at = int(left.argmax())
-            chosen.append(at)
-            near = (np.abs(self.row - self.row[at]) <= 1) & (np.abs(self.col - self.col[at]) <= 1)
-            near &= np.abs(wrap_deg(self.yaw_deg - self.yaw_deg[at])) < _NEXT * turns.yaw_step_deg + _NOTHING
-            near &= np.abs(self.scale - self.scale[at]) < _NEXT * turns.scale_step + _NOTHING
-            left &= ~near
+        at_cell: dict[tuple[int, int], list[int]] = {}
+        for at, (row, col) in enumerate(zip(self.row.tolist(), self.col.tolist(), strict=True)):
+            if len(chosen) == most:
+                break
+            cells = product((row - 1, row, row + 1), (col - 1, col, col + 1))
+            if not any(self._is_near(at, other, turns) for cell in cells for other in at_cell.get(cell, ())):
+                chosen.append(at)
+                at_cell.setdefault((row, col), []).append(at)
         return chosen
+
+    def _is_near(self, at: int, other: int, turns: Turns) -> bool:
+        """Whether two have neighbouring headings and scales."""
+        apart_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
+        is_turned = apart_deg >= _NEXT * turns.yaw_step_deg + _NOTHING
+        return not is_turned and abs(self.scale[at] - self.scale[other]) < _NEXT * turns.scale_step + _NOTHING
 
     def mode(self, at: int, point_m: tuple[float, float]) -> Mode:
         """One of them as a mode, its place given in metres."""

@@ -24,21 +24,17 @@ Value = TypeVar("Value", np.float32, np.uint8)
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """A field in cells of `factor` of its own, thin classes spread by half of one: what is near counts as there.
+    """A field in cells of `factor` of its own, thin classes spread by one: what is near counts as there.
 
-    `layers` is uint8 of shape (K + 1, rows, cols), the last one what is known; `thinner`, shape (K + 1,), is the share
-    of the spread area that each class had before, 1 where it is not spread.
+    `cells` is uint8 of shape (rows, cols, K + 1), the last band what is known: all bands of a cell lie together, for
+    they are read together. `thinner`, shape (K + 1,), is the share of the spread area that each class had before, 1
+    where it is not spread.
     """
 
     factor: int
     grid: Grid
-    layers: NDArray[np.uint8]
+    cells: NDArray[np.uint8]
     thinner: NDArray[np.float64]
-
-    @cached_property
-    def used(self) -> NDArray[np.bool_]:
-        """Bands that hold anything, shape (K + 1,)."""
-        return np.array([bool(layer.any()) for layer in self.layers])
 
     def window(self, row: int, col: int, shape: tuple[int, int], bands: NDArray[np.int64]) -> NDArray[np.float32]:
         """Cut some bands, 0..1, zeros beyond the map; shape (len(bands), *shape)."""
@@ -46,7 +42,8 @@ class Level:
         top, left = max(row, 0), max(col, 0)
         bottom, right = min(row + shape[0], self.grid.rows), min(col + shape[1], self.grid.cols)
         if top < bottom and left < right:
-            cut[:, top - row : bottom - row, left - col : right - col] = self.layers[bands, top:bottom, left:right]
+            under = np.moveaxis(self.cells[top:bottom, left:right], -1, 0)
+            cut[:, top - row : bottom - row, left - col : right - col] = under[bands]
         cut /= FULL
         return cut
 
@@ -73,8 +70,8 @@ class Field:
     --------
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4.0, cell_size_m=1.0, rows=4, cols=4)
     >>> town = Field(grid=grid, layers=np.zeros((2, 4, 4), np.uint8), known=np.full((4, 4), FULL, np.uint8))
-    >>> town.level(2).layers.shape
-    (3, 2, 2)
+    >>> town.level(2).cells.shape
+    (2, 2, 3)
     """
 
     grid: Grid
@@ -167,24 +164,25 @@ class Template:
 
 
 def _level(field: Field, factor: int) -> Level:
-    """Spread each thin class by half a large cell, then take means."""
+    """Spread each thin class by a large cell, then take means."""
     grid = field.grid.coarsen(factor)
     if factor == 1:
-        layers = np.concatenate((field.layers, field.known[None]))
-        return Level(factor=1, grid=grid, layers=layers, thinner=np.ones(len(layers)))
-    kernel = _disc(factor / 2)
+        cells = np.stack((*field.layers, field.known), axis=-1)
+        return Level(factor=1, grid=grid, cells=cells, thinner=np.ones(cells.shape[-1]))
+    kernel = _disc(factor)
     spread = [_spread(band, kernel) for band in field.layers]
     bands, thinner = [*(band for band, _ in spread), field.known], [*(share for _, share in spread), 1.0]
     size, around = (grid.cols, grid.rows), ((0, -field.grid.rows % factor), (0, -field.grid.cols % factor))
     pooled = [cv2.resize(np.pad(band, around), size, interpolation=cv2.INTER_AREA) for band in bands]
-    return Level(factor=factor, grid=grid, layers=np.stack(pooled), thinner=np.array(thinner))
+    return Level(factor=factor, grid=grid, cells=np.stack(pooled, axis=-1), thinner=np.array(thinner))
 
 
 def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
     """Spread a class, and what share of its area it had before.
 
-    Lines and houses would be lost in a mean of a large cell. Woods and fields are not, and as more of them than there
-    is they outscore the right place: a class that would not grow much stays as it is.
+    What the view shows may lie a cell off, by place and by heading: lines and houses would be missed there. Woods and
+    fields hardly would, and with more of them than there is any wood outscores the right place: a class that would not
+    grow much stays as it is.
     """
     grown = np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
     share = float(band.sum(dtype=np.float64) / max(grown.sum(dtype=np.float64), 1.0))
@@ -203,7 +201,7 @@ def _softened(template: Template, level: Level) -> NDArray[np.float32]:
     bands = template.bands[template.speaking]
     if level.factor == 1:
         return bands
-    kernel = _disc(level.grid.cell_size_m / template.cell_size_m / 2)
+    kernel = _disc(level.grid.cell_size_m / template.cell_size_m)
     for band, at in zip(bands, template.speaking.tolist(), strict=True):
         if level.thinner[at] < 1:
             near = cv2.dilate((band > 0).astype(np.uint8), kernel) > 0
@@ -253,6 +251,9 @@ def between(frame: Grid, pose: Pose, grid: Grid) -> NDArray[np.float64]:
 
 
 def warped(layer: NDArray[Value], to_layer: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[Value]:
-    """Read a raster on another lattice, linearly between its cells, 0 beyond them; `to_layer` as `between` gives it."""
+    """Read a raster on another lattice, linearly between its cells, 0 beyond them; `to_layer` as `between` gives it.
+
+    It has a shape of (rows, cols), or (rows, cols, bands).
+    """
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(layer, to_layer, shape[::-1], flags=flags), dtype=layer.dtype)

@@ -33,7 +33,7 @@ class Plan:
     """
 
     cells: int = 16
-    beam: tuple[int, ...] = (48, 24, 12, 8, 6)
+    beam: tuple[int, ...] = (160, 48, 16, 8, 6)
     each: int = 2
     spread: float = 2.5
     apart_m: float = 25.0

@@ -23,11 +23,11 @@ _NOTHING: Final = 1e-9
 class Sight:
     """A view in cells about as large as a level's, and the level, to be scored pose by pose.
 
-    `bands`, shape (B, rows, cols), are sums over squares of the view, `frame` their lattice.
+    `bands`, shape (rows, cols, K + 1) as the cells of the level, are sums over squares of the view, `frame` their
+    lattice.
     """
 
     level: Level
-    speaking: NDArray[np.int64]
     bands: NDArray[np.float32]
     frame: Grid
 
@@ -36,21 +36,19 @@ class Sight:
         """Make ready for one level of a map."""
         level = field.level(factor)
         pool = max(1, round(level.grid.cell_size_m / template.cell_size_m))
-        bands, frame = pooled(template, level, pool)
-        heard = level.used[template.speaking]
-        return cls(level=level, speaking=template.speaking[heard], bands=bands[heard], frame=frame)
+        summed, frame = pooled(template, level, pool)
+        bands = np.zeros((*frame.shape, level.cells.shape[-1]), dtype=np.float32)
+        bands[..., template.speaking] = np.moveaxis(summed, 0, -1)
+        return cls(level=level, bands=bands, frame=frame)
 
     def scores(self, pose: Pose, *, reach: int = 1) -> NDArray[np.float64]:
         """Score a pose and those some cells of the frame away; [i, j] is `shifted(pose, i - reach, j - reach)`."""
         rows, cols = self.frame.shape
         wide = self.frame.window(-reach, -reach, rows + 2 * reach, cols + 2 * reach)
-        under = np.empty((len(self.bands), *wide.shape), dtype=np.float32)
-        to_level = between(wide, pose, self.level.grid)
-        for band, at in zip(under, self.speaking.tolist(), strict=True):
-            band[:] = warped(self.level.layers[at], to_level, wide.shape)
+        under = warped(self.level.cells, between(wide, pose, self.level.grid), wide.shape).astype(np.float32)
         shifts = range(2 * reach + 1)
-        windows = ((under[:, row : row + rows, col : col + cols] for col in shifts) for row in shifts)
-        return np.array([[np.einsum("bij,bij", cut, self.bands) for cut in row] for row in windows]) / FULL
+        windows = ((under[row : row + rows, col : col + cols] for col in shifts) for row in shifts)
+        return np.array([[np.einsum("ijb,ijb", cut, self.bands) for cut in row] for row in windows]) / FULL
 
     def score(self, pose: Pose) -> float:
         """Score a pose alone."""

@@ -14,9 +14,11 @@ from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.search.dense import _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.find import exhaustive, rank, score_at, search
 from sasgeo_bench.search.plan import Plan, posterior
+from sasgeo_bench.search.space import all_around
 
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
 AGREE, EXTRA, MISSED = 1.0, 0.6, 0.4
@@ -266,6 +268,32 @@ def test_what_does_not_fit_is_refused():
         Template(weights=np.full((1, 2, 2), np.nan, np.float32), known=np.zeros((2, 2), np.float32), cell_size_m=1.0)
     with pytest.raises(ShapeError, match="weights"):
         Template(weights=np.zeros((1, 2, 2), np.float32), known=np.zeros((3, 2), np.float32), cell_size_m=1.0)
+
+
+def test_only_what_is_thin_is_spread_on_large_cells():
+    layers = np.zeros((2, 64, 64), dtype=np.uint8)
+    layers[0, 32] = layers[1, :, 16:56] = 1
+    level = as_field(a_grid(64), layers).level(8)
+    road, wood, _ = np.moveaxis(level.cells, -1, 0) / FULL
+    assert np.flatnonzero(road[:, 0]).tolist() == [3, 4, 5]
+    assert np.flatnonzero(wood[0]).tolist() == [2, 3, 4, 5, 6]
+    assert level.thinner.tolist() == pytest.approx([1 / 17, 1.0, 1.0])
+
+
+def test_peaks_beside_a_better_one_are_dropped():
+    rng = np.random.default_rng(0)
+    turns = all_around(10.0)
+    yaw_deg, row, col = 10.0 * rng.integers(0, 36, 500), rng.integers(0, 12, 500), rng.integers(0, 12, 500)
+    score = np.sort(rng.random(500).astype(np.float32))[::-1]
+    peaks = _Peaks(score=score, row=row, col=col, yaw_deg=yaw_deg, scale=np.ones(500))
+    chosen: list[int] = []
+    for at in range(500):
+        turned = abs(wrap_deg(yaw_deg[chosen] - yaw_deg[at])) < 15.0
+        beside = np.maximum(abs(row[chosen] - row[at]), abs(col[chosen] - col[at])) <= 1
+        if not (turned & beside).any():
+            chosen.append(at)
+    assert peaks.apart(500, turns) == chosen
+    assert peaks.apart(7, turns) == chosen[:7]
 
 
 def test_a_posterior_sums_to_one_and_grows_with_the_score():

@@ -32,6 +32,8 @@ class Switches:
         Eq. 6: what is rare on the map weighs more.
     is_stamped : bool
         Eq. 5 feature by feature: what nobody has edited for years is worth what it was learnt to be worth.
+    knows_age : bool
+        Else every map is taken for one of today: what of fitted weights is not stability.
 
     Examples
     --------
@@ -44,6 +46,7 @@ class Switches:
     has_graph: bool = True
     is_distinctive: bool = False
     is_stamped: bool = False
+    knows_age: bool = True
 
     @property
     def learns(self) -> bool:
@@ -61,6 +64,7 @@ class Switches:
         """Gains of Eq. 7 for a map of an age and a season, for classes in the order of what was learnt."""
         if self.weights == "even":
             return even_gains(learnt.classes)
+        age_years = age_years if self.knows_age else 0.0
         if self.weights == "hand":
             return hand_gains(learnt.classes, age_years=age_years, persists=by_hand(season, learnt.classes).tolist())
         persists = learnt.persists(season).tolist()

@@ -119,6 +119,22 @@ class SasgeoDistinct(LearningMatcher):
     switches = Switches(is_distinctive=True)
 
 
+class SasgeoAgeless(LearningMatcher):
+    """The whole scorer, which takes every map for one of today."""
+
+    card = _card(
+        "sasgeo_ageless",
+        "SASGeo without the age of the map",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights",
+        _GRAPH.format(how="learnt"),
+        _SILENT,
+        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+    )
+    switches = Switches(knows_age=False)
+
+
 class SasgeoStamped(LearningMatcher):
     """The whole scorer with each feature by its own age."""
 

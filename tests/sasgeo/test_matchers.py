@@ -15,6 +15,7 @@ from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.protection import PROTECTION
 from sasgeo_bench.sasgeo.variants import (
     Sasgeo,
+    SasgeoAgeless,
     SasgeoDistinct,
     SasgeoGraph,
     SasgeoHand,
@@ -24,8 +25,18 @@ from sasgeo_bench.sasgeo.variants import (
     SasgeoStamped,
 )
 
-ALL = (SasgeoRaster, SasgeoGraph, SasgeoStability, Sasgeo, SasgeoHand, SasgeoDistinct, SasgeoStamped, SasgeoNoGraph)
-LEARNERS = {SasgeoStability, Sasgeo, SasgeoDistinct, SasgeoStamped, SasgeoNoGraph}
+ALL = (
+    SasgeoRaster,
+    SasgeoGraph,
+    SasgeoStability,
+    Sasgeo,
+    SasgeoHand,
+    SasgeoDistinct,
+    SasgeoStamped,
+    SasgeoAgeless,
+    SasgeoNoGraph,
+)
+LEARNERS = {SasgeoStability, Sasgeo, SasgeoDistinct, SasgeoStamped, SasgeoAgeless, SasgeoNoGraph}
 
 
 def first(tiny, track, **wanted):
@@ -62,6 +73,15 @@ def test_cards_are_full_and_say_who_learns(arm):
 def test_switches_tell_the_arms_apart():
     assert len({arm.switches for arm in ALL}) == len(ALL)
     assert len({arm.card.name for arm in ALL}) == len(ALL)
+
+
+def test_an_arm_without_age_weighs_every_map_as_one_of_today():
+    learnt = Learnt.by_hand(["building", "railway"])
+    young, old = (SasgeoAgeless.switches.gains(learnt, age_years=age) for age in (0.0, 30.0))
+    aged = Sasgeo.switches.gains(learnt, age_years=30.0)
+    assert (young.agree == old.agree).all()
+    assert (aged.agree < old.agree).all()
+    assert (Sasgeo.switches.gains(learnt, age_years=0.0).missed == young.missed).all()
 
 
 @pytest.mark.parametrize("arm", ALL)

@@ -12,8 +12,8 @@ lie where at least 3 % is drawn: `noise-free`, `perceived` with a detector's err
 searched for on the old map.
 
 Speed: each row is a process of its own that holds the map, searches once to make the pyramid of the map ("first"), and
-then once a view; medians. Its memory is all that was resident at most, imports and map included. Beyond the region the
-map is mirrored. Exhaustive is every cell of the map at every step of heading, for one view.
+then once a view; medians. Its memory is all that was resident at most, imports and map included (Linux). Beyond the
+region the map is mirrored. Exhaustive is every cell of the map at every step of heading, for one view.
 
 Agreement: within one cell in easting and in northing and one step of heading. Of the rest each line gives what the two
 places score on the map's own cells and why: `better` where the search's place, between cells, scores at least as much
@@ -27,7 +27,6 @@ import datetime as dt
 import json
 import math
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -208,8 +207,13 @@ def measured(path: Path, threads: int, step_deg: float) -> dict[str, float]:
             for template in templates
         ]
     wall_s, cpu_s = (statistics.median(column) for column in zip(*each, strict=True))
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
-    return {"first_s": first[0], "wall_s": wall_s, "cpu_s": cpu_s, "peak_mb": peak_mb}
+    return {"first_s": first[0], "wall_s": wall_s, "cpu_s": cpu_s, "peak_mb": peak_mb()}
+
+
+def peak_mb() -> float:
+    """Most that was resident; `getrusage` would count what the parent held when it started this process."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024 / 1e6
 
 
 def in_a_process(path: Path, threads: int, step_deg: float = 0.0) -> dict[str, float]:
@@ -357,6 +361,7 @@ def main() -> None:
     parser.add_argument("--old", type=dt.date.fromisoformat, default=dt.date(2015, 7, 27), help="date of the older map")
     parser.add_argument("--extracts", type=Path, action="append", default=[])
     parser.add_argument("--runs", type=int, default=7, help="views of each row of the tables of cost")
+    parser.add_argument("--tables", nargs="+", choices=("speed", "costs"), default=("speed", "costs"))
     parser.add_argument("--agree", type=int, default=0, help="views of each kind to compare with the exhaustive search")
     parser.add_argument("--kinds", nargs="+", choices=[kind.name for kind in KINDS], default=[k.name for k in KINDS])
     parser.add_argument("--size", type=int, default=SIDE_CELLS, help="cells of the map a side: its middle")
@@ -379,8 +384,10 @@ def main() -> None:
         bench.agreements()
         return
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
-        bench.speed(Path(folder))
-        bench.costs(Path(folder))
+        if "speed" in given.tables:
+            bench.speed(Path(folder))
+        if "costs" in given.tables:
+            bench.costs(Path(folder))
 
 
 if __name__ == "__main__":

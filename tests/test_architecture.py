@@ -41,6 +41,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "shapes": None,
     "network": None,
     "graph": None,
+    "vectors": None,
     "region": None,
     "search": ("field", "plan", "space", "dense", "sight", "find"),
     "camera": None,
@@ -92,9 +93,11 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "sasgeo": (
         *("rates", "seasons", "stamps", "temper", "weights", "raster", "distinct"),
         *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
-        *("temporal", "joint", "learnt", "arms", "worth", "reading", "lookalike", "learning"),
+        *("temporal", "joint", "learnt", "arms", "reading", "learning"),
         *("integrity", "protection", "conformal", "frame", "rejectors", "matchers", "variants"),
     ),
+    "worth": None,
+    "lookalike": None,
     "plugins": None,
     "run": (
         *("sandbox", "wire", "serve", "child", "worker", "oracle"),
@@ -213,6 +216,24 @@ def file_faults(sources: Mapping[str, str]) -> list[str]:
     return faults
 
 
+# Rooms that draw what is asked, and rooms that answer it: a scorer that used a generator's code would know too much.
+GENERATORS = ("ageing", "perturb", "suites", "twin", "draw", "tasks")
+SCORERS = ("search", "sasgeo")
+
+
+def shared_code_faults(sources: Mapping[str, str]) -> list[str]:
+    """One line for each import of a generator in a scorer, and the other way round."""
+    modules = {module_name(path) for path in sources}
+    faults = []
+    for path, text in sorted(sources.items()):
+        room = module_name(path).split(".")[0]
+        barred = GENERATORS if room in SCORERS else SCORERS if room in GENERATORS else ()
+        for line, target in imported_modules(ast.parse(text), modules):
+            if target.split(".")[0] in barred:
+                faults.append(f"{path}:{line} imports {target}: generator and scorer share no code")
+    return faults
+
+
 @pytest.fixture(scope="module")
 def sources() -> dict[str, str]:
     """The files of the package, by their path inside it."""
@@ -221,6 +242,12 @@ def sources() -> dict[str, str]:
 
 def test_every_file_has_a_room_and_imports_only_what_stands_above_it(sources: dict[str, str]) -> None:
     faults = house_faults(sources, HOUSE)
+    assert not faults, "\n".join(faults)
+
+
+def test_generator_and_scorer_share_no_code(sources: dict[str, str]) -> None:
+    assert {module_name(path).split(".")[0] for path in sources} >= {*GENERATORS, *SCORERS}
+    faults = shared_code_faults(sources)
     assert not faults, "\n".join(faults)
 
 
@@ -276,6 +303,16 @@ def test_imports_of_rooms_above_and_of_other_packages_are_no_violation() -> None
     }
     house = {"errors": None, "grid": None, "extract": ("locate", "read"), "cli": None}
     assert house_faults(sources, house) == []
+
+
+def test_made_up_shared_code_is_found() -> None:
+    files = {"suites/base.py": "from sasgeo_bench.search.find import find", "perturb/base.py": "import numpy"}
+    other = {
+        "sasgeo/arms.py": "from sasgeo_bench.suites import base",
+        "sasgeo/rates.py": "from sasgeo_bench import grid",
+    }
+    assert shared_code_faults(files) == ["suites/base.py:1 imports search.find: generator and scorer share no code"]
+    assert len(shared_code_faults(other)) == 1
 
 
 @pytest.mark.parametrize("call", ["open('a')", "Path('a').read_text()", "rasterio.open('a')", "table.to_parquet('a')"])

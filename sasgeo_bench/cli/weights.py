@@ -12,11 +12,16 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import Out, print_table
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.lookalike import SIDE_M, find_lookalike, sheet_of
 from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.lookalike import SIDE_M, find_lookalike, sheet_of
-from sasgeo_bench.sasgeo.worth import (
+from sasgeo_bench.store.learnedfile import read_learned
+from sasgeo_bench.store.lookalikeplot import draw_lookalike
+from sasgeo_bench.store.regiondir import MANIFEST, read_region
+from sasgeo_bench.store.weightplot import WeightSheet, draw_weights, top_of
+from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench.worth import (
     AGES_YEARS,
     FITTED,
     HAND,
@@ -29,11 +34,6 @@ from sasgeo_bench.sasgeo.worth import (
     worth_of,
     worth_table,
 )
-from sasgeo_bench.store.learnedfile import read_learned
-from sasgeo_bench.store.lookalikeplot import draw_lookalike
-from sasgeo_bench.store.regiondir import MANIFEST, read_region
-from sasgeo_bench.store.weightplot import WeightSheet, draw_weights, top_of
-from sasgeo_bench.taxonomy import load_taxonomy
 
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
 WORTH: Final = (

@@ -24,6 +24,8 @@ from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.store.taskrows import pairs_from, query_from
 
 MOST_MAPS: Final = 2  # in memory while a matcher learns, as long as it keeps none itself
+# What of this package answers are made with: a change there may change them, so they are asked for anew.
+TOOLS: Final = ("evidence", "graph", "network", "search", "vectors")
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
@@ -135,7 +137,9 @@ class Maps(Mapping[str, Region]):
 
 
 def code_hash(matcher: Matcher) -> str:
-    """SHA-256 of the file a matcher's class is in and of all Python files beside and below it, by their names.
+    """SHA-256 of the code answers come from: a plugin's own, and what it has loaded of `TOOLS`.
+
+    Its own is the file its class is in or, in a package, all Python files beside and below it, by their names.
 
     Examples
     --------
@@ -151,8 +155,13 @@ def code_hash(matcher: Matcher) -> str:
     own = Path(name)
     is_package = "." in type(matcher).__module__ or own.name == "__init__.py"
     files = sorted(own.parent.rglob("*.py")) if is_package else [own]
-    for path in files:
-        digest.update(path.relative_to(own.parent).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    named = {path.relative_to(own.parent).as_posix(): path for path in files}
+    loaded = [sys.modules.get(f"sasgeo_bench.{tool}") for tool in TOOLS]
+    for path in (Path(tool.__file__) for tool in loaded if tool is not None and tool.__file__):
+        for part in sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]:
+            named[f"sasgeo_bench:{part.relative_to(path.parent.parent).as_posix()}"] = part
+    for shown, path in named.items():
+        digest.update(shown.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
 

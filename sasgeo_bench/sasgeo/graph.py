@@ -104,7 +104,7 @@ def verify(
     >>> from sasgeo_bench.evidence import Evidence
     >>> from sasgeo_bench.graph import build_graph
     >>> from sasgeo_bench.grid import Grid
-    >>> from sasgeo_bench.suites.vectors import as_features, vector_table
+    >>> from sasgeo_bench.vectors import as_features, vector_table
     >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
     >>> lines = shapely.from_wkt(ways)
     >>> streets = vector_table([("road_minor", 0, False, line) for line in lines])

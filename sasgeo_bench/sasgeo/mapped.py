@@ -62,7 +62,7 @@ class MappedGraph:
         --------
         >>> import shapely
         >>> from sasgeo_bench.graph import build_graph
-        >>> from sasgeo_bench.suites.vectors import as_features, vector_table
+        >>> from sasgeo_bench.vectors import as_features, vector_table
         >>> house = as_features(vector_table([("building", 0, False, shapely.box(5, 5, 9, 9))]))
         >>> grid = Grid(epsg=32632, west_m=0.0, north_m=20.0, cell_size_m=1.0, rows=20, cols=20)
         >>> mapped = MappedGraph.make(build_graph(house), house, known=np.ones((20, 20), dtype=bool), grid=grid)

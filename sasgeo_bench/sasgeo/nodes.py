@@ -290,7 +290,7 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
 
     Examples
     --------
-    >>> from sasgeo_bench.suites.vectors import as_features, vector_table
+    >>> from sasgeo_bench.vectors import as_features, vector_table
     >>> row = [("building", 0, False, shapely.box(at, 0, at + 9, 9)) for at in (0, 9, 50)]
     >>> patches_of(as_features(vector_table(row))).area_m2.tolist()
     [162.0, 81.0]

@@ -22,7 +22,7 @@ from sasgeo_bench.sasgeo.kinds import INDEX, KINDS, PATCHES, ROADS, Drawing
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes, arms_of, nodes_of, nothing, patches_of
 from sasgeo_bench.sasgeo.skeleton import lines_of_mask
 from sasgeo_bench.shapes import delaunay_pairs
-from sasgeo_bench.suites.vectors import as_features, instances_of_mask, vector_table
+from sasgeo_bench.vectors import as_features, instances_of_mask, vector_table
 
 MARGIN_M: Final = 8.0  # of what is known, where a thing may have slipped out of it
 NEAR_M: Final = 80.0  # neighbours whose relative place is looked at

@@ -77,7 +77,7 @@ def proposals(
     >>> from sasgeo_bench.graph import build_graph
     >>> from sasgeo_bench.grid import Grid
     >>> from sasgeo_bench.pose import inverse
-    >>> from sasgeo_bench.suites.vectors import as_features, vector_table
+    >>> from sasgeo_bench.vectors import as_features, vector_table
     >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
     >>> lines = shapely.from_wkt(ways)
     >>> grid = Grid(epsg=32632, west_m=-96.0, north_m=96.0, cell_size_m=2.0, rows=96, cols=96)

@@ -55,7 +55,7 @@ class LookalikeSheet:
     worth : mapping of str to float
         Of each class, where its surroundings are as rare as the map's mean.
     scores, terms : pandas.DataFrame
-        As those of `sasgeo.lookalike.Lookalike`.
+        As those of `lookalike.Lookalike`.
     panels : tuple of str
         A title for each of the four panels.
     worth_name : str

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, SuiteCard, Variant
 from sasgeo_bench.suites.twins import TWIN_GROUP, TwinSuite
-from sasgeo_bench.suites.vectors import instances_of_mask
 from sasgeo_bench.twin import Change, split_long
+from sasgeo_bench.vectors import instances_of_mask
 
 HOUSE_M: Final = 7.0
 LEAST_AREA_M2: Final = 160.0

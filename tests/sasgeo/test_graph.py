@@ -20,7 +20,8 @@ from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.suites.base import State
 from sasgeo_bench.suites.local_warp import bent
-from sasgeo_bench.suites.vectors import VectorNoise, as_features, perceive_vectors, vector_table
+from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
+from sasgeo_bench.vectors import as_features, vector_table
 
 WAYS = (
     *("LINESTRING (-97 -20, -40 -20, 20 -20, 97 -20)", "LINESTRING (-40 -20, -40 97)", "LINESTRING (20 -20, 20 -97)"),

@@ -29,8 +29,8 @@ from sasgeo_bench.store.sheet import (
     write_sheet,
 )
 from sasgeo_bench.store.splitmap import COLOURS, colour_of, write_split_map
-from sasgeo_bench.suites.vectors import vector_table
 from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench.vectors import vector_table
 
 CLASSES = ("road_major", "building")
 cells = arrays(np.uint8, (2, 4, 5), elements=st.integers(0, 2))

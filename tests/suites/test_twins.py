@@ -14,9 +14,10 @@ from sasgeo_bench.suites.mining import least_apart_m
 from sasgeo_bench.suites.sites import choose_sites
 from sasgeo_bench.suites.topology_twins import either
 from sasgeo_bench.suites.twins import OFF_M, find_targets
-from sasgeo_bench.suites.vectors import VectorNoise, as_features, perceive_vectors
+from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.suites.volatile_lure import STABLE, VOLATILE
 from sasgeo_bench.twin import around, paste
+from sasgeo_bench.vectors import as_features
 
 TWINS = ("topology-twins", "instance-twins", "grade-separation", "volatile-lure", "alias")
 CHANGED = ("topology-twins", "instance-twins", "grade-separation")  # by one change, which vectors show

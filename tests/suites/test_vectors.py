@@ -16,15 +16,8 @@ from sasgeo_bench.graph import build_graph
 from sasgeo_bench.perturb.local_warp import LocalWarp, folded_share, warped
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.suites.local_warp import bent
-from sasgeo_bench.suites.vectors import (
-    VECTOR_CLASSES,
-    VectorNoise,
-    as_features,
-    instances_of_mask,
-    perceive_vectors,
-    smooth_shift,
-    vector_table,
-)
+from sasgeo_bench.suites.vectors import VECTOR_CLASSES, VectorNoise, perceive_vectors, smooth_shift
+from sasgeo_bench.vectors import as_features, instances_of_mask, vector_table
 
 EXACT = VectorNoise(missed_share=0.0, gap_share=0.0, shift_m=0.0)
 EAST, NORTH = 5000.0, 7000.0

@@ -18,12 +18,12 @@ from sasgeo_bench.region import Region
 from sasgeo_bench.sasgeo.arms import Switches
 from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.reading import Glance, Reader
-from sasgeo_bench.sasgeo.worth import rarity_map, weight_map, worth_of
 from sasgeo_bench.search.find import rank
 from sasgeo_bench.store.lookalikeplot import LookalikeSheet
 from sasgeo_bench.store.weightplot import top_of
 from sasgeo_bench.suites.base import State
 from sasgeo_bench.suites.mining import RINGS, Windows, describe, least_apart_m
+from sasgeo_bench.worth import rarity_map, weight_map, worth_of
 
 VARIED: Final = 0.1  # share of the places that are most varied, among which one is chosen
 LEAST_DRAWN: Final = 0.05  # of a place's ground: with less there is nothing to confuse

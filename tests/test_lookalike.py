@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.lookalike import find_lookalike, find_pair
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.lookalike import find_lookalike, find_pair
-from sasgeo_bench.sasgeo.worth import HAND
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.suites.mining import RINGS, Windows, least_apart_m
+from sasgeo_bench.worth import HAND
 
 
 def windows(shares, *, spacing_m):

@@ -11,7 +11,8 @@ from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.rates import ClassRates
 from sasgeo_bench.sasgeo.seasons import by_hand
 from sasgeo_bench.sasgeo.weights import information
-from sasgeo_bench.sasgeo.worth import (
+from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench.worth import (
     FITTED,
     HAND,
     check_age,
@@ -22,7 +23,6 @@ from sasgeo_bench.sasgeo.worth import (
     worth_of,
     worth_table,
 )
-from sasgeo_bench.taxonomy import load_taxonomy
 
 NAMES = load_taxonomy().names
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)

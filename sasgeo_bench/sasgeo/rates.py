@@ -174,6 +174,7 @@ def tally(
     """
 
     def count(state: int) -> NDArray[np.int64]:
+        """Cells of one state by class and ring."""
         return np.stack(
             [
                 np.bincount(ring[view == state], minlength=NOWHERE + 1)[: FAR + 1]
@@ -330,6 +331,7 @@ def _fitted(
         return np.asarray(np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS)
 
     def loss(vector: NDArray[np.float64]) -> float:
+        """Of all blocks and the prior."""
         return float(losses(vector).sum() + 0.5 * (((vector - start) / _PRIOR_WIDTH) ** 2).sum())
 
     best = optimize.minimize(loss, start, method="L-BFGS-B").x
@@ -348,6 +350,7 @@ def _deviations(
     slopes = np.stack([(losses(best + step) - losses(best - step)) / (2 * _STEP) for step in steps])
 
     def slope(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of the sum of all blocks."""
         return np.array([(losses(vector + step) - losses(vector - step)).sum() / (2 * _STEP) for step in steps])
 
     bend = np.stack([(slope(best + step) - slope(best - step)) / (2 * _STEP) for step in steps])

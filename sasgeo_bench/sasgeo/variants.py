@@ -28,6 +28,7 @@ _LIMITS: Final = (
     "headings and scales beyond 2.5 standard deviations are not searched; places are 2 m apart before they are "
     "refined; where the heading is known the graph finds no place that the raster has not found"
 )
+_UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIMITS}"
 
 
 def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -> MatcherCard:
@@ -69,7 +70,7 @@ class SasgeoStability(LearningMatcher):
         _FITTED,
         _GRAPH.format(how="learnt"),
         _BLIND,
-        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+        limits=_UNTAUGHT,
     )
     switches = Switches(is_unknown_silent=False)
 
@@ -84,7 +85,7 @@ class Sasgeo(LearningMatcher):
         _FITTED,
         _GRAPH.format(how="learnt"),
         _SILENT,
-        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+        limits=_UNTAUGHT,
     )
     switches = Switches()
 
@@ -114,7 +115,7 @@ class SasgeoDistinct(LearningMatcher):
         "cells weigh by -log of the share of the map's configurations that are of their kind (Eq. 6)",
         _GRAPH.format(how="learnt"),
         _SILENT,
-        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+        limits=_UNTAUGHT,
     )
     switches = Switches(is_distinctive=True)
 
@@ -130,7 +131,7 @@ class SasgeoAgeless(LearningMatcher):
         "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights",
         _GRAPH.format(how="learnt"),
         _SILENT,
-        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+        limits=_UNTAUGHT,
     )
     switches = Switches(knows_age=False)
 
@@ -146,7 +147,7 @@ class SasgeoStamped(LearningMatcher):
         "features weigh by how long nobody had edited them when the map was taken, learnt by class in four strata",
         _GRAPH.format(how="learnt"),
         _SILENT,
-        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+        limits=_UNTAUGHT,
     )
     switches = Switches(is_stamped=True)
 
@@ -176,6 +177,6 @@ class SasgeoNoGraph(LearningMatcher):
         "Eqs. 5, 7-8, 12-14",
         _FITTED,
         _SILENT,
-        limits=f"Without train places its rates are those set by hand; {_LIMITS}",
+        limits=_UNTAUGHT,
     )
     switches = Switches(has_graph=False)

@@ -39,6 +39,7 @@ def dense(
     locks = [Lock() for _ in tiles]
 
     def peaks_of(base: Pose) -> list[tuple[int, _Peaks]]:
+        """Of one heading on every tile it speaks to; notes the highest score of each place."""
         found = []
         for at, turn, score in votes.scores(base):
             score[~tiles[at].allowed] = _LOW

@@ -12,10 +12,10 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scored_task
-from sasgeo_bench.entries import AS_SUBMITTED, Entry, find_entries
+from sasgeo_bench.entries import AS_SUBMITTED, Entry, find_entries, leave_out
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.query import CONTROLS, TASK_VERSION
+from sasgeo_bench.query import CONTROLS, TASK_VERSION, base_of
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
@@ -74,6 +74,8 @@ class ScoreRequest:
         Name and hash of the pipeline that asks for it; none for a board of `score`.
     extras : sequence of callable
         Each makes, of the finished board, files that are written with it.
+    without : collection of str
+        Regions that are left out, on each of their maps.
     """
 
     predictions: Sequence[Path]
@@ -88,6 +90,7 @@ class ScoreRequest:
     by_region: Collection[str] = ()
     pipeline: Mapping[str, str] = field(default_factory=dict)
     extras: Sequence[Callable[["Board"], Extra]] = ()
+    without: Collection[str] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +141,10 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
-    told = _read_told(request, find_entries(request.predictions), tell)
-    folders = list(dict.fromkeys(request.tasks)) or sorted({folder for item in told for folder in item.held})
+    told = _read_told(request, leave_out(find_entries(request.predictions), request.without), tell)
+    folders = list(dict.fromkeys(_kept(request.tasks, request.without))) or sorted(
+        {folder for item in told for folder in item.held}
+    )
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
     for item in told:
         if item.entry.how == AS_SUBMITTED:
@@ -193,6 +198,11 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _kept(tasks: Sequence[Path], regions: Collection[str]) -> list[Path]:
+    """Task folders but those of some regions."""
+    return [folder for folder in tasks if base_of(folder.name) not in regions]
 
 
 def _check_some(scores: Mapping[str, pd.DataFrame]) -> None:
@@ -276,7 +286,7 @@ class _Told:
 def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> list[_Told]:
     """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves."""
     files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
-    folders = list(request.tasks) or _named(entries, request.root)
+    folders = _kept(request.tasks, request.without) or _named(entries, request.root)
     folders = list(dict.fromkeys([*folders, *(() if request.tasks else held_tasks(files.values(), request.root))]))
     tasks = [AskedTask.of(folder) for folder in folders]
     told: list[_Told] = []
@@ -383,6 +393,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
         "by_region": sorted(request.by_region),
+        "without": sorted(set(request.without)),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "remarks": list(board.remarks),
         "entries": [

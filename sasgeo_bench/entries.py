@@ -2,14 +2,16 @@
 """Who is to be scored: matchers as they were run, and files of predictions."""
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
 from sasgeo_bench.matcher import check_name
 from sasgeo_bench.metrics.cost import run_cost
+from sasgeo_bench.query import base_of
 from sasgeo_bench.report.rows import is_unranked
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store import rundir
@@ -101,6 +103,38 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
         message = f"two contestants are named {twice!r}: rename the file of one"
         raise ConfigError(message)
     return tuple(sorted(entries, key=lambda entry: entry.name))
+
+
+def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Entry, ...]:
+    """Leave out what was run on some regions, on each of their maps; who is left without a run is left out.
+
+    Raises
+    ------
+    ConfigError
+        If no run is on one of them, or an entry is a file, which does not say where its queries are.
+
+    Examples
+    --------
+    >>> leave_out((), ())
+    ()
+    """
+    if not regions:
+        return entries
+    file = next((entry for entry in entries if not entry.runs), None)
+    if file is not None:
+        message = f"{file.sources[0]} is a file of predictions, of which no region can be left out: name runs alone"
+        raise ConfigError(message)
+    known = {base_of(about["region"]) for entry in entries for about in entry.runs}
+    unknown = sorted(set(regions) - known)
+    if unknown:
+        message = f"no run is on {unknown[0]!r}: regions that can be left out are {', '.join(sorted(known))}"
+        raise ConfigError(message)
+    kept = [[base_of(about["region"]) not in regions for about in entry.runs] for entry in entries]
+    return tuple(
+        replace(entry, sources=tuple(compress(entry.sources, keep)), runs=tuple(compress(entry.runs, keep)))
+        for entry, keep in zip(entries, kept, strict=True)
+        if any(keep)
+    )
 
 
 def _is_new(path: Path, seen: set[Path]) -> bool:

@@ -17,11 +17,10 @@ from sasgeo_bench.paper.task import region_name
 from sasgeo_bench.paperboard import paper_extra
 from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.plugins import check_names
-from sasgeo_bench.query import CONTROLS, PriorGroup
+from sasgeo_bench.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.rows import YARDSTICK, is_unranked
 from sasgeo_bench.request import Request, Wanted, plan_requests
-from sasgeo_bench.run.lesson import base_of
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits

@@ -25,6 +25,17 @@ BLIND: Final = "all unknown"
 YAW_SIGMA_DEG: Final = {"known": 5.0, "weak": 20.0, "unknown": None}
 
 
+def base_of(region: str) -> str:
+    """The region of a map, whatever its date and edits.
+
+    Examples
+    --------
+    >>> base_of("vaduz@2013-08-03+alias")
+    'vaduz'
+    """
+    return region.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PriorGroup:
     """How much is known before matching; results are never ranked across groups.

@@ -13,7 +13,7 @@ from sasgeo_bench.matcher import SAME_PLACE_M
 from sasgeo_bench.metrics.pose import first_pose, pose_errors
 from sasgeo_bench.metrics.ranking import MISS, Rank, rank_candidate, rank_of
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Head, Truth
+from sasgeo_bench.query import Head, Truth, base_of
 from sasgeo_bench.results import Prediction
 
 SCORER_VERSION: Final = 3  # raised whenever the same predictions get other figures; rows of two never share a board
@@ -175,7 +175,7 @@ def _score(
     if truth.is_present and head.track == "retrieval":
         rank = _rank(prediction, truth, head.candidates)
         is_right = fix is not None and rank.right > 0 and _is_at(fix, head.candidates[truth.candidate])
-    base = head.region.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+    base = base_of(head.region)
     return Score(
         query_id=head.query_id,
         track=head.track,

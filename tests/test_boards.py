@@ -512,6 +512,26 @@ def test_who_was_asked_nothing_of_a_task_is_not_on_the_board_of_its_suite(out):
         told_by(out, out / "runs" / "partly", tasks=[out / "tasks" / "clean" / town for town in TOWNS])
 
 
+def test_a_region_that_is_left_out_is_as_if_it_had_never_been_asked(out):
+    alone, _ = told_by(out, out / "runs", tasks=[out / "tasks" / "clean" / TOWNS[0]])
+    board, lines = told_by(out, out / "runs", without=[TOWNS[1]])
+    pd.testing.assert_frame_equal(alone.table, board.table)
+    assert not any("left out" in line for line in lines)
+    said = json.loads((out / "boards" / "mine" / "board.json").read_text())
+    assert said["without"] == [TOWNS[1]]
+    assert [task["region"] for task in said["tasks"]] == [TOWNS[0]]
+
+
+def test_what_cannot_be_left_out_is_told(out, tmp_path):
+    with pytest.raises(ConfigError, match=f"no run is on 'nowhere': regions that can be left out are {TOWNS[0]}, "):
+        told_by(out, out / "runs", without=["nowhere"])
+    with pytest.raises(ConfigError, match="there is nothing to score"):
+        told_by(out, out / "runs", without=TOWNS)
+    submission(out, tmp_path / "mine.parquet")
+    with pytest.raises(ConfigError, match=r"mine.parquet is a file of predictions, of which no region can be left out"):
+        told_by(out, tmp_path / "mine.parquet", without=TOWNS[:1])
+
+
 def test_two_files_of_one_name_are_refused(out, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

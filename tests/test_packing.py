@@ -14,6 +14,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.packing import laid_out, pack_board, stored_settings
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.query import base_of
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.store import packfile
 from sasgeo_bench.store.packfile import read_settings
@@ -87,6 +88,19 @@ def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     (said,) = [line for line in lines if f"{count} predictions" in line]
     assert said.startswith(f"{folder}: 0.")
     assert read_settings(folder)["dropped"] == ""
+
+
+def test_stored_results_are_scored_without_a_region(kept, program, tmp_path):
+    _, _, folder, _ = kept
+    towns = pq.read_table(folder / "tasks.parquet", columns=["region_json"])["region_json"].to_pylist()
+    region = json.loads(next(item for item in towns if item))["id"]
+    code, _, err = program(
+        "score", "--predictions", folder, "--name", "fewer", "--without", region, "--draws", "100", "--out", tmp_path
+    )
+    assert code in {0, 3}, err
+    scores = pd.read_parquet(tmp_path / "boards" / "fewer" / "scores.parquet")
+    assert len(scores)
+    assert region not in {base_of(name) for name in scores["region"]}
 
 
 def test_what_is_too_large_is_stored_without_headings_or_refused_and_the_old_one_stays(kept, tmp_path):

@@ -58,6 +58,9 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         ),
     ] = None,
     region_folders: RegionFolders = None,
+    without: Annotated[
+        list[str] | None, typer.Option(help="region whose queries are left out, on each of its maps; may be repeated")
+    ] = None,
     draws: Annotated[
         int | None,
         typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
@@ -87,6 +90,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         by_region=stored.by_region,
         pipeline=stored.pipeline,
         extras=(figures,),
+        without=without or (),
     )
     with laid_out(request) as request_laid:
         board = make_board(request_laid, tell=tell)

@@ -11,6 +11,7 @@ from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table,
 from sasgeo_bench.duplicates import constellations, search_split
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.panels import panels
+from sasgeo_bench.query import base_of
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.split import make_split
 from sasgeo_bench.store.catalog import (
@@ -59,7 +60,7 @@ def _check_target(target: str, out: Path) -> None:
     if suite not in EVERY_SUITE or (region and Path(target).is_dir()):
         return
     made = sorted(path.parent.name for path in (out / "tasks" / suite).glob(f"*/{TASK}"))
-    near = [name for name in made if name.split("+")[0].split("@")[0] == region.split("+")[0].split("@")[0]] or made
+    near = [name for name in made if base_of(name) == base_of(region)] or made
     there = ", ".join(f"{suite}/{name}" for name in near[:8]) or "none of this suite: make-queries first"
     message = f"{out / 'tasks'} holds no task {target}; there is {there}"
     raise ConfigError(message)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
-from sasgeo_bench.query import Truth
+from sasgeo_bench.query import Truth, base_of
 from sasgeo_bench.split import Block, Split, nearest_blocks
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.regiondir import read_manifest
@@ -48,17 +48,6 @@ class Lesson:
     def to_text(self) -> str:
         """As in "24 queries of 3 places (monaco, porto, prague)"."""
         return f"{counted(self.count, 'query', 'queries')} of {named(self.places, 'place')}"
-
-
-def base_of(region: str) -> str:
-    """The region of a map, whatever its date and edits.
-
-    Examples
-    --------
-    >>> base_of("vaduz@2013-08-03+alias")
-    'vaduz'
-    """
-    return region.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,6 +21,7 @@ from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
+from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
@@ -107,6 +108,7 @@ class Board:
     predictions: dict[str, dict[str, Prediction]]
     table: pd.DataFrame
     findings: tuple[Finding, ...] = ()
+    falsifiers: tuple[Falsifier, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     tasks: tuple[dict[str, Any], ...] = field(default=())
     remarks: tuple[str, ...] = ()
@@ -188,6 +190,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         predictions=predictions,
         table=table,
         findings=findings,
+        falsifiers=hold_falsifiers(request.contrasts, scores, draws=request.draws),
         verdicts=verdicts,
         tasks=tuple(task.about for task in tasks),
         remarks=remarks,
@@ -427,11 +430,12 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
             "leaderboard": board.table,
             "scores": scores,
             "contrasts": contrast_frame(board.findings),
+            "falsifiers": falsifier_frame(board.falsifiers),
             "controls": verdict_frame(board.verdicts),
             **({PROTECTION: board.protection} if len(board.protection) else {}),
         },
         texts={
-            "leaderboard.md": board_markdown(board.table, about, board.findings, board.verdicts),
+            "leaderboard.md": board_markdown(board.table, about, board.findings, board.falsifiers, board.verdicts),
             "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },
         about=about,

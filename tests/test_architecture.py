@@ -110,8 +110,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "validate": None,
     "score": None,
     "report": (
-        *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
-        *("latex", "protection"),
+        *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "falsifiers"),
+        *("controls", "costs", "text", "latex", "protection"),
         *("paper", "papertext", "plottables", "plots", "site"),
     ),
     "boardtasks": None,

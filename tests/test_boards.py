@@ -611,6 +611,7 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
         "board.json",
         "contrasts.parquet",
         "controls.parquet",
+        "falsifiers.parquet",
         "leaderboard.csv",
         "leaderboard.md",
         "leaderboard.parquet",

@@ -43,7 +43,7 @@ first = "random"
 second = "prior_centre"
 suites = ["clean"]
 """
-TABLES = ("leaderboard", "scores", "contrasts", "controls")
+TABLES = ("leaderboard", "scores", "contrasts", "falsifiers", "controls")
 
 
 @pytest.fixture(scope="module")

@@ -156,7 +156,7 @@ def _tested(
     if first.empty:
         return _nothing(contrast)
     is_mean = contrast.metric == "primary"
-    return _means(contrast, first, second, draws) if is_mean else _areas(contrast, first, second)
+    return mean_finding(contrast, first, second, draws) if is_mean else _areas(contrast, first, second)
 
 
 def _pair(
@@ -165,13 +165,38 @@ def _pair(
     """Rows of both sides, the same queries in the same order."""
     is_mean = contrast.metric == "primary"
     known: Mapping[str, pd.DataFrame] = scores if is_mean else {" x ".join(key): item for key, item in judged.items()}
+    return both_on(contrast, known, _stressed if is_mean else _unfalsified)
+
+
+def both_on(
+    contrast: Contrast, known: Mapping[str, pd.DataFrame], chosen: Callable[[pd.DataFrame], "pd.Series[bool]"]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of both sides on the suites, track and kinds of a contrast, the same queries in the same order.
+
+    Parameters
+    ----------
+    contrast : Contrast
+        Says which sides, and on what.
+    known : mapping of str to pandas.DataFrame
+        Scored rows by the names of sides.
+    chosen : callable
+        Says of rows which of them count, shape (N,).
+
+    Raises
+    ------
+    ConfigError
+        If a side is not on the board.
+    """
     frames = []
     for name in (contrast.first, contrast.second):
         if name not in known:
             there = ", ".join(sorted(known)) or "nothing of the kind"
             message = f"contrast {contrast.name!r} names {name!r}, which is not on the board: there is {there}"
             raise ConfigError(message)
-        frames.append(_chosen(contrast, known[name]))
+        rows = known[name]
+        rows = rows[rows["suite"].isin(contrast.suites) & (rows["track"] == contrast.track)]
+        rows = rows[chosen(rows).to_numpy(bool)]
+        frames.append(rows[_of_kinds(contrast, rows).to_numpy(bool)])
     shared = sorted(set(frames[0]["query_id"]) & set(frames[1]["query_id"]))
     first, second = (frame.set_index("query_id", drop=False).loc[shared] for frame in frames)
     return first, second
@@ -247,17 +272,18 @@ def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, pla
     )
 
 
-def _chosen(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
-    """The queries of a contrast: stresses of its suites and kinds on its track."""
-    rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
-    if contrast.metric == "primary":
-        rows = rows[rows["is_present"].to_numpy(bool) & (rows["role"] == "stress").to_numpy(bool)]
-    else:
-        rows = rows[(rows["role"] != "falsifier").to_numpy(bool)]
-    if contrast.kinds:
-        is_kind = rows["kind"].str.startswith(contrast.kinds) | (rows["role"] == "control").to_numpy(bool)
-        rows = rows[is_kind.to_numpy(bool)]
-    return rows
+def _stressed(rows: pd.DataFrame) -> "pd.Series[bool]":
+    return rows["is_present"].astype(bool) & (rows["role"] == "stress")
+
+
+def _unfalsified(rows: pd.DataFrame) -> "pd.Series[bool]":
+    return rows["role"] != "falsifier"
+
+
+def _of_kinds(contrast: Contrast, rows: pd.DataFrame) -> "pd.Series[bool]":
+    """Stresses of the kinds that a contrast is about; whatever is no stress is about all of them."""
+    is_stress = rows["role"] == "stress"
+    return ~is_stress | rows["kind"].str.startswith(contrast.kinds or "")
 
 
 def _nothing(contrast: Contrast) -> Finding:
@@ -286,7 +312,8 @@ def _seed(contrast: Contrast) -> int:
     return int.from_bytes(hashlib.sha256(contrast.name.encode()).digest()[:8], "big")
 
 
-def _means(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
+def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
+    """Two sides by success or recall, on the same queries in the same order; without a verdict."""
     measure = primary_of(contrast.track)
     ours, theirs = measure.values(first), measure.values(second)
     blocks, sites = first["block"].tolist(), first["pair_id"].tolist()

@@ -12,6 +12,7 @@ from sasgeo_bench.metrics.compare import LEAST_BLOCKS, RankInterval
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict, verdict_frame
+from sasgeo_bench.report.falsifiers import Falsifier
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES, is_unranked
@@ -264,6 +265,7 @@ def board_markdown(
     board: pd.DataFrame,
     about: Mapping[str, Any],
     findings: Sequence[Finding] = (),
+    falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
 ) -> str:
     """The board as a document."""
@@ -279,6 +281,8 @@ def board_markdown(
     ]
     if findings:
         lines += ["## Registered contrasts", "", *markdown_table(finding_table(findings)), ""]
+    if falsifiers:
+        lines += ["## Falsifiers", "", _FALSIFIERS_NOTE, "", *markdown_table(falsifier_table(falsifiers)), ""]
     for title, table in tables_of(board):
         lines += [f"## {title}", "", *markdown_table(table), ""]
     if verdicts:
@@ -287,6 +291,11 @@ def board_markdown(
     return "\n".join(lines)
 
 
+_FALSIFIERS_NOTE: Final = (
+    "The arms of each contrast where what should separate them is taken away: at the same places without the stress "
+    "(`control`), and on the falsifiers of each suite. What the first arm gains here as well is not owed to what the "
+    "contrast is named for."
+)
 _CONTROLS_NOTE: Final = (
     "Queries whose right score is known beforehand. At chance: views of a shuffled map, of a map turned by half, and "
     "of one of two places that are the same; `expected` is what guessing among the candidates or in the prior's disc "
@@ -317,6 +326,25 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
             "verdict": item.verdict,
         }
         for item in findings
+    ]
+    return pd.DataFrame(rows)
+
+
+def falsifier_table(found: Sequence[Falsifier]) -> pd.DataFrame:
+    """Falsifiers in words."""
+    rows = [
+        {
+            "contrast": item.contrast,
+            "suite": item.suite,
+            "kind": item.kind,
+            "first": f"{item.finding.first}: {_number(item.finding.first_value)}",
+            "second": f"{item.finding.second}: {_number(item.finding.second_value)}",
+            "difference": _with_interval(item.finding.difference, item.finding.lo, item.finding.hi),
+            "discordant": f"{item.finding.first_only} and {item.finding.second_only}",
+            "n": f"{item.finding.n} in {counted(item.finding.blocks, 'block')}",
+            "verdict": item.verdict,
+        }
+        for item in found
     ]
     return pd.DataFrame(rows)
 

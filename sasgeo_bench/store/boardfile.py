@@ -24,7 +24,8 @@ _AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a
 _VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
 _KNOWN: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
-    *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
+    *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
+    *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
     *(FIGURES, "site"),

@@ -13,7 +13,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pose import Pose, Prior
 from sasgeo_bench.query import YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.split import Block, Split
-from sasgeo_bench.suites.base import Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
+from sasgeo_bench.suites.base import EVERYTHING, Choice, Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
 from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, least_apart_m, mine
 
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
@@ -47,6 +47,7 @@ class Drawer:
     seeds: Seeds
     group: PriorGroup
     split: Split
+    choice: Choice = EVERYTHING
     windows: dict[tuple[str, float], Windows] = field(default_factory=dict)
     mined: dict[tuple[str, float, int], Decoys] = field(default_factory=dict)
 
@@ -62,6 +63,7 @@ class Drawer:
             for site in sites
             for variant in self.suite.variants
             for track in self.suite.tracks(variant)
+            if self.choice.takes(variant, track)
         ]
         return sorted(jobs, key=lambda job: job.query_id)
 

@@ -21,12 +21,14 @@ from sasgeo_bench.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.rows import YARDSTICK, is_unranked
 from sasgeo_bench.request import Request, Wanted, plan_requests
+from sasgeo_bench.requests import carry_out
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.split import HALVES, Half
 from sasgeo_bench.store import rundir
-from sasgeo_bench.tasks import ensure_tasks, is_of_region, made_tasks, why_to_draw
+from sasgeo_bench.suites.base import Choice
+from sasgeo_bench.tasks import is_of_region, made_tasks, why_to_draw
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
@@ -232,6 +234,7 @@ def plan_pipeline(
             extract_folders=extract_folders,
             region_folders=region_folders,
             may_be_fewer=True,
+            choice=Choice(views_cells=tuple(task.views_cells), kinds=tuple(task.kinds), tracks=tuple(task.tracks)),
         )
         requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
     if spec.task and not requests:
@@ -292,11 +295,11 @@ def run_pipeline(
     StoreError
         As `packing.pack_board` does; the board itself is then written.
     """
-    tasks = [*_draw(plan.requests, tell), *_draw_paper(plan, tell)]
+    tasks = [*_draw(plan.requests, tell, jobs=plan.jobs), *_draw_paper(plan, tell)]
     if not tasks:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
-    controls = _draw(plan.controls, tell)
+    controls = _draw(plan.controls, tell, jobs=1)
     folders = [folder for spec in plan.matchers for folder in _run(plan, spec, [*tasks, *controls], tell, progress)]
     if REFERENCE not in plan.matchers:
         folders += _run(plan, REFERENCE, controls, tell, progress)
@@ -424,15 +427,15 @@ def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest
     )
 
 
-def _draw(requests: Sequence[Request], tell: Tell) -> list[Path]:
+def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
     """Task folders of every request that a region carries; those that are up to date are left as they are."""
     tasks: list[Path] = []
     lacking: list[str] = []
-    for request in requests:
-        try:
-            tasks += ensure_tasks(request, tell=tell)
-        except ConfigError as error:
-            lacking.append(str(error).removesuffix(" (--skip passes on to the next suite)"))
+    for drawn in carry_out(requests, jobs=jobs):
+        for line in drawn.lines:
+            tell(line)
+        tasks += drawn.folders
+        lacking += [] if drawn.lack is None else [drawn.lack]
     for line in lacking[:MOST_LINES]:
         tell(f"left out: {line}")
     if len(lacking) > MOST_LINES:

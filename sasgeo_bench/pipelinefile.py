@@ -2,14 +2,16 @@
 """What a file in `pipelines/` says: an experiment as data, read before anything is run."""
 
 import hashlib
+import json
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sasgeo_bench.query import CONTROLS, PriorGroup
+from sasgeo_bench.query import CONTROLS, PriorGroup, Track
 from sasgeo_bench.tomlfile import Document
 
 PAPER_SUITE: Final = "paper-poc"
+CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
 
@@ -32,12 +34,16 @@ class TaskSpec(Document):
     """Suites that are drawn alike; several of these make up a pipeline.
 
     `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
+    `views_cells`, `kinds` and `tracks` choose of the variants of each suite: fewer variants at more sites say more.
     """
 
     suites: Annotated[list[str], Field(min_length=1)]
     sites: Annotated[int, Field(ge=1, le=10_000)]
     prior: str | None = None
     matchers: list[str] = []
+    views_cells: list[Annotated[int, Field(gt=0)]] = []
+    kinds: list[str] = []
+    tracks: list[Track] = []
 
 
 class PaperSpec(Document):
@@ -97,9 +103,13 @@ class PipelineFile(Document):
     @property
     def sha256(self) -> str:
         """Hash of all that it says, defaults among it, as `board.json` names it."""
-        # Files without the table keep the hash that boards were made under before there was one.
-        left_out = {"learning"} if self.learning is None else None
-        return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()
+        # Files that leave a newer key out keep the hash that boards were made under before there was one.
+        said = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
+        for task in said["task"]:
+            for name in CHOICE:
+                if not task[name]:
+                    del task[name]
+        return hashlib.sha256(json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:

@@ -22,6 +22,7 @@ from sasgeo_bench.store.catalog import (
     read_split_file,
 )
 from sasgeo_bench.suites.all_suites import find_suite
+from sasgeo_bench.suites.base import EVERYTHING, Choice
 from sasgeo_bench.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
 
 Tell = Callable[[str], None]
@@ -53,6 +54,8 @@ class Request:
         For regions that are not built yet.
     may_be_fewer : bool
         Whether as many sites as the region holds will do.
+    choice : Choice
+        Of the suite's variants; those that are left out change no other query.
     """
 
     suite: str
@@ -65,6 +68,7 @@ class Request:
     elsewhere: RegionFile | None = None
     extract_folders: tuple[Path, ...] = ()
     may_be_fewer: bool = False
+    choice: Choice = EVERYTHING
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +88,7 @@ class Wanted:
     extract_folders: tuple[Path, ...] = ()
     region_folders: tuple[Path, ...] = ()
     may_be_fewer: bool = False
+    choice: Choice = EVERYTHING
 
 
 def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
@@ -96,7 +101,9 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         positive, or the truths would lie among the tasks.
     """
     for name in wanted.suites:
-        find_suite(name)
+        fault = wanted.choice.lack(find_suite(name))
+        if fault is not None:
+            raise ConfigError(fault)
     check_count(wanted.count)
     check_roots(wanted.out)
     files = list_region_files(folders=wanted.region_folders)
@@ -127,6 +134,7 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
             elsewhere=wrong_place(split, item, known),
             extract_folders=wanted.extract_folders,
             may_be_fewer=wanted.may_be_fewer,
+            choice=wanted.choice,
         )
         for item in {item.id: item for item in named}.values()
         for name in dict.fromkeys(wanted.suites)

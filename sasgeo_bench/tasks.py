@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,14 +22,14 @@ from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
-from sasgeo_bench.query import TASK_VERSION, Query, Truth
+from sasgeo_bench.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.suites.all_suites import find_suite
-from sasgeo_bench.suites.base import Scene, Seeds, Site, State, Suite
+from sasgeo_bench.suites.base import EVERYTHING, Scene, Seeds, Site, State, Suite
 from sasgeo_bench.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.suites.synthetic_age import ageing_of
 from sasgeo_bench.twin import paste
@@ -144,7 +144,7 @@ def is_of_region(name: str, region: str) -> bool:
     >>> [is_of_region(name, "vaduz") for name in ("vaduz", "vaduz@2021-10-28", "vaduz+alias", "vaduz-north")]
     [True, True, True, False]
     """
-    return name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0] == region
+    return base_of(name) == region
 
 
 def _request_sha256(request: Request) -> str:
@@ -161,6 +161,8 @@ def _request_sha256(request: Request) -> str:
         "group": None if request.group is None else request.group.name,
         "made_by": version("sasgeo-bench"),
     }
+    if request.choice != EVERYTHING:  # what was drawn before there was a choice is as it was
+        said["choice"] = asdict(request.choice)
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
@@ -181,7 +183,7 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     suite = replace(suite, variants=suite.usable(scene))
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     scene, sites = _edited(request, suite, scene, base, sites, seeds)
-    drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split)
+    drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
     return tuple(_write(request, drawer, sites, tell))
 
 
@@ -267,7 +269,14 @@ def _edited(
         raise ConfigError(message)
     # Counted on the map as it is: the edited one is not written where there would be nothing to ask on it.
     group = request.group or suite.card.group
-    trial = Drawer(suite=suite, scene=replace(scene, twins=edit.twins), seeds=seeds, group=group, split=request.split)
+    trial = Drawer(
+        suite=suite,
+        scene=replace(scene, twins=edit.twins),
+        seeds=seeds,
+        group=group,
+        split=request.split,
+        choice=request.choice,
+    )
     if not any(trial.can_draw(job) for job in trial.jobs(edit.sites)):
         raise _too_small(request, suite)
     plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)

@@ -87,6 +87,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "request": None,
     "draw": None,
     "tasks": None,
+    "requests": None,
     "panels": None,
     "paper": ("tiles", "windows", "trials", "task"),
     "doctor": None,

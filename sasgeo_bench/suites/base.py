@@ -132,6 +132,61 @@ class Variant:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Which of a suite's variants are drawn; what is empty leaves all in.
+
+    Parameters
+    ----------
+    views_cells : tuple of int
+        Sizes of views, controls and falsifiers among them.
+    kinds : tuple of str
+        Kinds of stress, as they begin; controls and falsifiers are drawn whatever they are.
+    tracks : tuple of str
+        What is asked.
+
+    Examples
+    --------
+    >>> choice = Choice(kinds=("U2",))
+    >>> [choice.takes(Variant(role="stress", kind=kind), "retrieval") for kind in ("U1 rectangles", "U2 glare")]
+    [False, True]
+    """
+
+    views_cells: tuple[int, ...] = ()
+    kinds: tuple[str, ...] = ()
+    tracks: tuple[Track, ...] = ()
+
+    def takes(self, variant: Variant, track: Track) -> bool:
+        """Whether this variant is asked on this track."""
+        return (
+            (not self.views_cells or variant.view_cells in self.views_cells)
+            and (not self.kinds or variant.role != "stress" or variant.kind.startswith(self.kinds))
+            and (not self.tracks or track in self.tracks)
+        )
+
+    def lack(self, suite: "Suite") -> str | None:
+        """Say what the suite has nothing of, or None if all that is named is there."""
+        stresses = [variant for variant in suite.variants if variant.role == "stress"]
+        there: dict[str, tuple[Sequence[object], Sequence[object]]] = {
+            "views_cells": (self.views_cells, sorted({variant.view_cells for variant in suite.variants})),
+            "kinds": (self.kinds, sorted({variant.kind for variant in stresses})),
+            "tracks": (self.tracks, sorted({track for item in suite.variants for track in suite.tracks(item)})),
+        }
+        for name, (wanted, known) in there.items():
+            lost = next((item for item in wanted if not any(_begins(one, item) for one in known)), None)
+            if lost is not None:
+                return f"suite {suite.card.name!r} has nothing of {name} {lost!r}: it has {', '.join(map(str, known))}"
+        some = any(self.takes(item, track) for item in stresses for track in suite.tracks(item))
+        return None if some else f"suite {suite.card.name!r} has no stress of all that is chosen: choose less narrowly"
+
+
+EVERYTHING: Final = Choice()
+
+
+def _begins(known: object, wanted: object) -> bool:
+    return known.startswith(wanted) if isinstance(known, str) and isinstance(wanted, str) else known == wanted
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
     """One place and heading where a control and its stresses are seen; `is_copy` where it is the copy of another."""
 

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many requests -> tasks on disk, by several processes."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from signal import SIG_DFL, SIGINT, signal
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.request import Request
+from sasgeo_bench.tasks import ensure_tasks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """What came of a request: its folders, or what the region lacks for it; and what was told on the way."""
+
+    lines: tuple[str, ...]
+    folders: tuple[Path, ...] = ()
+    lack: str | None = None
+
+
+def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
+    """Carry requests out, by several processes if there are several jobs; no query hangs on how many there are.
+
+    Parameters
+    ----------
+    requests : sequence of Request
+        What was done before is left as it is.
+    jobs : int
+        Processes.
+
+    Yields
+    ------
+    Drawn
+        One for each request, in their order.
+
+    Raises
+    ------
+    StoreError
+        If a folder cannot be written or holds something that is not ours.
+
+    Examples
+    --------
+    >>> list(carry_out([], jobs=2))
+    []
+    """
+    if jobs == 1 or len(requests) < 2:  # noqa: PLR2004 - one request is no work to share
+        yield from map(_carry_out, requests)
+        return
+    # An interrupt ends the processes where they are: what they write is whole or not there, and the next run goes on.
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=signal, initargs=(SIGINT, SIG_DFL)) as pool:
+        yield from pool.map(_carry_out, requests)
+
+
+def _carry_out(request: Request) -> Drawn:
+    lines: list[str] = []
+    try:
+        folders = ensure_tasks(request, tell=lines.append)
+    except ConfigError as error:
+        return Drawn(lines=tuple(lines), lack=str(error).removesuffix(" (--skip passes on to the next suite)"))
+    return Drawn(lines=tuple(lines), folders=folders)

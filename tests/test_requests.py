@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many requests: no query hangs on how many processes draw, nor on which variants are left out."""
+
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.requests import carry_out
+from sasgeo_bench.store import taskdir
+from sasgeo_bench.suites.all_suites import find_suite
+from sasgeo_bench.suites.base import EVERYTHING, Choice, Variant
+
+TOWNS = ("town-suburb", "town-agricultural")
+
+
+def wanted(out, *suites, regions=TOWNS, **changes):
+    return plan_requests(
+        Wanted(
+            suites=suites, regions=regions, split="crossfit", count=1, seed=3, out=out, may_be_fewer=True, **changes
+        ),
+        tell=lambda _: None,
+    )
+
+
+def queries_of(drawn):
+    return {
+        query.query_id: query for item in drawn for folder in item.folders for query in taskdir.read_queries(folder)
+    }
+
+
+def test_two_processes_draw_the_queries_that_one_draws(tmp_path):
+    one = list(carry_out(wanted(tmp_path / "one", "clean", "absent")))
+    two = list(carry_out(wanted(tmp_path / "two", "clean", "absent"), jobs=2))
+    assert [item.lines[-1].partition(" in ")[0] for item in one] == [
+        item.lines[-1].partition(" in ")[0] for item in two
+    ]
+    hashes = [[taskdir.read_task(folder)["files"] for item in drawn for folder in item.folders] for drawn in (one, two)]
+    assert len(hashes[0]) == 4
+    assert hashes[0] == hashes[1]
+    again = list(carry_out(wanted(tmp_path / "two", "clean", "absent"), jobs=2))
+    assert [item.folders for item in again] == [item.folders for item in two]
+    assert not any(item.lines for item in again)
+
+
+def test_what_a_region_lacks_is_told_beside_what_others_give(tmp_path):
+    drawn = list(carry_out(wanted(tmp_path, "season", regions=("town-suburb", "town-grid")), jobs=2))
+    assert [bool(item.folders) for item in drawn] == [item.lack is None for item in drawn]
+
+
+def test_what_is_left_out_changes_no_other_query(tmp_path):
+    all_of_it = queries_of(carry_out(wanted(tmp_path / "all", "occlusion", regions=TOWNS[:1])))
+    choice = Choice(views_cells=(192,), kinds=("U2", "U3"), tracks=("localization",))
+    some = queries_of(carry_out(wanted(tmp_path / "some", "occlusion", regions=TOWNS[:1], choice=choice)))
+    assert 0 < len(some) < len(all_of_it)
+    assert {name: query.prior for name, query in some.items()} == {name: all_of_it[name].prior for name in some}
+    assert {query.track for query in some.values()} == {"localization"}
+    assert {query.evidence.shape for query in some.values()} == {(192, 192)}
+
+
+def test_controls_and_falsifiers_are_drawn_whatever_the_kinds():
+    choice = Choice(kinds=("U2",))
+    assert choice.takes(Variant(role="control", kind="control"), "localization")
+    assert choice.takes(Variant(role="falsifier", kind="none"), "retrieval")
+    assert EVERYTHING.takes(Variant(role="stress", kind="U1"), "retrieval")
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (Choice(views_cells=(100,)), "nothing of views_cells 100: it has 96, 192, 384"),
+        (Choice(kinds=("U9",)), "nothing of kinds 'U9': it has U1 rectangles, U2 border, "),
+        (Choice(tracks=("localization",), kinds=("U1",), views_cells=(384, 96)), None),
+        (Choice(kinds=("U2",), views_cells=(384,)), "has no stress of all that is chosen"),
+    ],
+)
+def test_a_choice_of_nothing_is_refused_before_anything_is_drawn(tmp_path, choice, words):
+    assert (choice.lack(find_suite("occlusion")) is None) == (words is None)
+    if words is not None:
+        with pytest.raises(ConfigError, match=f"suite 'occlusion' .*{words}"):
+            wanted(tmp_path, "occlusion", choice=choice)
+    with pytest.raises(ConfigError, match="suite 'growth' has nothing of tracks 'retrieval': it has localization"):
+        wanted(tmp_path, "growth", choice=Choice(tracks=("retrieval",)))

@@ -4,10 +4,11 @@
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.query import CONTROLS
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.requests import carry_out
 from sasgeo_bench.store import taskdir
-from sasgeo_bench.suites.all_suites import find_suite
+from sasgeo_bench.suites.all_suites import EVERY_SUITE, find_suite
 from sasgeo_bench.suites.base import EVERYTHING, Choice, Variant
 
 TOWNS = ("town-suburb", "town-agricultural")
@@ -62,6 +63,7 @@ def test_controls_and_falsifiers_are_drawn_whatever_the_kinds():
     assert choice.takes(Variant(role="control", kind="control"), "localization")
     assert choice.takes(Variant(role="falsifier", kind="none"), "retrieval")
     assert EVERYTHING.takes(Variant(role="stress", kind="U1"), "retrieval")
+    assert all(EVERYTHING.lack(find_suite(name)) is None for name in (*EVERY_SUITE, CONTROLS))
 
 
 @pytest.mark.parametrize(

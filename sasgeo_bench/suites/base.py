@@ -165,6 +165,8 @@ class Choice:
 
     def lack(self, suite: "Suite") -> str | None:
         """Say what the suite has nothing of, or None if all that is named is there."""
+        if self == EVERYTHING:
+            return None
         stresses = [variant for variant in suite.variants if variant.role == "stress"]
         there: dict[str, tuple[Sequence[object], Sequence[object]]] = {
             "views_cells": (self.views_cells, sorted({variant.view_cells for variant in suite.variants})),

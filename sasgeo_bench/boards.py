@@ -4,15 +4,16 @@
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 
+from sasgeo_bench.apart import set_apart
 from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scored_task
-from sasgeo_bench.entries import AS_SUBMITTED, Entry, find_entries, leave_out
+from sasgeo_bench.entries import Entry, find_entries, leave_out
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, base_of
@@ -26,7 +27,7 @@ from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, judge, own_word, remarks_of, rules_of, why_not
-from sasgeo_bench.report.rows import to_frame, with_contestants
+from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
@@ -34,8 +35,7 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, write_board
-from sasgeo_bench.store.learnedfile import LearnedSaid
-from sasgeo_bench.validate import validate
+from sasgeo_bench.validate import submission_faults, validate
 
 Tell = Callable[[str], None]
 
@@ -77,6 +77,8 @@ class ScoreRequest:
         Each makes, of the finished board, files that are written with it.
     without : collection of str
         Regions that are left out, on each of their maps.
+    submissions : sequence of Path
+        Folders of submissions, scored as files are, but held to more (`validate.submission_faults`).
     """
 
     predictions: Sequence[Path]
@@ -92,6 +94,7 @@ class ScoreRequest:
     pipeline: Mapping[str, str] = field(default_factory=dict)
     extras: Sequence[Callable[["Board"], Extra]] = ()
     without: Collection[str] = ()
+    submissions: Sequence[Path] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +103,8 @@ class Board:
 
     `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
     `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id.
-    `everyone` are the entries with those who were asked nothing but controls; so are the predictions.
+    `everyone` are the entries with those who were asked nothing but controls; so are the predictions. `apart` says of
+    contestants whose rows are set apart why they are.
     """
 
     entries: tuple[Entry, ...]
@@ -116,6 +120,7 @@ class Board:
     judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     everyone: tuple[Entry, ...] = ()
+    apart: Mapping[str, str] = field(default_factory=dict)
 
 
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
@@ -143,14 +148,13 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
-    told = _read_told(request, leave_out(find_entries(request.predictions), request.without), tell)
+    entries = leave_out(find_entries(request.predictions, request.submissions), request.without)
+    told = _read_told(request, entries, tell)
     folders = list(dict.fromkeys(_kept(request.tasks, request.without))) or sorted(
         {folder for item in told for folder in item.held}
     )
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
-    for item in told:
-        if item.entry.how == AS_SUBMITTED:
-            _check_file(item.entry.sources[0], folders)
+    _check_files([item.entry for item in told], folders, request.split)
     everything = {item.entry.name: _scored(item, tasks, request) for item in told}
     predictions = {item.entry.name: item.predictions for item in told}
     verdicts = hold_controls(everything)
@@ -159,14 +163,15 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     scores = {name: frame for name, frame in scores.items() if len(frame)}
     entries = tuple(item.entry for item in told if item.entry.name in scores)
     _check_some(scores)
-    rows = list(_leaderboards(scores, whole, request.draws))
+    apart = _apart(entries, scores, request.split, tell)
+    rows = list(_leaderboards(scores, whole, request.draws, apart))
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
     areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
     for entry in entries:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
-        is_taught = bool(_learned(entry))
+        is_taught = entry.is_taught
         own = own_word(frame, request.split, is_taught=is_taught)
         if len(own):
             all_judged[entry.name, OWN] = own
@@ -182,7 +187,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         tell(f"{entry.name}: {_in_words(frame)}")
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
-    table = with_contestants(figures, {entry.name: (entry.version, entry.hash) for entry in entries})
+    table = with_contestants(figures, _contestants(entries, apart))
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
     board = Board(
         entries=entries,
@@ -198,6 +203,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         judged={key: frame for key, frame in all_judged.items() if len(frame)},
         measured={truth.query_id: truth.measured for task in tasks for truth in task.truths},
         everyone=tuple(item.entry for item in told),
+        apart=apart,
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
@@ -206,6 +212,20 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
 def _kept(tasks: Sequence[Path], regions: Collection[str]) -> list[Path]:
     """Task folders but those of some regions."""
     return [folder for folder in tasks if base_of(folder.name) not in regions]
+
+
+def _apart(
+    entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None, tell: Tell
+) -> dict[str, str]:
+    """Why rows are set apart; told, too."""
+    found = set_apart(entries, scores, split)
+    for name, why in found.items():
+        tell(f"{name}: set apart, {why}")
+    return found
+
+
+def _contestants(entries: Sequence[Entry], apart: Mapping[str, str]) -> dict[str, Contestant]:
+    return {entry.name: Contestant(entry.version, entry.hash, entry.how, apart.get(entry.name)) for entry in entries}
 
 
 def _check_some(scores: Mapping[str, pd.DataFrame]) -> None:
@@ -262,14 +282,14 @@ def _asked_whole(told: Sequence["_Told"], tasks: Sequence[ScoredTask], tell: Tel
 
 
 def _leaderboards(
-    scores: Mapping[str, pd.DataFrame], whole: Mapping[str, Collection[str]], draws: int
+    scores: Mapping[str, pd.DataFrame], whole: Mapping[str, Collection[str]], draws: int, apart: Collection[str]
 ) -> Iterator[pd.DataFrame]:
     """Figures of suites by those who were asked all of them: in most cases one table of everything."""
     asked_by: dict[tuple[str, ...], set[str]] = {}
     for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
         asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
     for names, suites in asked_by.items():
-        yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws)
+        yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws, apart=apart)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,7 +297,8 @@ class _Told:
     """One contestant and its answers to the tasks of a board.
 
     `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
-    file is asked all tasks, and brings those that it holds an answer to. `entry` has only the runs that count.
+    file is asked all tasks, and brings those that it holds an answer to; a submission is asked those that it names.
+    `entry` has only the runs that count.
     """
 
     entry: Entry
@@ -301,7 +322,7 @@ def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> l
         else:
             rows = files[entry.name]
             held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-            item = _Told(entry=entry, predictions=rows, held=held, asked=frozenset(folders))
+            item = _Told(entry=entry, predictions=rows, held=held, asked=_asked_of(entry, tasks))
         if item.asked:
             told.append(item)
     named = next((source for source in stale if source in request.predictions), None)
@@ -322,6 +343,14 @@ def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> l
         listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
         tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
     return told
+
+
+def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
+    """Folders of the tasks that a file or a submission is asked."""
+    if entry.submission is None:
+        return frozenset(task.folder for task in tasks)
+    named = {(item.suite, item.region) for item in entry.submission.tasks}
+    return frozenset(task.folder for task in tasks if (task.about["suite"], task.about["region"]) in named)
 
 
 def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
@@ -363,9 +392,22 @@ def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
     return [folder for folder in folders if (folder / taskdir.TASK).is_file()]
 
 
-def _check_file(path: Path, folders: Sequence[Path]) -> None:
-    """Refuse a file of predictions that is not what the tasks ask for; queries without a row are misses, no faults."""
-    faults = [fault for fault in validate(path, folders) if not fault.is_missing_row]
+def _check_files(entries: Sequence[Entry], folders: Sequence[Path], split: Split | None) -> None:
+    """Refuse files and submissions that are not what the tasks ask for."""
+    for entry in entries:
+        if entry.how == AS_SUBMITTED:
+            _check_file(entry, folders, split)
+
+
+def _check_file(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
+    """Refuse what anyone may have written if it is not what the tasks ask for; queries without a row are misses."""
+    path = entry.sources[0]
+    if entry.submission is None:
+        found = validate(path, folders)
+    else:
+        path = path.parents[1]
+        found = submission_faults(path, entry.submission, folders, places=() if split is None else tuple(split.blocks))
+    faults = [fault for fault in found if not fault.is_missing_row]
     if faults:
         message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
         raise ConfigError(message)
@@ -405,9 +447,11 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
                 "version": entry.version,
                 "hash": entry.hash,
                 "how": entry.how,
-                "card": entry.runs[0]["matcher"] if entry.runs else None,
+                "card": entry.card,
+                "trained_on": entry.declared,
+                "set_apart": board.apart.get(entry.name),
                 "isolation": entry.runs[0].get("isolation") if entry.runs else None,
-                "learned": _learned(entry),
+                "learned": entry.learned(),
             }
             for entry in board.entries
         ],
@@ -441,17 +485,6 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
         about=about,
         extras=extras,
     )
-
-
-def _learned(entry: Entry) -> list[dict[str, Any]]:
-    """What a contestant has learnt: each text once, where it comes from, and the tasks that were asked under it."""
-    found: dict[str, dict[str, Any]] = {}
-    for about in entry.runs:
-        said = LearnedSaid.of(about)
-        if said is not None:
-            one = found.setdefault(said.key, {**asdict(said), "trained_on": list(said.trained_on), "asked": []})
-            one["asked"].append(f"{about['suite']}/{about['region']}")
-    return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
 
 def _libraries() -> dict[str, str]:

@@ -3,7 +3,7 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any, Final
@@ -12,22 +12,23 @@ from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
 from sasgeo_bench.matcher import check_name
 from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.query import base_of
-from sasgeo_bench.report.rows import is_unranked
+from sasgeo_bench.report.rows import AS_SUBMITTED, REPRODUCED, is_unranked
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store import rundir
 from sasgeo_bench.store.learnedfile import LearnedSaid
+from sasgeo_bench.store.submissiondir import predictions_name, read_submission
+from sasgeo_bench.submissionfile import Submission
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-REPRODUCED: Final = "reproduced"
-AS_SUBMITTED: Final = "as submitted"
 _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One contestant: a matcher as it was run, or a file of predictions.
+    """One contestant: a matcher as it was run, a file of predictions, or a submission.
 
-    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them.
+    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them. Of a submission
+    `submission` is what its `submission.json` says.
     """
 
     name: str
@@ -36,15 +37,48 @@ class Entry:
     how: str
     sources: tuple[Path, ...]
     runs: tuple[Mapping[str, Any], ...] = ()
+    submission: Submission | None = None
+
+    @property
+    def card(self) -> dict[str, Any] | None:
+        """What a contestant says of itself; None for a file of predictions."""
+        if self.submission is not None:
+            return self.submission.card.model_dump(mode="json")
+        return dict(self.runs[0]["matcher"]) if self.runs else None
+
+    @property
+    def declared(self) -> list[str] | None:
+        """Places that it says have taught it, before any runner did; None where it says nothing."""
+        if self.submission is not None:
+            return list(self.submission.card.places)
+        said = self.runs[0]["matcher"].get("trained_on") if self.runs else None
+        return [str(place) for place in said] if isinstance(said, list) else None
+
+    @property
+    def is_taught(self) -> bool:
+        """Whether the halves of a split were answered after other training."""
+        return bool(self.learned()) or (self.submission is not None and self.submission.card.is_by_half)
+
+    def learned(self) -> list[dict[str, Any]]:
+        """What the runner has taught it: each text once, where it comes from, and the tasks asked under it."""
+        found: dict[str, dict[str, Any]] = {}
+        for about in self.runs:
+            said = LearnedSaid.of(about)
+            if said is not None:
+                one = found.setdefault(said.key, {**asdict(said), "trained_on": list(said.trained_on), "asked": []})
+                one["asked"].append(f"{about['suite']}/{about['region']}")
+        return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
 
-def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
+def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tuple[Entry, ...]:
     """Who is to be scored.
 
     Parameters
     ----------
     paths : sequence of Path
         Folders with runs somewhere in them, and files of predictions.
+    submissions : sequence of Path
+        Folders of submissions.
 
     Returns
     -------
@@ -55,9 +89,10 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
     Raises
     ------
     StoreError
-        If a path holds no predictions, or a `run.json` does not say whose answers lie beside it.
+        If a path holds no predictions, a `run.json` does not say whose answers lie beside it, or a submission is not
+        what it says.
     ConfigError
-        If two files have one name, or one has that of a control.
+        If two contestants have one name, or a file or submission that of a control.
     """
     by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
     files: list[Entry] = []
@@ -97,10 +132,19 @@ def find_entries(paths: Sequence[Path]) -> tuple[Entry, ...]:
         for (name, number, digest), found in by_run.items()
     ]
     entries += files
+    entries += [_submitted(path) for path in submissions]
     listed = [entry.name for entry in entries]
-    twice = next((name for name in listed if listed.count(name) > 1), None)
+    # No submission passes for a version of what is there: "mine" beside "mine 1" would be told apart by no reader.
+    twice = next(
+        (
+            one.name
+            for one in entries
+            if listed.count(one.name) > 1 or (one.submission is not None and one.name in names)
+        ),
+        None,
+    )
     if twice is not None:
-        message = f"two contestants are named {twice!r}: rename the file of one"
+        message = f"two contestants are named {twice!r}: rename the file or the submission of one"
         raise ConfigError(message)
     return tuple(sorted(entries, key=lambda entry: entry.name))
 
@@ -148,10 +192,28 @@ def _file_entry(path: Path) -> Entry:
     if not FILE_NAME.fullmatch(path.stem):
         message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
         raise ConfigError(message)
-    if is_unranked(path.stem):
-        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: rename the file"
-        raise ConfigError(message)
+    _check_free(path.stem, path)
     return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
+
+
+def _check_free(name: str, path: Path) -> None:
+    """Refuse the name of a control: its row would stand beside the ranks."""
+    if is_unranked(name):
+        message = f"{path.name!r}: {name!r} is the name of a control of every board: choose another name"
+        raise ConfigError(message)
+
+
+def _submitted(folder: Path) -> Entry:
+    said = read_submission(folder)
+    _check_free(said.card.name, folder)
+    return Entry(
+        name=said.card.name,
+        version=said.card.version,
+        hash="",
+        how=AS_SUBMITTED,
+        sources=(folder / predictions_name(said.card.name),),
+        submission=said,
+    )
 
 
 def _read_run(path: Path) -> dict[str, Any]:

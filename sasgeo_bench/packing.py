@@ -22,6 +22,7 @@ from sasgeo_bench.store.packfile import (
     is_pack,
     read_settings,
     unpack,
+    unpack_tasks,
     write_pack,
 )
 from sasgeo_bench.store.taskdir import read_ids
@@ -190,3 +191,48 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
             root=found.root,
             truth=found.root / "truth",
         )
+
+
+@contextmanager
+def laid_tasks(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
+    """Yield task folders: those that are named, and the tasks of stored results, laid out until the block ends.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Task folders and stored results.
+
+    Raises
+    ------
+    StoreError
+        If results are damaged.
+
+    Examples
+    --------
+    >>> with laid_tasks([Path("out/tasks/clean/town-grid")]) as tasks:
+    ...     tasks[0].name
+    'town-grid'
+    """
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+        tasks: list[Path] = []
+        for number, path in enumerate(paths):
+            tasks += unpack_tasks(path, Path(folder) / str(number)) if is_pack(path) else [path]
+        yield tuple(tasks)
+
+
+def board_of(paths: Sequence[Path]) -> str:
+    """Id of the board whose stored results are among some paths; empty where none are, or they are of no pipeline.
+
+    Raises
+    ------
+    ConfigError
+        If there are two.
+    StoreError
+        If they are damaged.
+
+    Examples
+    --------
+    >>> board_of([Path("nowhere")])
+    ''
+    """
+    return str(stored_settings(paths).pipeline.get("id", ""))

@@ -8,6 +8,7 @@ from typing import Final
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.plugins import BUILT_IN, ORACLE, list_entry_points
+from sasgeo_bench.submissionfile import example_card
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
@@ -133,7 +134,11 @@ sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside
 ```
 
 Say in the card (`src/{module}/matcher.py`) where the method comes from, what of it is yours, and what a query must
-tell for it to work; raise its version whenever answers change.
+tell for it to work; raise its version whenever answers change. `card.toml` says the same of a submission:
+
+```bash
+sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/results/leaderboard
+```
 """
 
 
@@ -153,7 +158,7 @@ def plugin_files(name: str) -> dict[str, str]:
     Examples
     --------
     >>> sorted(plugin_files("my-matcher"))[:3]
-    ['README.md', 'pyproject.toml', 'src/my_matcher/__init__.py']
+    ['README.md', 'card.toml', 'pyproject.toml']
     """
     module = name.replace("-", "_")
     if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
@@ -185,4 +190,5 @@ def plugin_files(name: str) -> dict[str, str]:
         "src/{module}/matcher.py": _MATCHER,
         "tests/test_conforms.py": _TEST,
     }
-    return {path.format(**said): text.format(**said) for path, text in files.items()}
+    made = {path.format(**said): text.format(**said) for path, text in files.items()}
+    return made | {"card.toml": example_card(name)}

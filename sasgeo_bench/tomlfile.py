@@ -62,6 +62,24 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     except (ValueError, RecursionError) as error:  # too many digits or brackets are no error of TOML's own
         message = f"{source}: not valid TOML: {error}"
         raise ConfigError(message) from error
+    return check_document(content, model, source=source)
+
+
+def check_document(content: object, model: type[Model], *, source: str) -> Model:
+    """Hold what a file says, whatever its format, to a model.
+
+    Raises
+    ------
+    ConfigError
+        As `parse_toml` does; all faults on one line.
+
+    Examples
+    --------
+    >>> class Town(Document):
+    ...     seed: int
+    >>> check_document({"seed": 3}, Town, source="town.json")
+    Town(seed=3)
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:

@@ -1,17 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predictions held against the tasks they answer: every violation by row and column, found and expected."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import difflib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import MatchError, PoseError, StoreError, counted
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
-from sasgeo_bench.query import Head
+from sasgeo_bench.pose import Pose
+from sasgeo_bench.query import TASK_VERSION, Head, PriorGroup
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.store.runrows import differing_columns, prediction_of
+from sasgeo_bench.store.submissiondir import SAID, predictions_name
+from sasgeo_bench.store.taskrows import ASKED
+from sasgeo_bench.submissionfile import Submission
+
+Bounds = tuple[float, float, float, float]  # west, south, east, north, metres
 
 _ANSWERED: Final = "ok"
 _NO_ROW: Final = "no row for "
@@ -66,7 +74,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
         If a file cannot be read at all, a task is of another version, or the folder holds runs of two matchers.
     """
     rundir.check_one_matcher([path])
-    queries = {query.query_id: query for task in tasks for query in _queries(task)}
+    queries = _asked_of(tasks)
     asked = _asked(tasks)
     seen: dict[str, str] = {}
     files = rundir.parts_of(path)
@@ -88,11 +96,92 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
             is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
             if item["query_id"] not in before and not is_aside:
                 yield from _row_faults(file.name, row, item, queries, seen)
-    missing = [] if unread else [name for name in queries if name not in seen]
-    for name in missing:
+    yield from _missing(path.name, [] if unread else queries, seen)
+
+
+def submission_faults(
+    folder: Path, said: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
+) -> Iterator[Violation]:
+    """Hold a submission against the tasks of a board; its folder and hashes are `read_submission`'s business.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the submission.
+    said : Submission
+        From `read_submission`.
+    tasks : sequence of Path, optional
+        Task folders of the board; those that the submission does not name are passed over. Without any, the rows are
+        held against nothing.
+    board : str
+        Id of the board; empty where nobody says it.
+    places : collection of str
+        Of the board's split; without any, what the card says of training is not looked at.
+
+    Yields
+    ------
+    Violation
+        Faults of what it says, then of its rows; last, as of a file, the queries without a row, which are misses.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be read, or a task is of another version.
+    """
+    yield from _said_faults(said, board, places)
+    if tasks is None or said.task_version != TASK_VERSION:
+        return
+    named = {(item.suite, item.region) for item in said.tasks}
+    mine = [task for task in tasks if _name_of(task) in named]
+    lost = sorted(named - {_name_of(task) for task in mine})
+    for suite, region in lost:
         yield Violation(
-            file=path.name, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
+            file=SAID, row=-1, column="tasks", found=f"{suite}/{region}", expected="tasks that the board holds"
         )
+    queries, asked = _asked_of(mine), _asked(mine)
+    seen: dict[str, str] = {}
+    file = folder / predictions_name(said.card.name)
+    for row, item in enumerate(rundir.read_part(file).to_pylist()):
+        name = item["query_id"]
+        yield from _row_faults(file.name, row, item, queries, seen)
+        if name in asked and item[ASKED] != asked[name]:
+            yield Violation(
+                file=file.name,
+                row=row,
+                column=ASKED,
+                found=f"an answer to query {name} as it was drawn otherwise",
+                expected=f"{asked[name]}, for answers belong to queries: run and submit again",
+            )
+    yield from _missing(file.name, queries, seen)
+
+
+def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
+    """What a submission says of itself that does not fit a board."""
+    if said.task_version != TASK_VERSION:
+        yield Violation(
+            file=SAID,
+            row=-1,
+            column="task_version",
+            found=str(said.task_version),
+            expected=f"{TASK_VERSION}: run and submit again",
+        )
+    if board and said.board != board:
+        yield Violation(file=SAID, row=-1, column="board", found=repr(said.board), expected=repr(board))
+    for place in said.card.places if places else ():
+        if place not in places:
+            near = difflib.get_close_matches(place, places, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else ": what else taught it goes into trained_elsewhere"
+            yield Violation(
+                file=SAID, row=-1, column="trained_on", found=repr(place), expected=f"places of the split{hint}"
+            )
+
+
+def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iterator[Violation]:
+    for name in queries:
+        if name not in seen:
+            yield Violation(
+                file=file, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
+            )
 
 
 def set_aside(path: Path, tasks: Sequence[Path]) -> int:
@@ -115,14 +204,52 @@ def _asked(tasks: Sequence[Path]) -> dict[str, str]:
     return {name: said for task in tasks for name, said in taskdir.read_asked(task).items()}
 
 
-def _queries(task: Path) -> Iterator[Head]:
+def _name_of(task: Path) -> tuple[str, str]:
+    about = taskdir.read_task(task)
+    return str(about["suite"]), str(about["region"])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Asked:
+    """A query, and where its answers may lie; None for retrieval, which says it by candidates, or without a map."""
+
+    head: Head
+    bounds_m: Bounds | None
+
+
+def _asked_of(tasks: Sequence[Path]) -> dict[str, _Asked]:
+    return {asked.head.query_id: asked for task in tasks for asked in _queries(task)}
+
+
+def _queries(task: Path) -> Iterator[_Asked]:
     """Queries of a task that this program can read; what was seen is no matter, and stored results hold none of it."""
-    taskdir.read_task(task)
-    yield from taskdir.read_heads(task)
+    _, region = _name_of(task)
+    bounds_m = _bounds_m(task.resolve().parents[2] / "regions" / region)
+    by_group: dict[str, Bounds] = {}
+    for head in taskdir.read_heads(task):
+        group = head.prior_group
+        if bounds_m is not None and head.track == "localization" and group not in by_group:
+            by_group[group] = _reach_m(bounds_m, PriorGroup.parse(group))
+        yield _Asked(head=head, bounds_m=by_group.get(group) if head.track == "localization" else None)
+
+
+def _bounds_m(region: Path) -> Bounds | None:
+    """Where a region lies; None where its map is not beside the tasks."""
+    try:
+        return read_manifest(region).bounds_m
+    except StoreError:
+        return None
+
+
+def _reach_m(bounds_m: Bounds, group: PriorGroup) -> Bounds:
+    """The region, and what a disc of a prior can hold beyond its rim: at most its diameter."""
+    more_m = 2 * (group.radius_m or 0.0)
+    west, south, east, north = bounds_m
+    return west - more_m, south - more_m, east + more_m, north + more_m
 
 
 def _row_faults(
-    file: str, row: int, item: Mapping[str, Any], queries: Mapping[str, Head], seen: dict[str, str]
+    file: str, row: int, item: Mapping[str, Any], queries: Mapping[str, _Asked], seen: dict[str, str]
 ) -> Iterator[Violation]:
     name = item["query_id"]
     if name not in queries:
@@ -156,7 +283,7 @@ def _row_faults(
     yield from _answer_faults(file, row, item, queries[name])
 
 
-def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Head) -> Iterator[Violation]:
+def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) -> Iterator[Violation]:
     """What is wrong with the answer itself."""
     empty = next((at for at, one in enumerate(item["candidates"] or ()) if one is None or None in one.values()), None)
     if empty is not None:
@@ -170,7 +297,8 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Head) ->
             confidence=prediction.confidence,
             diagnostics=prediction.diagnostics,
         )
-        check_match(match, query, top_k=MOST_CANDIDATES)
+        check_match(match, query.head, top_k=MOST_CANDIDATES)
+        _check_inside(match.poses, query)
     except PoseError as error:
         expected, _, found = str(error).partition(", got ")
         yield Violation(file=file, row=row, column="candidates", found=found, expected=expected)
@@ -178,3 +306,17 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: Head) ->
         found, _, expected = str(error).partition(", expected ")
         column = next((name for name in ("diagnostics", "confidence") if name in found), "candidates")
         yield Violation(file=file, row=row, column=column, found=found, expected=expected or "an answer")
+
+
+def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:
+    """Refuse a place neither in the region nor where a prior's disc may reach: it is of another map or CRS."""
+    if query.bounds_m is None:
+        return
+    west, south, east, north = query.bounds_m
+    for pose in poses:
+        if not (west <= pose.easting_m <= east and south <= pose.northing_m <= north):
+            message = (
+                f"candidates hold ({pose.easting_m:.1f}, {pose.northing_m:.1f}), outside of {query.head.region}, "
+                f"expected eastings of {west:.0f}..{east:.0f} m and northings of {south:.0f}..{north:.0f} m"
+            )
+            raise MatchError(message)

@@ -66,8 +66,9 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "matcher": None,
     "results": None,
     "rejector": None,
+    "submissionfile": None,
     "store": (
-        *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
+        *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
         *("boardfile", "packfile", "pluginfiles"),
         *(
             "preview",
@@ -117,14 +118,28 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     ),
     "boardtasks": None,
     "entries": None,
+    "apart": None,
     "boards": None,
     "boardfigures": None,
     "packing": None,
+    "submissions": None,
     "paperboard": None,
     "pipeline": None,
     "scaffold": None,
     "testing": None,
-    "cli": ("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "boards", "program"),
+    "cli": (
+        "console",
+        "regions",
+        "ageing",
+        "queries",
+        "looking",
+        "weights",
+        "matchers",
+        "runs",
+        "submissions",
+        "boards",
+        "program",
+    ),
 }
 
 # The rooms that touch the disk, and the few calls others may make, each with its reason.

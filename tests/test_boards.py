@@ -545,7 +545,7 @@ def test_two_files_of_one_name_are_refused(out, tmp_path):
 @pytest.mark.parametrize("name", ["oracle_pose", "prior_centre", "random"])
 def test_a_file_may_not_pass_for_a_control(out, tmp_path, name):
     submission(out, tmp_path / f"{name}.parquet")
-    with pytest.raises(ConfigError, match=f"'{name}' is the name of a control of every board: rename the file"):
+    with pytest.raises(ConfigError, match=f"'{name}' is the name of a control of every board: choose another name"):
         find_entries([tmp_path / f"{name}.parquet"])
 
 

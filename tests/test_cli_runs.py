@@ -92,8 +92,9 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
 
 def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path) -> None:
     code, told, err = program("new-matcher", "my-matcher")
-    assert (code, err) == (0, "")
-    assert told == "my-matcher: 5 files; next: pip install -e my-matcher && sasgeo-bench check-matcher my-matcher\n"
+    assert code == 0
+    assert "submit --card my-matcher/card.toml" in err
+    assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check-matcher my-matcher\n"
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
     code, told, _ = program("new-matcher", "other", "--into", "deep/er")
     assert (code, told.split(":")[0]) == (0, "deep/er")
@@ -422,7 +423,7 @@ def test_missing_double_and_foreign_rows_get_a_line_each_and_exit_2(program, min
 
 
 def test_of_many_queries_without_a_row_some_are_named_and_the_rest_counted(program, mine, ids, monkeypatch) -> None:
-    monkeypatch.setattr("sasgeo_bench.cli.runs.MOST_MISSING", 2)
+    monkeypatch.setattr("sasgeo_bench.cli.submissions.MOST_MISSING", 2)
     path = mine([Prediction(query_id=ids[0])])
     code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
     assert (code, err) == (2, f"mine.parquet: {len(ids) - 1} violations\n")

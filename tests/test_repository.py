@@ -106,7 +106,9 @@ def test_the_licence_is_apache_and_the_data_licence_names_its_duties() -> None:
 
 
 def test_no_file_is_larger_than_half_a_megabyte() -> None:
-    large = [str(path.relative_to(ROOT)) for path in repository_files() if path.stat().st_size > MAX_FILE_BYTES]
+    # Answers of others have a limit of their own, which `read_submission` holds.
+    files = [path for path in repository_files() if not path.match("submissions/*/predictions/*.parquet")]
+    large = [str(path.relative_to(ROOT)) for path in files if path.stat().st_size > MAX_FILE_BYTES]
     assert large == []
 
 

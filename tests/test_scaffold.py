@@ -20,7 +20,9 @@ from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region
 from sasgeo_bench.scaffold import plugin_files
 from sasgeo_bench.store.pluginfiles import write_plugin
+from sasgeo_bench.submissionfile import Card
 from sasgeo_bench.testing import check_matcher
+from sasgeo_bench.tomlfile import parse_toml
 
 LONGEST = "a" * 60
 # Some of these would break what is generated if their class were called what the name says.
@@ -48,7 +50,8 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, na
     module = name.replace("-", "_")
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     package = {f"src/{module}/__init__.py", f"src/{module}/matcher.py"}
-    assert files == {"pyproject.toml", "README.md", "tests/test_conforms.py", *package}
+    assert files == {"pyproject.toml", "README.md", "card.toml", "tests/test_conforms.py", *package}
+    assert parse_toml((folder / "card.toml").read_text(), Card, source="card.toml").name == name
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     assert project["name"] == name.replace("_", "-")
     ((point, value),) = project["entry-points"][MATCHERS].items()
@@ -137,7 +140,7 @@ def test_a_file_above_the_folder_is_told_in_one_line(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("is_there", [False, True])
-@pytest.mark.parametrize("written", range(5))
+@pytest.mark.parametrize("written", range(6))
 def test_nothing_half_written_is_left_on_a_full_disk(tmp_path, monkeypatch, is_there, written) -> None:
     folder = tmp_path / "new" / "plugin" if not is_there else tmp_path
     write, count = Path.write_text, 0

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A predictions file is the contract of a submission: every violation is named by row and column."""
 
+import shutil
 from dataclasses import replace
 
 import pyarrow as pa
@@ -15,7 +16,7 @@ from sasgeo_bench.store import rundir, runrows, taskdir
 from sasgeo_bench.tasks import make_tasks
 from sasgeo_bench.validate import validate
 
-POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
+POSE = Pose(easting_m=299_878.0, northing_m=5_458_887.0, yaw_deg=3.0)  # amid town-riverside
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,25 @@ def test_a_fault_is_named_by_its_row_and_column(tmp_path, task, answers, change,
     listed = faults(tmp_path, task, broken)
     assert listed[0][:3] == (2, column, found)
     assert listed[0][3]
+
+
+@pytest.mark.parametrize("moved", [{"easting_m": 301_400.0}, {"northing_m": 5_457_365.0}, {"easting_m": 11.65}])
+def test_a_pose_outside_of_the_region_is_named(tmp_path, task, answers, moved):
+    # The map is 1024 m wide; a disc of 500 m that holds a place of it ends 1000 m beyond its rim.
+    away = replace(answers[2], candidates=((POSE, 1.0), (replace(POSE, **moved), 0.5)))
+    ((row, column, found, expected),) = faults(tmp_path, task, [*answers[:2], away, *answers[3:]])
+    assert (row, column) == (2, "candidates")
+    assert "outside of town-riverside" in found
+    assert expected == "eastings of 298366..301390 m and northings of 5457375..5460399 m"
+    near = replace(answers[2], candidates=((replace(POSE, easting_m=301_380.0), 1.0),))
+    assert faults(tmp_path, task, [*answers[:2], near, *answers[3:]]) == []
+
+
+def test_without_a_map_beside_the_tasks_nobody_says_what_is_outside(tmp_path, task, answers):
+    alone = tmp_path / "alone" / "tasks" / "false-unknown" / "town-riverside"
+    shutil.copytree(task, alone)
+    away = replace(answers[0], candidates=((replace(POSE, easting_m=0.0), 1.0),))
+    assert faults(tmp_path, alone, [away, *answers[1:]]) == []
 
 
 def test_a_pose_without_a_place_is_named(tmp_path, task, answers):

@@ -15,18 +15,11 @@ from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.packing import laid_out, stored_settings
+from sasgeo_bench.packing import board_of, laid_out, stored_settings
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
-from sasgeo_bench.split import Split, make_split
-from sasgeo_bench.store.catalog import (
-    find_pipeline_file,
-    find_split_file,
-    list_region_files,
-    read_pipeline_file,
-    read_region_file,
-    read_split_file,
-)
+from sasgeo_bench.store.catalog import find_pipeline_file, find_split, read_pipeline_file
+from sasgeo_bench.submissions import submissions_for
 
 CONTROL_FAILED: Final = 3  # exit status
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
@@ -57,6 +50,10 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
             help="name from list-rejectors, or module:Class; may be repeated; default: none, or those of stored results"
         ),
     ] = None,
+    submissions: Annotated[
+        list[Path] | None,
+        typer.Option(help="a submission, or a folder of them, beside stored results; those for their board are scored"),
+    ] = None,
     region_folders: RegionFolders = None,
     without: Annotated[
         list[str] | None, typer.Option(help="region whose queries are left out, on each of its maps; may be repeated")
@@ -75,7 +72,8 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
         raise ConfigError(message)
     stored = stored_settings(predictions)
-    chosen = _split(split or stored.split or "crossfit", region_folders or [])
+    submitted = submissions_for(board_of(predictions), submissions, tell=tell) if submissions else ()
+    chosen = find_split(split or stored.split or "crossfit", folders=region_folders or ())
     figures = partial(figures_extra, tell=tell, contrasts=stored.contrasts, split=chosen)
     request = ScoreRequest(
         predictions=predictions,
@@ -91,6 +89,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         pipeline=stored.pipeline,
         extras=(figures,),
         without=without or (),
+        submissions=submitted,
     )
     with laid_out(request) as request_laid:
         board = make_board(request_laid, tell=tell)
@@ -143,11 +142,6 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     typer.echo(str(board_folder(plan)))
     tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")
     _check_controls(board)
-
-
-def _split(name: str, folders: list[Path]) -> Split:
-    grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
-    return make_split(read_split_file(find_split_file(name)), grids)
 
 
 def _check_controls(board: Board) -> None:

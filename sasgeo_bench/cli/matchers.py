@@ -46,6 +46,7 @@ def new_matcher_command(
     target = folder or Path(name)
     write_plugin(target, files)
     typer.echo(f"{target}: {len(files)} files; next: pip install -e {target} && sasgeo-bench check-matcher {name}")
+    tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/adding-a-matcher.md walks the path)")
 
 
 def check_matcher_command(

@@ -22,7 +22,8 @@ from sasgeo_bench.cli.matchers import (
 )
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
-from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
+from sasgeo_bench.cli.runs import merge_command, run_command
+from sasgeo_bench.cli.submissions import submit_command, validate_command
 from sasgeo_bench.cli.weights import lookalike_command, weights_command
 from sasgeo_bench.doctor import examine
 from sasgeo_bench.errors import SasgeoError
@@ -59,6 +60,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "run": run_command,
     "merge": merge_command,
     "validate": validate_command,
+    "submit": submit_command,
     "score": score_command,
     "leaderboard": leaderboard_command,
 }

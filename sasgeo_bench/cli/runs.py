@@ -9,24 +9,16 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import EXIT_USER, Bars, Out, tell
+from sasgeo_bench.cli.console import Bars, Out, tell
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
-from sasgeo_bench.split import Split, make_split
-from sasgeo_bench.store.catalog import (
-    find_split_file,
-    list_region_files,
-    list_split_files,
-    read_region_file,
-    read_split_file,
-)
+from sasgeo_bench.split import Split
+from sasgeo_bench.store.catalog import find_split, list_split_files
 from sasgeo_bench.store.rundir import merge_runs
 from sasgeo_bench.store.taskdir import read_asked, read_task
-from sasgeo_bench.validate import set_aside, validate
 
-MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 
@@ -115,8 +107,7 @@ def _split(name: str | None, tasks: Sequence[Path]) -> Split | None:
         name = str(read_task(tasks[0]).get("split"))
         if name not in list_split_files():
             return None
-    grids = {item: read_region_file(path).grid() for item, path in list_region_files().items()}
-    return make_split(read_split_file(find_split_file(name)), grids)
+    return find_split(name)
 
 
 def merge_command(
@@ -132,26 +123,3 @@ def merge_command(
     asked = {name: said for task in tasks or () for name, said in read_asked(task).items()}
     count = merge_runs(runs, into, asked=asked if tasks else None)
     typer.echo(f"{into}: {counted(count, 'prediction')}")
-
-
-def validate_command(
-    *,
-    predictions: Annotated[Path, typer.Option(help="predictions file, or the folder of a run")],
-    tasks: Annotated[list[Path], typer.Option(help="task folder; may be repeated")],
-) -> None:
-    """List everything in which predictions are not what the tasks ask for; many queries without a row are counted."""
-    count = missing = 0
-    for violation in validate(predictions, tasks):
-        count += 1
-        missing += violation.is_missing_row
-        if missing <= MOST_MISSING or not violation.is_missing_row:
-            typer.echo(violation.to_text())
-    if missing > MOST_MISSING:
-        more = counted(missing - MOST_MISSING, "more query", "more queries")
-        typer.echo(f"{predictions.name}, query_id: found no row for {more}, expected one for every query")
-    if count:
-        tell(f"{predictions}: {counted(count, 'violation')}")
-        raise typer.Exit(EXIT_USER)
-    aside = set_aside(predictions, tasks)
-    rest = f"{counted(aside, 'answer')} to other queries set aside" if aside else "and nothing else"
-    typer.echo(f"{predictions}: answers every query of {counted(len(tasks), 'task')}, {rest}")

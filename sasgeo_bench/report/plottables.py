@@ -16,7 +16,7 @@ from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.measures import MEASURES, primary_of
 from sasgeo_bench.report.protection import ToldLevels
 from sasgeo_bench.report.rejection import answers_of
-from sasgeo_bench.report.rows import ALL_SUITES, is_unranked
+from sasgeo_bench.report.rows import ALL_SUITES, is_apart, is_unranked
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, control_name, step_name
 
 MOST_MATCHERS: Final = 8  # more are not told apart at a glance
@@ -32,7 +32,7 @@ BEYOND_M: Final = 1500.0
 
 
 def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[str, ...]:
-    """Matchers that figures show: all but controls, or of many those of the contrasts and a few beside them.
+    """Matchers that figures show: all but controls and what is set apart; of many those of contrasts, and a few beside.
 
     Parameters
     ----------
@@ -52,7 +52,8 @@ def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[
     >>> shown_matchers(board.assign(metric="success_25m"), [Contrast(name="x", first="b", second="a", suites=())])
     ('a', 'b')
     """
-    there = [name for name in dict.fromkeys(table["matcher"]) if not is_unranked(name)]
+    ranked = table.loc[~is_apart(table), "matcher"]
+    there = [name for name in dict.fromkeys(ranked) if not is_unranked(name)]
     sides = [side.partition(" x ")[0] for item in contrasts for side in (item.second, item.first)]
     named = [name for name in dict.fromkeys(sides) if name in there]
     if len(there) <= MOST_MATCHERS:

@@ -14,6 +14,8 @@ from sasgeo_bench.metrics.intervals import Interval
 from sasgeo_bench.score import MISSING
 
 ALL_SUITES: Final = "all suites"
+REPRODUCED: Final = "reproduced"  # how answers came: we ran the code,
+AS_SUBMITTED: Final = "as submitted"  # or their author gave them
 UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: beside the ranks
 YARDSTICK: Final = "oracle_"  # how the names of yardsticks begin, which know what no matcher can: beside the ranks, too
 _THREADS: Final = 4  # each holds some 100 MB of draws
@@ -195,28 +197,57 @@ def to_frame(rows: list[Row]) -> pd.DataFrame:
     return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # whole numbers, and none where none is
 
 
-def with_contestants(board: pd.DataFrame, contestants: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
-    """Rows that also say which code they are of, and whether of a control.
+@dataclass(frozen=True, slots=True)
+class Contestant:
+    """What all rows of a contestant say: version, hash of code and settings ("" for a file), how its answers came.
+
+    `set_apart` is why it is in no rank; None where it is.
+    """
+
+    version: str
+    hash: str
+    how: str
+    set_apart: str | None = None
+
+
+def with_contestants(board: pd.DataFrame, contestants: Mapping[str, Contestant]) -> pd.DataFrame:
+    """Rows that also say whose code they are of, how the answers came, and whether they are of a control or set apart.
 
     Parameters
     ----------
     board : pandas.DataFrame
         Columns as the fields of `Row`.
-    contestants : mapping of str to (str, str)
-        By matcher: version, and hash of its code and settings; empty for a file of predictions.
+    contestants : mapping of str to Contestant
+        By matcher.
 
     Returns
     -------
     pandas.DataFrame
-        With the columns version, hash (missing for a file) and is_control behind the matcher.
+        With the columns version, hash (missing for a file), how, is_control and set_apart (missing where it is not)
+        behind the matcher.
 
     Examples
     --------
-    >>> with_contestants(to_frame([]), {}).columns[:4].tolist()
-    ['matcher', 'version', 'hash', 'is_control']
+    >>> with_contestants(to_frame([]), {}).columns[:6].tolist()
+    ['matcher', 'version', 'hash', 'how', 'is_control', 'set_apart']
     """
     board = board.copy()
-    for at, name in enumerate(("version", "hash")):
-        board.insert(1 + at, name, [contestants[matcher][at] or None for matcher in board["matcher"]])
-    board.insert(3, "is_control", board["matcher"].map(is_unranked).astype(bool))
+    for at, name in enumerate(("version", "hash", "how")):
+        board.insert(1 + at, name, [getattr(contestants[matcher], name) or None for matcher in board["matcher"]])
+    board.insert(4, "is_control", board["matcher"].map(is_unranked).astype(bool))
+    reasons = [contestants[matcher].set_apart for matcher in board["matcher"]]
+    board.insert(5, "set_apart", pd.Series(reasons, index=board.index, dtype=object))
     return board
+
+
+def is_apart(board: pd.DataFrame) -> "pd.Series[bool]":
+    """Which rows are set apart; none of a table that does not say so.
+
+    Examples
+    --------
+    >>> is_apart(pd.DataFrame({"matcher": ["mine"], "set_apart": ["trained on vaduz"]})).tolist()
+    [True]
+    """
+    if "set_apart" not in board:
+        return pd.Series(data=False, index=board.index)
+    return board["set_apart"].notna()

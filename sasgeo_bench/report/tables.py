@@ -3,7 +3,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Self
@@ -28,7 +28,7 @@ GROUP: Final = ("suite", "track", "prior_group")
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
-def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd.DataFrame:
+def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS, apart: Collection[str] = ()) -> pd.DataFrame:
     """Figures of every matcher on every suite, track, prior group and stratum.
 
     Parameters
@@ -37,6 +37,8 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd
         By matcher, from `score.score_task`; all hold the same queries.
     draws : int
         Of the bootstrap.
+    apart : collection of str
+        Matchers that have figures and no rank, and are nobody's rivals; controls are so in any case.
 
     Returns
     -------
@@ -49,7 +51,8 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS) -> pd
         If two matchers were scored on different queries.
     """
     groups = _groups(_aligned(scored))
-    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws), groups))
+    beside = frozenset({*apart, *filter(is_unranked, scored)})
+    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws, beside), groups))
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -84,6 +87,7 @@ class _Group:
 
     key: tuple[str, str, str]
     names: tuple[str, ...]
+    rivals: tuple[str, ...]  # those of them that are ranked
     first: pd.DataFrame  # rows of any matcher: what they say of the queries is the same in all
     blocks: Ints
     places: Ints
@@ -94,8 +98,8 @@ class _Group:
     errors: dict[str, Floats]
 
     @classmethod
-    def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame]) -> Self:
-        """Columns of the rows of some matchers."""
+    def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
+        """Columns of the rows of some matchers, of which some stand beside the ranks."""
         first = next(iter(frames.values()))
         columns = dict.fromkeys(quantile.column for quantile in QUANTILE_MEASURES)
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
@@ -107,6 +111,7 @@ class _Group:
         return cls(
             key=key,
             names=tuple(frames),
+            rivals=tuple(name for name in frames if name not in unranked),
             first=first,
             blocks=codes[0],
             places=codes[1],
@@ -158,14 +163,16 @@ class _Cell:
         ]
 
 
-def _rows_of_group(key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int) -> Iterator[Row]:
+def _rows_of_group(
+    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, beside: Collection[str]
+) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
     for name, frame in frames.items():
         if name not in able:
             yield _not_applicable(name, key, frame)
     if not able:
         return
-    group = _Group.of(key, able)
+    group = _Group.of(key, able, beside)
     counted = {measure.name: measure.counts(group.first) for measure in MEASURES[key[1]]}
     for stratum, inside in strata(group.first):
         by_count: dict[bytes, list[Measure]] = {}
@@ -248,11 +255,11 @@ def _ranked(
     names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
     found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
     is_decidable = measure.is_primary and told[0].blocks >= LEAST_BLOCKS
-    ranks = _ranks(names, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
+    ranks = _ranks(cell.group, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
     for at, name in enumerate(names):
         interval, how = found[at]
         rank = ranks.get(name)
-        detectable = _detectable(name, names, table, blocks) if is_decidable else math.nan
+        detectable = _detectable(name, cell.group, table, blocks) if is_decidable else math.nan
         yield told[at].row(
             measure.name,
             measure.unit,
@@ -265,19 +272,19 @@ def _ranked(
         )
 
 
-def _ranks(names: Sequence[str], values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
-    """Rank intervals of all but the controls."""
-    chosen = [at for at, name in enumerate(names) if not is_unranked(name)]
+def _ranks(group: _Group, values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
+    """Rank intervals of all rivals."""
+    chosen = [group.names.index(name) for name in group.rivals]
     if not chosen:
         return {}
     better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
-    return {names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
+    return {group.names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
 
 
-def _detectable(name: str, names: Sequence[str], table: Floats, blocks: Ints) -> float:
-    """Least difference from the best other matcher that would be found; controls are nobody's rivals."""
-    others = [at for at, other in enumerate(names) if other != name and not is_unranked(other)]
-    if not others or is_unranked(name):
+def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
+    """Least difference from the best other rival that would be found."""
+    others = [group.names.index(other) for other in group.rivals if other != name]
+    if not others or name not in group.rivals:
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
-    return sensitivity(table[:, names.index(name)], table[:, best], blocks).detectable
+    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks).detectable

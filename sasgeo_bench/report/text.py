@@ -15,7 +15,7 @@ from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.falsifiers import Falsifier
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
-from sasgeo_bench.report.rows import ALL_SUITES, is_unranked
+from sasgeo_bench.report.rows import ALL_SUITES, REPRODUCED, is_apart, is_unranked
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 
 _INTEGRITY: Final = (
@@ -47,8 +47,15 @@ def tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     Yields
     ------
     tuple of str, pandas.DataFrame
-        One for each suite, track and prior group; then rejectors, then costs.
+        One for each suite, track and prior group; then rejectors, then costs; at last the same of what is set apart.
     """
+    apart = is_apart(board)
+    yield from _tables_of(board[~apart])
+    for title, table in _tables_of(board[apart]):
+        yield f"Set apart: {title}", table
+
+
+def _tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
     for (suite, track, prior_group), part in means.groupby(["suite", "track", "prior_group"], sort=True):
         primary = primary_of(str(track)).name
@@ -89,6 +96,7 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
         rows.append(
             {
                 "matcher": matcher,
+                "how": main.get("how", REPRODUCED),
                 primary: _figure(main) if main["is_applicable"] else "not applicable",
                 "rank": _rank(main),
                 WITHIN.name: "-" if near is None else _figure(near),
@@ -103,7 +111,12 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
         )
     table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
     empty = [name for name in (WITHIN.name, "false fixes") if (table[name] == "-").all()]
-    return table.drop(columns=["_key", *empty])
+    return _without_how(table.drop(columns=["_key", *empty]))
+
+
+def _without_how(table: pd.DataFrame) -> pd.DataFrame:
+    """The table as it is, or without a column that says of all rows that we ran the code."""
+    return table.drop(columns="how") if (table["how"] == REPRODUCED).all() else table
 
 
 def _pick(rows: pd.DataFrame, metric: str, stratum: str) -> pd.Series | None:
@@ -154,9 +167,10 @@ def _number(value: float) -> str:
 
 
 def _rank(row: pd.Series) -> str:
-    """A rank or ranks that cannot be told apart; controls have none."""
+    """A rank or ranks that cannot be told apart; controls have none, nor has what is set apart."""
     if pd.isna(row["rank_best"]):
-        return "control" if is_unranked(row["matcher"]) else "-"
+        is_beside = pd.notna(row.get("set_apart"))
+        return "control" if is_unranked(row["matcher"]) else "set apart" if is_beside else "-"
     return RankInterval(best=int(row["rank_best"]), worst=int(row["rank_worst"])).text
 
 
@@ -198,6 +212,8 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "chance": "in a title, what guessing among the candidates reaches",
     "rank": "ranks a matcher can have, all pairs at once; `-` where there are fewer than "
     f"{LEAST_BLOCKS} blocks: they rank nobody, as they decide no contrast",
+    "how": "`reproduced`: we ran the code; `as submitted`: the answers came from its author, and nobody else ran it",
+    "set apart": "in no rank, for a place that it was trained on is among those it is tested on",
     "detectable": "least difference from the best other matcher that these queries would show; inf where none would, "
     "`-` where nobody is ranked",
     "n, missing, blocks": "queries counted; those of them without a row; pieces of ground they come from, which are "
@@ -244,16 +260,21 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     return [f"CONTROLS FAILED, {len(failed)} of {len(verdicts)}: do not trust this board.", *failed]
 
 
-def learned_lines(about: Mapping[str, Any]) -> list[str]:
-    """Who of a board has learnt, and from which places.
+def training_lines(about: Mapping[str, Any]) -> list[str]:
+    """Whose rows are set apart, and who of a board has learnt from which places.
 
     Examples
     --------
     >>> said = {"file": "learned/ab.json", "trained_on": ["monaco", "porto"], "pairs": 24, "asked": ["clean/vaduz"]}
-    >>> learned_lines({"entries": [{"name": "mine", "learned": [said]}]})
+    >>> training_lines({"entries": [{"name": "mine", "learned": [said]}]})
     ['mine: for 1 task (clean/vaduz) learnt from 24 queries of 2 places (monaco, porto).']
     """
-    return [
+    apart = [
+        f"{entry['name']} is set apart: {entry['set_apart']}. It is in no rank; its figures stand in tables apart."
+        for entry in about.get("entries", ())
+        if entry.get("set_apart")
+    ]
+    return apart + [
         f"{entry['name']}: for {named(one['asked'], 'task')} {'learnt' if one['file'] else 'could not learn'} from "
         f"{counted(one['pairs'], 'query', 'queries')} of {named(one['trained_on'], 'place')}."
         for entry in about.get("entries", ())
@@ -276,7 +297,7 @@ def board_markdown(
         "",
         _NOTE.format(draws=about["draws"]),
         "",
-        *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board), *learned_lines(about))),
+        *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board), *training_lines(about))),
         "",
     ]
     if findings:
@@ -383,7 +404,7 @@ def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple
         primary = primary_of(str(track)).name
         rows = []
         for matcher, mine in part.groupby("matcher", sort=True):
-            row = {"matcher": str(matcher)}
+            row = {"matcher": str(matcher), "how": mine["how"].iloc[0] if "how" in mine else REPRODUCED}
             total = []
             for suite, one in mine.groupby("suite", sort=True):
                 shown = _main(one, primary)
@@ -394,7 +415,7 @@ def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple
             rows.append(row | {"_key": sum(numbers) / len(numbers) if numbers else -1.0})
         table = pd.DataFrame(rows).sort_values(["_key", "matcher"], ascending=[False, True], kind="stable")
         title = f"{primary} [95 %] (rank), {track}, prior group {prior_group}"
-        yield title, table.drop(columns="_key").fillna("-")
+        yield title, _without_how(table.drop(columns="_key").fillna("-"))
 
 
 def _heading(suite: str, rows: pd.DataFrame, shown: pd.Series) -> str:

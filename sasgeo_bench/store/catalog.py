@@ -9,7 +9,7 @@ from typing import Literal, TypeVar
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.regionfile import RegionFile
-from sasgeo_bench.split import SplitFile
+from sasgeo_bench.split import Split, SplitFile, make_split
 from sasgeo_bench.tomlfile import Document, parse_toml
 
 Kind = Literal["regions", "splits", "pipelines"]
@@ -99,6 +99,18 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
 def find_split_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     """Find a split file by its id, or take the path of one; raises as `find_region_file` does."""
     return _find(id_or_path, "split", "or name a .toml file", lambda: list_split_files(folders=folders))
+
+
+def find_split(id_or_path: str, *, folders: Sequence[Path] = ()) -> Split:
+    """The checked split of an id or file, laid out on all regions that are known; raises as `make_split` does.
+
+    Examples
+    --------
+    >>> find_split("crossfit").half_of["porto"]
+    'a'
+    """
+    grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
+    return make_split(read_split_file(find_split_file(id_or_path)), grids)
 
 
 def list_pipeline_files() -> dict[str, Path]:

@@ -347,6 +347,32 @@ def unpack(folder: Path, into: Path) -> Unpacked:
         return Unpacked(root=into, tasks=tasks, runs=tuple(_lay_runs(folder, tables["runs"], asked, into)))
 
 
+def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
+    """Lay the tasks of stored results out, with their maps' `region.json` and truths, and no answers.
+
+    Parameters
+    ----------
+    folder : Path
+        From `write_pack`.
+    into : Path
+        An empty folder.
+
+    Returns
+    -------
+    tuple of Path
+        Task folders.
+
+    Raises
+    ------
+    StoreError
+        If the results are damaged.
+    """
+    with _sound(folder):
+        read_settings(folder)
+        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in _TABLES if name != "runs"}
+        return tuple(_lay_tasks(tables, into))
+
+
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
     parts = {name: _parts_of(tables[name]) for name in ("queries", "truths")}
     for number, row in enumerate(tables["tasks"].to_pylist()):

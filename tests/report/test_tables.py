@@ -17,7 +17,7 @@ from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.rejection import own_word
-from sasgeo_bench.report.rows import COLUMNS, to_frame
+from sasgeo_bench.report.rows import COLUMNS, Contestant, to_frame, with_contestants
 from sasgeo_bench.report.strata import strata
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown, summary, tables_of, warnings_of
@@ -194,6 +194,30 @@ def test_ranks_tell_apart_what_differs_and_nothing_else():
     }
     assert ranks(pick(board, "oracle_pose", "success_25m")) == (None, None)
     assert 0 < pick(board, "good", "success_25m")["detectable"] < 0.2
+
+
+def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
+    chance = np.random.default_rng(3)
+    best, good, bad = (np.where(chance.random(600) < share, 1.0, 99.0) for share in (0.95, 0.8, 0.2))
+    tables = {name: scores(errors, blocks=60) for name, errors in (("best", best), ("good", good), ("bad", bad))}
+    board = leaderboard(tables, draws=1000, apart={"best"})
+    alone = leaderboard({name: tables[name] for name in ("good", "bad")}, draws=1000)
+    row = pick(board, "best", "success_25m")
+    assert ranks(row) == (None, None)
+    assert row["value"] > 0.9
+    assert math.isnan(row["detectable"])
+    for name in ("good", "bad"):
+        mine, before = (pick(table, name, "success_25m") for table in (board, alone))
+        assert ranks(mine) == ranks(before)
+        assert mine["detectable"] == before["detectable"]
+    said = {name: Contestant("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
+    titles = {title: set(table["matcher"]) for title, table in tables_of(with_contestants(board, said))}
+    assert {frozenset(names) for title, names in titles.items() if title.startswith("Set apart: ")} == {
+        frozenset({"best"})
+    }
+    assert {frozenset(names) for title, names in titles.items() if not title.startswith("Set apart: ")} == {
+        frozenset({"good", "bad"})
+    }
 
 
 @pytest.mark.parametrize(("blocks", "expected"), [(5, {(None, None)}), (6, {(1, 1), (2, 2)})])

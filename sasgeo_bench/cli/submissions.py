@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands for whoever hands in answers: holding them against tasks, and making a submission of them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from sasgeo_bench.cli.console import EXIT_USER, tell
+from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.packing import laid_tasks
+from sasgeo_bench.store.submissiondir import is_submission
+from sasgeo_bench.submissionfile import example_card
+from sasgeo_bench.submissions import SubmitRequest, hold_submission, make_submission
+from sasgeo_bench.validate import Violation, set_aside, validate
+
+MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
+
+BoardTasks = Annotated[
+    list[Path] | None,
+    typer.Option("--tasks", "--for", help="task folder, or stored results of a board; may be repeated"),
+]
+
+
+def submit_command(
+    *,
+    predictions: Annotated[
+        Path | None, typer.Option(help="predictions file, or the folder of a matcher's runs")
+    ] = None,
+    card: Annotated[Path | None, typer.Option(help="card, a .toml file (--example-card prints one)")] = None,
+    board: Annotated[
+        Path | None, typer.Option("--for", help="stored results of the board, as in docs/results/leaderboard")
+    ] = None,
+    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/NAME of the card")] = None,
+    example: Annotated[bool, typer.Option("--example-card", help="print a card to begin with, and stop")] = False,
+) -> None:
+    """Put predictions, card, versions and hashes into a folder that validate accepts: SUBMISSIONS/NAME."""
+    if example:
+        typer.echo(example_card(), nl=False)
+        return
+    if predictions is None or card is None or board is None:
+        needed = {"--predictions": predictions, "--card": card, "--for": board}
+        lacking = [flag for flag, value in needed.items() if value is None]
+        message = (
+            f"submit needs {' and '.join(lacking)}: name the answers, the card and the stored results of the board"
+        )
+        raise ConfigError(message)
+    folder = make_submission(SubmitRequest(predictions=predictions, card=card, board=board, into=into), tell=tell)
+    typer.echo(str(folder))
+    tell(f"next: validate --predictions {folder} --for {board}; then open a pull request with the folder")
+
+
+def validate_command(
+    *,
+    predictions: Annotated[Path, typer.Option(help="predictions file, the folder of a run, or a submission")],
+    tasks: BoardTasks = None,
+) -> None:
+    """List everything in which predictions are not what the tasks ask for; many queries without a row are counted."""
+    if is_submission(predictions):
+        _validate_submission(predictions, tasks or [])
+        return
+    if not tasks:
+        message = "validate needs --tasks: name task folders, or the stored results of a board"
+        raise ConfigError(message)
+    with laid_tasks(tasks) as folders:
+        _show(validate(predictions, folders), predictions)
+        aside = set_aside(predictions, folders)
+    rest = f"{counted(aside, 'answer')} to other queries set aside" if aside else "and nothing else"
+    typer.echo(f"{predictions}: answers every query of {counted(len(folders), 'task')}, {rest}")
+
+
+def _show(faults: Iterable[Violation], predictions: Path) -> None:
+    """Print faults, of many queries without a row the first, and end if there are any."""
+    count = missing = 0
+    for violation in faults:
+        count += 1
+        missing += violation.is_missing_row
+        if missing <= MOST_MISSING or not violation.is_missing_row:
+            typer.echo(violation.to_text())
+    if missing > MOST_MISSING:
+        more = counted(missing - MOST_MISSING, "more query", "more queries")
+        typer.echo(f"{predictions.name}, query_id: found no row for {more}, expected one for every query")
+    if count:
+        tell(f"{predictions}: {counted(count, 'violation')}")
+        raise typer.Exit(EXIT_USER)
+
+
+def _validate_submission(folder: Path, tasks: list[Path]) -> None:
+    """Of a submission queries without a row are no faults: they are misses, and said."""
+    said, found = hold_submission(folder, tasks)
+    _show([fault for fault in found if not fault.is_missing_row], folder)
+    missing = len(found)
+    misses = f", {counted(missing, 'query', 'queries')} without a row count as misses" if missing else ""
+    against = "" if tasks else "; its rows were held against no queries (--for names the stored results of its board)"
+    typer.echo(
+        f"{folder}: a sound submission of {said.card.name} {said.card.version} to {said.board}, "
+        f"{counted(len(said.tasks), 'task')}{misses}{against}"
+    )

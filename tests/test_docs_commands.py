@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every command of the documents: run where that is quick, and held against the program's own flags where it is not."""
+
+import io
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import typer
+
+from sasgeo_bench import cli
+from sasgeo_bench.boards import ScoreRequest, make_board
+from sasgeo_bench.cli import program
+from sasgeo_bench.packing import pack_board
+from sasgeo_bench.request import Wanted, plan_requests
+from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.runner import run
+from sasgeo_bench.store.catalog import find_split
+from sasgeo_bench.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks import make_tasks
+
+ROOT = Path(__file__).parents[1]
+UsageError = typer.BadParameter.__base__  # of whichever click it is that typer brings along
+# In the order in which a command that stands in several of them is run: in the first that has it.
+DOCUMENTS = (
+    "docs/adding-a-matcher.md",
+    "docs/adding-a-region.md",
+    "docs/adding-a-suite.md",
+    *sorted(
+        path.relative_to(ROOT).as_posix()
+        for path in (*ROOT.glob("docs/*.md"), *ROOT.glob("docs/*/README.md"))
+        if path.name not in ("adding-a-matcher.md", "adding-a-region.md", "adding-a-suite.md")
+    ),
+    *("README.md", "CONTRIBUTING.md", "submissions/README.md"),
+    *(f"{folder}/README.md" for folder in ("pipelines", "regions", "splits", "benchmarks")),
+)
+
+# Commands of the program that are not run, each with its reason; all are held against its flags.
+ONLY_PARSED = {
+    r"vaduz": "needs an extract of Liechtenstein",
+    r"--extracts|--extract ": "needs extracts",
+    r"^sasgeo-bench leaderboard (?!.*--dry-run)": "minutes to hours; tests/test_pipeline.py carries a small one out",
+    r"--dask": "needs a scheduler; tests/run does it",
+    r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
+    r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/test_cli_runs.py does it",
+    r"--train ": "needs a matcher that learns; tests/run does it",
+    r"FILE\.json|<hash>": "needs what a matcher has learnt",
+    r"^sasgeo-bench verify crossfit": "minutes: it reads every region that is built; tests/test_cli_queries.py does it",
+    r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
+}
+# Commands of other programs that are not run, each with its reason.
+OTHERS = {
+    r"^pip install -e my-matcher$": "done by hand: an installation needs the package registry",
+    r"^sha256sum ": "a program of the system",
+}
+PLUGIN = """[sasgeo_bench.matchers]
+my-matcher = my_matcher.matcher:MyMatcher
+"""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One command of a document."""
+
+    document: str
+    number: int
+    text: str
+
+    @property
+    def words(self) -> list[str]:
+        return shlex.split(self.text)
+
+
+def blocks(document: str, language: str) -> list[tuple[int, str]]:
+    """Number of the first line and text of each block of a language."""
+    text = (ROOT / document).read_text(encoding="utf-8")
+    found = re.finditer(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+    return [(text[: item.start(1)].count("\n") + 1, item[1]) for item in found]
+
+
+def plain(text: str) -> str:
+    """A command without its comment, its variables, and the folder of its program."""
+    words = shlex.split(text, comments=True)
+    return re.sub(r"^(\w+=\S+ )*(\.venv/bin/)?", "", shlex.join(words))
+
+
+def commands(document: str) -> list[Line]:
+    """Every command of a document, continued lines joined."""
+    found = []
+    for first, block in (*blocks(document, "bash"), *blocks(document, "sh"), *blocks(document, "console")):
+        joined = re.sub(r"\\\n\s*", " ", block)
+        for at, text in enumerate(joined.splitlines()):
+            if plain(text):
+                found.append(Line(document, first + at, plain(text)))
+    return found
+
+
+def reason(text: str, table: dict[str, str]) -> str | None:
+    return next((why for pattern, why in table.items() if re.search(pattern, text)), None)
+
+
+def is_ours(line: Line) -> bool:
+    return line.words[0] == "sasgeo-bench"
+
+
+def parsed(text: str) -> None:
+    """Hold a command against the program's flags and choices, without doing anything."""
+    name, *words = shlex.split(text)[1:]
+    group = typer.main.get_command(program.app)
+    with typer.Context(group, info_name="sasgeo-bench") as parent:
+        command = group.get_command(parent, name)
+        assert command is not None, f"there is no command {name}"
+        command.make_context(name, words, parent=parent)
+
+
+def first_runs() -> dict[str, Line]:
+    """Where each command is run: in the first document that has it."""
+    found: dict[str, Line] = {}
+    for document in DOCUMENTS:
+        for line in commands(document):
+            if is_ours(line) and reason(line.text, ONLY_PARSED) is None:
+                found.setdefault(line.text, line)
+    return found
+
+
+EVERY = [line for document in DOCUMENTS for line in commands(document)]
+RUN = first_runs()
+WALKS = sorted({line.document for line in RUN.values()}, key=DOCUMENTS.index)
+
+
+def test_every_command_of_a_document_is_one_that_this_test_knows() -> None:
+    unknown = [
+        f"{line.document}:{line.number}: {line.text}"
+        for line in EVERY
+        if line.words[0] not in ("make", "sasgeo-bench") and reason(line.text, OTHERS) is None
+    ]
+    assert unknown == []
+    assert len(EVERY) > 50
+
+
+def test_every_document_is_looked_at() -> None:
+    written = {path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.md") if "```bash" in path.read_text("utf-8")}
+    hidden = {name for name in written if name.startswith((".", "out/", "dist/"))}
+    assert written - hidden - set(DOCUMENTS) == set()
+
+
+@pytest.mark.parametrize("table", [ONLY_PARSED, OTHERS])
+def test_every_reason_not_to_run_a_command_is_still_needed(table: dict[str, str]) -> None:
+    unused = [pattern for pattern in table if not any(re.search(pattern, line.text) for line in EVERY)]
+    assert unused == []
+
+
+def test_every_command_of_the_program_has_flags_that_there_are() -> None:
+    for line in filter(is_ours, EVERY):
+        try:
+            parsed(line.text)
+        except UsageError as error:
+            pytest.fail(f"{line.document}:{line.number}: {line.text}: {error.format_message()}")
+
+
+def test_a_flag_that_is_made_up_is_found() -> None:
+    for text in ("sasgeo-bench score --predictions a --nome b", "sasgeo-bench run --tasks a", "sasgeo-bench run a"):
+        with pytest.raises(UsageError):
+            parsed(text)
+
+
+@pytest.mark.parametrize("text", sorted({line.text for line in EVERY if line.words[0] == "make"}))
+def test_every_make_command_would_run(text: str) -> None:
+    words = shlex.split(text)
+    shown = subprocess.run([*words, "-n"], cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S603 - of our own documents
+    assert shown.returncode == 0, shown.stderr
+    recipe = re.sub(r"\\\n\s*", " ", shown.stdout)
+    for line in (plain(item) for item in recipe.splitlines() if item.startswith(".venv/bin/sasgeo-bench")):
+        parsed(line)
+
+
+# --- run --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def desk(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as a reader has it after `make demo`, on a smaller scale: towns built, tasks drawn, results stored."""
+    out = tmp_path_factory.mktemp("desk") / "out"
+    shutil.copytree(towns, out)
+    wanted = Wanted(
+        suites=("clean",), regions=("town-riverside", "town-suburb"), split="crossfit", count=2, seed=0, out=out
+    )
+    for request in plan_requests(wanted, tell=lambda _: None):
+        make_tasks(request, tell=lambda _: None)
+    asked = [out / "tasks" / "clean" / name for name in ("town-riverside", "town-suburb")]
+    run(plan_run(RunRequest(spec="random", tasks=asked, out=out)), tell=lambda _: None)
+    request = ScoreRequest(
+        predictions=[out / "runs"],
+        root=out,
+        board=out / "boards" / "demo",
+        split=find_split("crossfit"),
+        draws=100,
+        pipeline={"id": "demo", "sha256": "0"},
+    )
+    pack_board(make_board(request, tell=lambda _: None), request, out / "results" / "demo")
+    return out.parent
+
+
+@pytest.fixture
+def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A desk of one's own, and a package that counts as installed as soon as it is there."""
+    folder = Path(shutil.copytree(desk, tmp_path / "desk"))
+    about = tmp_path / "site" / "my_matcher-0.1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-matcher\nVersion: 0.1.0\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text(PLUGIN, encoding="utf-8")
+    for path in (tmp_path / "site", folder / "my-matcher" / "src"):
+        monkeypatch.syspath_prepend(str(path))
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)
+    monkeypatch.delenv("SASGEO_OUT", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return folder
+
+
+def write_files(document: str, folder: Path) -> None:
+    """Files that a document tells its reader to write: TOML that is named in the line before."""
+    text = (ROOT / document).read_text(encoding="utf-8")
+    for name, content in re.findall(r"`([\w./-]+\.toml)`:\n\n```toml\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+
+
+def enter_suites(document: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Suites that a document tells its reader to write."""
+    for _, code in blocks(document, "python"):
+        if "SUITE: Final" in code:
+            found: dict[str, object] = {}
+            exec(code, found)  # noqa: S102 - of our own documents
+            monkeypatch.setitem(EVERY_SUITE, found["SUITE"].card.name, found["SUITE"])  # type: ignore[attr-defined]
+
+
+def told(words: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
+    """Exit status of the program, and all that it said."""
+    monkeypatch.setattr(sys, "argv", words)
+    said = io.StringIO()
+    with redirect_stdout(said), redirect_stderr(said), pytest.raises(SystemExit) as leaving:
+        cli.main()
+    return int(leaving.value.code or 0), said.getvalue()
+
+
+@pytest.mark.parametrize("document", WALKS)
+def test_the_commands_of_a_document_do_what_they_say(
+    document: str, reader: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_files(document, reader)
+    enter_suites(document, monkeypatch)
+    for line in commands(document):
+        if RUN.get(line.text) is not None and RUN[line.text] == line:
+            code, said = told(line.words, monkeypatch)
+            assert code == 0, f"{document}:{line.number}: {line.text}\n{said}"

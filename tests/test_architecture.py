@@ -112,7 +112,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
         *("latex", "protection"),
-        *("paper", "papertext", "plottables", "plots", "site"),
+        *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots", "site"),
     ),
     "boardtasks": None,
     "entries": None,

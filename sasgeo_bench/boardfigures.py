@@ -127,7 +127,8 @@ def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
 def _priced(board: Board, shown: Sequence[str]) -> pd.DataFrame:
     """Matchers of which some cost is known."""
     rows = price_frame(board.table, board.scores, shown)
-    return rows.loc[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
+    known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
+    return known
 
 
 def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:

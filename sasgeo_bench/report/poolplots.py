@@ -26,7 +26,7 @@ from sasgeo_bench.report.measures import primary_of
 from sasgeo_bench.report.pools import LEAST_ERROR_M, MOST_ERROR_M, front_of
 from sasgeo_bench.report.rows import ALL_SUITES
 from sasgeo_bench.score import FIX_M
-from sasgeo_bench.store.boardplot import FAINT, GREY, Page, look_of, page
+from sasgeo_bench.store.boardplot import FAINT, Page, look_of, page
 
 _STRESS: Final = "Present places under stress; of a suite without stresses all of them."
 _LETTERS: Final = 30  # of a panel's title, in a line
@@ -288,8 +288,9 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         title=f"What answers are worth, and what they take: {first['track']}, prior {first['prior_group']}",
         note=(
             f"Suites {first['suites']}: those that all of these matchers were asked; n {first['n']:g} present places, "
-            f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median latency to the 95th "
-            "percentile, all suites of the track. Grey line: the front, where no other matcher is both cheaper and "
+            f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "
+            "latency to the 95th percentile, all suites of the track. Grey line: the front, where no other matcher is "
+            "both cheaper and "
             f"better.{_left_out(rows)}"
         ),
         below="",

@@ -37,6 +37,7 @@ MOST_ERROR_M: Final = 2000.0
 _RADII_M: Final = np.unique(np.concatenate((np.geomspace(LEAST_ERROR_M, MOST_ERROR_M, 87), [5.0, 10.0, FIX_M])))
 _RATIOS: Final = np.unique(np.concatenate((np.geomspace(1.0, 200.0, 47), COST_RATIOS)))
 _GROUP: Final = ("suite", "track", "prior_group")
+_NO_INTERVAL: Final = (np.nan, np.nan)
 _FIGURE: Final = ("n", "blocks", "value", "lo", "hi")
 
 
@@ -214,7 +215,8 @@ def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> p
     rows: list[dict[str, Any]] = []
     told = table[(table["metric"] == WITHIN_M) & (table["rejector"] == "")]
     keys = zip(*(told[name] for name in (*_GROUP, "stratum", "matcher")), strict=True)
-    ends = dict(zip(keys, told[["lo", "hi"]].to_dict("records"), strict=True))
+    both = zip(told["lo"].to_numpy(float), told["hi"].to_numpy(float), strict=True)
+    ends = dict(zip(keys, both, strict=True))
     for said, frames in _suites(scores, shown):
         if said["track"] == "retrieval":
             continue
@@ -222,10 +224,11 @@ def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> p
             errors_m = np.sort(frame["position_error_m"].fillna(np.inf).to_numpy(float))
             shares = np.searchsorted(errors_m, _RADII_M, side="right") / len(errors_m)
             counts = {"n": len(frame), "blocks": int(frame["block"].nunique())}
-            end = ends.get((*said.values(), name), {"lo": np.nan, "hi": np.nan})
+            end = ends.get((*said.values(), name), _NO_INTERVAL)
             for radius_m, value in zip(_RADII_M.tolist(), shares.tolist(), strict=True):
-                interval = end if radius_m == FIX_M else {"lo": np.nan, "hi": np.nan}
-                rows.append({**said, "matcher": name, "radius_m": radius_m, **counts, "value": value, **interval})
+                lo, hi = end if radius_m == FIX_M else _NO_INTERVAL
+                point = {"radius_m": radius_m, "value": value, "lo": lo, "hi": hi}
+                rows.append({**said, "matcher": name, **counts, **point})
     return pd.DataFrame(rows, columns=[*_GROUP, "stratum", "matcher", "radius_m", *_FIGURE])
 
 

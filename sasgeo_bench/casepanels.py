@@ -150,6 +150,7 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
         at_answer=_seen_at(case.fix, case, bits, grid, manifest),
         disc=_disc(query),
         said=_lines(case),
+        attribution=manifest.attribution,
     )
 
 

@@ -26,7 +26,7 @@ from sasgeo_bench.report.rejection import answers_of
 from sasgeo_bench.report.rows import ALL_SUITES
 from sasgeo_bench.report.strata import ALL, STRESS
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.score import FIX_M
+from sasgeo_bench.score import FIX_M, NOT_APPLICABLE
 
 Scores = Mapping[str, pd.DataFrame]
 
@@ -54,10 +54,16 @@ def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any
 
 
 def _alike(frames: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Those matchers that were asked the most queries of a pool, the same ones; rows in one order."""
-    sorted_ = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in frames.items() if len(frame)}
+    """Those matchers that were asked the most queries of a pool, the same ones, and can answer; rows in one order."""
+    able = {name: frame for name, frame in frames.items() if _is_able(frame)}
+    sorted_ = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in able.items()}
     most = max(sorted_.values(), key=len, default=pd.DataFrame({"query_id": []}))["query_id"]
     return {name: frame for name, frame in sorted_.items() if frame["query_id"].equals(most)}
+
+
+def _is_able(frame: pd.DataFrame) -> bool:
+    """Whether there is a query, and the matcher's card does not say that it cannot."""
+    return bool((frame["status"] != NOT_APPLICABLE).any())
 
 
 def _is_whole(first: pd.DataFrame) -> Bools:
@@ -301,8 +307,9 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
             name: frame[(frame["track"] == track) & (frame["prior_group"] == prior_group)]
             for name, frame in mine.items()
         }
-        some = {name: frame for name, frame in some.items() if len(frame)}
-        shared = set.intersection(*(set(frame["suite"]) for frame in some.values()))
+        some = {name: frame for name, frame in some.items() if _is_able(frame)}
+        suites = [set(frame["suite"]) for frame in some.values()]
+        shared = set.intersection(*suites) if suites else set()
         said = {"suites": ", ".join(sorted(shared)), "track": track, "prior_group": prior_group}
         for name, frame in _alike({name: one[one["suite"].isin(shared)] for name, one in some.items()}).items():
             values = primary_of(track).values(frame)[:, None]

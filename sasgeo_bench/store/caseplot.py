@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import Evidence, footprint
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.store.picture import pixels_of
 from sasgeo_bench.store.preview import scale_bar
 from sasgeo_bench.store.sheet import HIDDEN, paint
@@ -68,6 +67,8 @@ class CasePicture:
         Easting, northing and radius of the disc that is searched.
     said : sequence of str
         Lines on what the answer and the integrity model say.
+    attribution : str
+        Of the map.
     """
 
     title: str
@@ -80,13 +81,14 @@ class CasePicture:
     at_answer: Evidence | None
     disc: tuple[float, float, float] | None
     said: Sequence[str]
+    attribution: str
 
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
     """Draw a query and its answer; pixels as of `picture.pixels_of`, the same for the same case."""
     figure = Figure(figsize=(_WIDTH, _HEIGHT), dpi=_DPI, facecolor="white")
     _text(figure, 0.12, _HEIGHT - 0.1, case.title, size=10.5, weight="bold")
-    _text(figure, 0.12, 0.17, f"Map: {ATTRIBUTION}", size=7)
+    _text(figure, 0.12, 0.17, f"Map: {case.attribution}", size=7)
     top = _HEIGHT - 0.62
     where = "map at the true place" if case.is_present else "map where it was taken"
     panels = (("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer))

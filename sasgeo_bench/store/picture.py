@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.region import ATTRIBUTION, Manifest
+from sasgeo_bench.region import Manifest
 from sasgeo_bench.store.preview import paint_overview
 
 WEBP: Final = ".webp"
@@ -100,5 +100,5 @@ def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uin
     chart = figure.add_axes((0, _FOOT_INCHES / height, cols * scale / width, rows * scale / height))
     chart.imshow(paint_overview(manifest, overview), interpolation="antialiased", aspect="auto")
     chart.set_axis_off()
-    figure.text(0.03 / width, 0.03 / height, ATTRIBUTION, fontsize=5.5, color="#444444", va="bottom")
+    figure.text(0.03 / width, 0.03 / height, manifest.attribution, fontsize=5.5, color="#444444", va="bottom")
     return pixels_of(figure)

@@ -143,6 +143,19 @@ def test_a_pool_is_that_of_its_contrasts_and_has_those_who_were_asked_all_of_it(
     assert list(dict.fromkeys(ablation_frame(tables, [], ["one", "two"])["pool"])) == ["all suites"]
 
 
+def test_who_cannot_answer_has_no_bar_and_no_line(listed):
+    tables, answers, truths = listed
+    unable = {**tables, "two": tables["two"].assign(status="not applicable", is_answered=False)}
+    board = leaderboard(tables, draws=100)
+    for rows in (
+        ablation_frame(unable, [], ["one", "two"]),
+        recall_frame(unable, answers, truths, ["one", "two"]),
+        errors_frame(unable, board, ["one", "two"]),
+        price_frame(board, unable, ["one", "two"]),
+    ):
+        assert set(rows["matcher"]) == {"one"}
+
+
 def test_prices_are_those_of_the_board_on_the_queries_that_all_were_asked(tmp_path):
     one = answered(np.where(AT % 3 == 0, 4.0, 300.0))
     more = answered(np.full(COUNT, 4.0)).assign(suite="clean", query_id=[f"x{at}" for at in AT])

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pandas as pd
 
 from sasgeo_bench.boards import Board, Tell
@@ -30,6 +31,8 @@ from sasgeo_bench.report.plottables import (
     steps_frame,
     stress_frame,
 )
+from sasgeo_bench.report.poolplots import draw_ablation, draw_costs, draw_errors, draw_prices, draw_recall
+from sasgeo_bench.report.pools import COSTS, ablation_frame, cost_frame, errors_frame, price_frame, recall_frame
 from sasgeo_bench.report.protection import ToldLevels, told_levels
 from sasgeo_bench.score import FIX_M
 from sasgeo_bench.split import Split
@@ -61,18 +64,36 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
     ages = ages_frame(steps, queries, board.measured)
     # An age is no other strength: where maps have ages, those are the axis.
     others = steps[~steps["suite"].isin(set(ages["suite"]))]
+    calibrated = _calibrated(board.table)
     kinds: dict[str, Named] = {
         "success against the age of the map": _each("age", ages, GROUP, draw_ages, shown),
         "success against strength": _each("strength", others, GROUP, draw_steps, shown),
         "success under stress": _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
+        "arms beside each other": _each(
+            "ablation", ablation_frame(board.scores, contrasts, shown), GROUP[1:], draw_ablation, shown
+        ),
         "differences by place": _forests(board, contrasts),
+        "recall against K": _each(
+            "recall",
+            recall_frame(board.scores, board.predictions, board.truths, shown),
+            GROUP[1:],
+            draw_recall,
+            shown,
+        ),
+        "the distribution of errors": _each(
+            "errors", errors_frame(board.scores, board.table, shown), GROUP[1:], draw_errors, shown
+        ),
+        "worth against cost": _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
         "risk against coverage": _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
         "reliability": _each(
             "reliability",
-            reliability_frame(board.judged, _calibrated(board.table), shown),
+            reliability_frame(board.judged, calibrated, shown),
             GROUP[1:],
             draw_reliability,
             shown,
+        ),
+        "the cost of decisions": _each(
+            "cost", cost_frame(board.judged, calibrated, shown), GROUP[1:], draw_costs, shown
         ),
         "protection levels against errors": _stanfords(board, shown, split),
     }
@@ -101,6 +122,13 @@ def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
     """Matcher x rejector that gives probabilities: it is judged as such."""
     rows = table[table["metric"] == "ece"]
     return set(zip(rows["matcher"], rows["rejector"], strict=True))
+
+
+def _priced(board: Board, shown: Sequence[str]) -> pd.DataFrame:
+    """Matchers of which some cost is known."""
+    rows = price_frame(board.table, board.scores, shown)
+    known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
+    return known
 
 
 def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:

@@ -16,7 +16,7 @@ from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scor
 from sasgeo_bench.entries import Entry, find_entries, leave_out
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.query import CONTROLS, TASK_VERSION, base_of
+from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.rejector import RejectorCard
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
@@ -102,9 +102,9 @@ class Board:
     """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
 
     `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
-    `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id.
-    `everyone` are the entries with those who were asked nothing but controls; so are the predictions. `apart` says of
-    contestants whose rows are set apart why they are.
+    `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id,
+    `truths` all that is known of it, controls among them. `everyone` are the entries with those who were asked nothing
+    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are.
     """
 
     entries: tuple[Entry, ...]
@@ -119,6 +119,7 @@ class Board:
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
     judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    truths: Mapping[str, Truth] = field(default_factory=dict)
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
 
@@ -202,6 +203,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         protection=_protection(scores, predictions, request.split),
         judged={key: frame for key, frame in all_judged.items() if len(frame)},
         measured={truth.query_id: truth.measured for task in tasks for truth in task.truths},
+        truths={truth.query_id: truth for task in tasks for truth in task.truths},
         everyone=tuple(item.entry for item in told),
         apart=apart,
     )

@@ -161,6 +161,17 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
         raise StoreError(message) from error
 
 
+def stored_among(predictions: Sequence[Path]) -> Path | None:
+    """The stored results among some predictions.
+
+    Examples
+    --------
+    >>> stored_among([Path("nowhere")]) is None
+    True
+    """
+    return next((path for path in predictions if is_pack(path)), None)
+
+
 @contextmanager
 def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     """Yield the request with stored results among its predictions laid out as runs, tasks and truths.
@@ -174,7 +185,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     StoreError
         If the results are damaged.
     """
-    stored = next((path for path in request.predictions if is_pack(path)), None)
+    stored = stored_among(request.predictions)
     if stored is None:
         yield request
         return

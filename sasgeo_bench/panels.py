@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Queries of a task as panels of a contact sheet: the view, what the map shows at the truth, and the hardest decoy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,13 @@ from sasgeo_bench.tasks import built_anew
 
 
 def panels(
-    task_folder: Path, truth_folder: Path, *, out: Path, count: int = 12, query_id: str | None = None
+    task_folder: Path,
+    truth_folder: Path,
+    *,
+    out: Path,
+    count: int = 12,
+    query_id: str | None = None,
+    choose: Callable[[Sequence[Truth]], Sequence[Truth]] | None = None,
 ) -> tuple[Panel, ...]:
     """Choose queries of a task for a contact sheet: each kind and strength of a site, site by site.
 
@@ -33,6 +39,8 @@ def panels(
         At most so many.
     query_id : str, optional
         This query alone.
+    choose : callable, optional
+        Picks those that are shown, in their order, instead.
 
     Raises
     ------
@@ -48,7 +56,7 @@ def panels(
     state = State.of(region, name=about["region"])
     truths = {truth.query_id: truth for truth in taskdir.read_truths(truth_folder)}
     strangers = StoreError(f"{truth_folder} does not hold the truths of {task_folder}: make the queries again")
-    chosen = _for_sheet(list(truths.values()), count)
+    chosen = _for_sheet(list(truths.values()), count) if choose is None else list(choose(list(truths.values())))
     if query_id is not None:
         chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
         if not chosen:

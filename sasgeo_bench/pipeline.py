@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.boardfigures import figures_extra
+from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.packing import pack_board
@@ -268,7 +269,12 @@ def _silent(line: str) -> None:
 
 
 def run_pipeline(
-    plan: PipelinePlan, *, tell: Tell, progress: Progress | None = None, results: Path | None = None
+    plan: PipelinePlan,
+    *,
+    tell: Tell,
+    progress: Progress | None = None,
+    results: Path | None = None,
+    has_cases: bool = True,
 ) -> Board:
     """Draw what is missing, run what has no row, score all of it and write the board.
 
@@ -282,6 +288,8 @@ def run_pipeline(
         Is told of every answer.
     results : Path, optional
         Folder to store the board in, with the answers and truths it was made of, as <id>/.
+    has_cases : bool
+        Whether the board shows queries that went wrong, with their truths.
 
     Returns
     -------
@@ -306,6 +314,7 @@ def run_pipeline(
     split = plan.requests[0].split if plan.requests else None
     contrasts = _contrasts(plan.spec)
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
+    pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
     request = ScoreRequest(
         predictions=folders,
         tasks=[*tasks, *controls],
@@ -316,7 +325,7 @@ def run_pipeline(
         contrasts=contrasts,
         draws=plan.spec.draws,
         pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
-        extras=(figures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
+        extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
     )
     board = make_board(request, tell=tell)

@@ -106,6 +106,9 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
     assert set(figures) == {
         "age-real-age-localization-r500-weak-s3.svg",
         "stress-localization-r500-weak-s3.svg",
+        "ablation-localization-r500-weak-s3.svg",
+        "errors-localization-r500-weak-s3.svg",
+        "cost-localization-r500-weak-s3.svg",
         "contrast-graph.svg",
         "contrast-doubt.svg",
         "risk-real-age-localization-r500-weak-s3.svg",
@@ -113,7 +116,10 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
         "reliability-localization-r500-weak-s3.svg",
         "stanford-0.01-r500-weak-s3.svg",
     }
-    assert told == ["no figure of success against strength: the board holds nothing to draw there"]
+    assert told == [
+        f"no figure of {kind}: the board holds nothing to draw there"
+        for kind in ("success against strength", "recall against K", "worth against cost")
+    ]
     for name, draw in figures.items():
         draw(tmp_path / name)
         text = (tmp_path / name).read_text(encoding="utf-8")
@@ -121,11 +127,8 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
         assert "oracle_pose" not in text  # the control that has the truth is no curve
         assert re.search(r">(n |.*\(n |.*, n )\d", text), name
         assert "<dc:date>" not in text
-    draw = figures["age-real-age-localization-r500-weak-s3.svg"]
-    draw(tmp_path / "again.svg")
-    assert (tmp_path / "again.svg").read_bytes() == (
-        tmp_path / "age-real-age-localization-r500-weak-s3.svg"
-    ).read_bytes()
+        draw(tmp_path / "again.svg")
+        assert (tmp_path / "again.svg").read_bytes() == (tmp_path / name).read_bytes()
 
 
 def test_a_board_without_data_has_no_figures_and_says_so(board):
@@ -134,12 +137,17 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
     assert set(figures_extra(unanswered(bare), tell=told.append).figures) == {
         "strength-real-age-localization-r500-weak-s3.svg",
         "stress-localization-r500-weak-s3.svg",
+        "ablation-localization-r500-weak-s3.svg",
+        "errors-localization-r500-weak-s3.svg",
     }
     assert [line.split(":")[0] for line in told] == [
         "no figure of success against the age of the map",
         "no figure of differences by place",
+        "no figure of recall against K",
+        "no figure of worth against cost",
         "no figure of risk against coverage",
         "no figure of reliability",
+        "no figure of the cost of decisions",
         "no figure of protection levels against errors",
     ]
 

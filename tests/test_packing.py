@@ -9,6 +9,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import ScoreRequest
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.packing import laid_out, pack_board, stored_settings
@@ -65,8 +66,25 @@ def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path
     assert {path.name for path in first.iterdir()} == {path.name for path in again.iterdir()}
     for name in (*(f"{table}.parquet" for table in TABLES), "leaderboard.csv", "leaderboard.md", "board.json"):
         assert (first / name).read_bytes() == (again / name).read_bytes(), name
-    for path in (first / "figures").iterdir():
-        assert path.read_bytes() == (again / "figures" / path.name).read_bytes(), path.name
+    for path in (path for kind in ("figures", "pictures") for path in (first / kind).rglob("*.*")):
+        assert path.read_bytes() == (again / path.relative_to(first)).read_bytes(), path.name
+    assert f"pictures are those that {folder} holds" in err
+
+
+def test_stored_pictures_are_kept_without_cases_where_none_are_wanted(kept, tmp_path):
+    _, _, folder, _ = kept
+    lines = []
+    files = pictures_extra(kept[0], tell=lines.append, root=tmp_path, kept=folder, has_cases=False).pictures
+    assert json.loads(files["pictures.json"])["cases"] == []
+    assert {name.partition("/")[0] for name in files} == {"pictures.json", "regions", "suites"}
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    shutil.rmtree(bare / "pictures")
+    assert pictures_extra(kept[0], tell=lines.append, root=tmp_path, kept=bare).pictures == {}
+    assert lines[-1] == f"no pictures: {bare} holds none, and no views to draw them of"
+    (bare / "pictures").mkdir()
+    (bare / "pictures" / "pictures.json").write_text("[", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"pictures.json is damaged: remove the folder"):
+        pictures_extra(kept[0], tell=lines.append, root=tmp_path, kept=bare, has_cases=False)
 
 
 def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
@@ -75,7 +93,7 @@ def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     assert names == {
         *(f"{table}.parquet" for table in (*TABLES, "runs", "tasks", "queries", "truths")),
         *("leaderboard.csv.gz", "leaderboard.md", "leaderboard.tex", "board.json", "pack.json"),
-        *("figures", "predictions", "learned"),
+        *("figures", "pictures", "predictions", "learned"),
     }
     pd.testing.assert_frame_equal(
         pd.read_csv(folder / "leaderboard.csv.gz"), pd.read_csv(plan.out / "boards" / "kept" / "leaderboard.csv")
@@ -103,13 +121,19 @@ def test_stored_results_are_scored_without_a_region(kept, program, tmp_path):
     assert region not in {base_of(name) for name in scores["region"]}
 
 
-def test_what_is_too_large_is_stored_without_headings_or_refused_and_the_old_one_stays(kept, tmp_path):
+def test_what_is_too_large_is_stored_without_pictures_then_without_headings_or_refused_and_the_old_one_stays(
+    kept, tmp_path
+):
     board, plan, _, _ = kept
     request = request_of(plan)
     whole = pack_board(board, request, tmp_path / "kept").packed
-    lean = pack_board(board, request, tmp_path / "kept", most_bytes=whole.total_bytes - 1).packed
-    assert lean.total_bytes < whole.total_bytes
-    assert lean.dropped.startswith("heading and scale of all poses")
+    bare = pack_board(board, request, tmp_path / "kept", most_bytes=whole.total_bytes - 1).packed
+    assert bare.dropped == "pictures of regions, suites and cases"
+    assert not (tmp_path / "kept" / "pictures").exists()
+    assert bare.prediction_bytes == whole.prediction_bytes
+    lean = pack_board(board, request, tmp_path / "kept", most_bytes=bare.total_bytes - 1).packed
+    assert lean.total_bytes < bare.total_bytes
+    assert lean.dropped.startswith("pictures of regions, suites and cases; heading and scale of all poses")
     pack_board(board, request, tmp_path / "kept", most_bytes=lean.total_bytes - 1)
     assert {path.name.partition(".")[2] for path in (tmp_path / "kept" / "figures").iterdir()} == {"svg.gz"}
     before = (tmp_path / "kept" / "pack.json").read_bytes()
@@ -123,7 +147,8 @@ def test_what_is_too_large_is_stored_without_headings_or_refused_and_the_old_one
 
 def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
     board, plan, folder, _ = kept
-    most = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) - 1
+    files = [path for path in folder.rglob("*") if path.is_file() and "pictures" not in path.parts]
+    most = sum(path.stat().st_size for path in files) - 1
     pack_board(board, request_of(plan), tmp_path / "kept", most_bytes=most)
     code, _, err = program("score", "--predictions", tmp_path / "kept", "--name", "again", "--out", tmp_path / "out")
     assert code == 3, err

@@ -3,6 +3,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,17 +12,21 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boardfigures import figures_extra
+from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.packing import board_of, laid_out, stored_settings
+from sasgeo_bench.packing import board_of, laid_out, stored_among, stored_settings
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.store.catalog import find_pipeline_file, find_split, read_pipeline_file
 from sasgeo_bench.submissions import submissions_for
 
 CONTROL_FAILED: Final = 3  # exit status
+Cases = Annotated[
+    bool, typer.Option("--cases/--no-cases", help="show queries that went wrong on the board, with their truths")
+]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
@@ -62,6 +67,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         int | None,
         typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
     ] = None,
+    cases: Cases = True,
     out: Out = Path("out"),
 ) -> None:
     """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
@@ -87,12 +93,19 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         draws=draws or stored.draws,
         by_region=stored.by_region,
         pipeline=stored.pipeline,
-        extras=(figures,),
         without=without or (),
         submissions=submitted,
     )
-    with laid_out(request) as request_laid:
-        board = make_board(request_laid, tell=tell)
+    with laid_out(request) as laid:
+        pictures = partial(
+            pictures_extra,
+            tell=tell,
+            root=laid.root,
+            contrasts=stored.contrasts,
+            kept=stored_among(predictions),
+            has_cases=cases,
+        )
+        board = make_board(replace(laid, extras=(figures, pictures)), tell=tell)
     show_board(board)
     typer.echo(str(request.board))
     _check_controls(board)
@@ -117,6 +130,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
     ] = False,
+    cases: Cases = True,
     out: Out = Path("out"),
 ) -> None:
     """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
@@ -135,9 +149,9 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         return
     if sys.stderr.isatty():
         with Bars() as bars:
-            board = run_pipeline(plan, tell=tell, progress=bars, results=results)
+            board = run_pipeline(plan, tell=tell, progress=bars, results=results, has_cases=cases)
     else:
-        board = run_pipeline(plan, tell=tell, results=results)
+        board = run_pipeline(plan, tell=tell, results=results, has_cases=cases)
     show_board(board)
     typer.echo(str(board_folder(plan)))
     tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")

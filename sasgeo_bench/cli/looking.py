@@ -9,11 +9,14 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, tell
 from sasgeo_bench.duplicates import constellations, search_split
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.panels import panels
 from sasgeo_bench.query import base_of
 from sasgeo_bench.region import Manifest
+from sasgeo_bench.report.cases import count_cases, sample_cases
+from sasgeo_bench.runcases import RunCases, is_run, picture_of, read_run_cases
 from sasgeo_bench.split import make_split
+from sasgeo_bench.store.caseplot import case_pixels
 from sasgeo_bench.store.catalog import (
     find_split_file,
     list_region_files,
@@ -21,6 +24,7 @@ from sasgeo_bench.store.catalog import (
     read_region_file,
     read_split_file,
 )
+from sasgeo_bench.store.picture import write_png
 from sasgeo_bench.store.regiondir import differing_files, read_features, read_manifest
 from sasgeo_bench.store.sheet import write_sheet
 from sasgeo_bench.store.splitmap import write_split_map
@@ -29,19 +33,39 @@ from sasgeo_bench.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks import check_task, has_truths
 
 TOP_DROPS: Final = 12
+SOME_CASES: Final = 3
+SHOWN_LETTERS: Final = 10  # of a query's id: enough to name it
 
 
 def inspect_command(
-    target: Annotated[str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one")],
-    query: Annotated[str | None, typer.Option(help="of a task: this query alone, by the beginning of its id")] = None,
+    target: Annotated[
+        str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one or of a run")
+    ],
+    *,
+    query: Annotated[
+        str | None, typer.Option(help="of a task or a run: this query alone, by the beginning of its id")
+    ] = None,
     rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12,
+    rejector: Annotated[
+        list[str] | None, typer.Option(help="of a run: what says which answers are accepted; may be repeated")
+    ] = None,
+    split: Annotated[str, typer.Option(help="of a run: says which places calibrate rejectors")] = "crossfit",
     region_folders: RegionFolders = None,
     out: Out = Path("out"),
 ) -> None:
-    """Say what is in a region, a task or a split; of a task draw a contact sheet, of a split its map."""
+    """Say what is in a region, a task, a split or a run; draw a task's sheet, a split's map, a query and its answer."""
     folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
     if (folder / TASK).is_file():
         _inspect_task(folder, out, query=query, rows=rows)
+        return
+    if Path(target).is_dir() and is_run(Path(target)):
+        grids = {
+            name: read_region_file(path).grid()
+            for name, path in list_region_files(folders=region_folders or []).items()
+        }
+        chosen = make_split(read_split_file(find_split_file(split)), grids)
+        cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=rejector or (), tell=tell)
+        _inspect_run(cases, out, query)
         return
     _check_target(target, out)
     if target.endswith(".toml") or target in list_split_files():
@@ -81,6 +105,25 @@ def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> N
     path.parent.mkdir(parents=True, exist_ok=True)
     write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
     typer.echo(f"contact sheet: {path}")
+
+
+def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
+    """Count the failures of a run by class, with some to look at; or draw one query and its answer."""
+    if query is not None:
+        query_id, picture = picture_of(cases, query)
+        path = out / "sheets" / f"{cases.entry.name.replace(' ', '-')}-{query_id}.png"
+        write_png(path, case_pixels(picture))
+        typer.echo(f"picture: {path}")
+        return
+    found = cases.failures()
+    counts = count_cases(found)
+    some = sample_cases(found, each=SOME_CASES)
+    table = Table("failure", "queries", "some of them (--query draws one)", box=None, pad_edge=False)
+    for name, count in counts.items():
+        listed = some.loc[some["failure"] == name, "query_id"]
+        table.add_row(name, str(count), ", ".join(query_id[:SHOWN_LETTERS] for query_id in listed))
+    typer.echo(f"{cases.entry.name}: {len(found)} failures in {counted(len(cases.scores), 'query', 'queries')}")
+    print_table(table)
 
 
 def _inspect_split(target: str, out: Path, folders: list[Path]) -> None:

@@ -193,10 +193,7 @@ def both_on(
             there = ", ".join(sorted(known)) or "nothing of the kind"
             message = f"contrast {contrast.name!r} names {name!r}, which is not on the board: there is {there}"
             raise ConfigError(message)
-        rows = known[name]
-        rows = rows[rows["suite"].isin(contrast.suites) & (rows["track"] == contrast.track)]
-        rows = rows[chosen(rows).to_numpy(bool)]
-        frames.append(rows[_of_kinds(contrast, rows).to_numpy(bool)])
+        frames.append(_rows_of(contrast, known[name], chosen))
     shared = sorted(set(frames[0]["query_id"]) & set(frames[1]["query_id"]))
     first, second = (frame.set_index("query_id", drop=False).loc[shared] for frame in frames)
     return first, second
@@ -272,18 +269,27 @@ def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, pla
     )
 
 
+def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
+    """The queries of a contrast: stresses of its suites and kinds on its track."""
+    return _rows_of(contrast, frame, _stressed if contrast.metric == "primary" else _unfalsified)
+
+
+def _rows_of(
+    contrast: Contrast, frame: pd.DataFrame, chosen: Callable[[pd.DataFrame], "pd.Series[bool]"]
+) -> pd.DataFrame:
+    """Some rows on the suites, track and kinds of a contrast; what is no stress is about all kinds."""
+    rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
+    rows = rows[chosen(rows).to_numpy(bool)]
+    is_kind = (rows["role"] != "stress") | rows["kind"].str.startswith(contrast.kinds or "")
+    return rows[is_kind.to_numpy(bool)]
+
+
 def _stressed(rows: pd.DataFrame) -> "pd.Series[bool]":
     return rows["is_present"].astype(bool) & (rows["role"] == "stress")
 
 
 def _unfalsified(rows: pd.DataFrame) -> "pd.Series[bool]":
     return rows["role"] != "falsifier"
-
-
-def _of_kinds(contrast: Contrast, rows: pd.DataFrame) -> "pd.Series[bool]":
-    """Stresses of the kinds that a contrast is about; whatever is no stress is about all of them."""
-    is_stress = rows["role"] == "stress"
-    return ~is_stress | rows["kind"].str.startswith(contrast.kinds or "")
 
 
 def _nothing(contrast: Contrast) -> Finding:

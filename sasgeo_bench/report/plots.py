@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -11,6 +11,17 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
+from sasgeo_bench.report.axes import (
+    ACROSS,
+    HALVES,
+    INTERVALS,
+    PRIMARY,
+    draw_bars_of,
+    draw_line,
+    dress_share,
+    of_which,
+    those_there,
+)
 from sasgeo_bench.report.contrasts import Contrast, Finding, PlaceDifference
 from sasgeo_bench.report.measures import primary_of
 from sasgeo_bench.report.plottables import AS_DRAWN, BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
@@ -18,16 +29,6 @@ from sasgeo_bench.report.protection import ToldLevels
 from sasgeo_bench.report.rows import ALL_SUITES
 from sasgeo_bench.store.boardplot import FAINT, GREY, Page, look_of, page
 
-PRIMARY: Final = {
-    "success_25m": "success (share of queries\nwithin 25 m and 5 deg)",
-    "recall_1": "recall@1\n(share of queries)",
-}
-_INTERVALS: Final = (
-    "Bars: 95 % intervals as on the board (blocks, then sites are drawn; never narrower than Wilson's over sites). "
-    "n: queries of each point."
-)
-_ACROSS: Final = 4  # panels beside each other
-_HALVES: Final = (0.0, 0.5, 1.0)
 _DODGE: Final = 0.011  # of an axis, between two matchers at one step
 
 
@@ -47,9 +48,14 @@ def draw_steps(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         Matchers, in the order of their looks.
     """
     first = rows.iloc[0]
-    note = f"Strength 0: the controls, the same places with nothing done to the view. {_INTERVALS}"
+    note = f"Strength 0: the controls, the same places with nothing done to the view. {INTERVALS}"
     _draw_lines(
-        path, rows, shown, f"Success against strength: {_of(first)}", note, ("strength", str(first["strength_unit"]))
+        path,
+        rows,
+        shown,
+        f"Success against strength: {of_which(first)}",
+        note,
+        ("strength", str(first["strength_unit"])),
     )
 
 
@@ -67,26 +73,17 @@ def draw_ages(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """
     note = (
         "A point stands at the mean age of the maps of its step; the grey line at the bottom shows from which to "
-        f"which age they are. {_INTERVALS}"
+        f"which age they are. {INTERVALS}"
     )
-    title = f"Success against the age of the map: {_of(rows.iloc[0])}"
+    title = f"Success against the age of the map: {of_which(rows.iloc[0])}"
     _draw_lines(path, rows, shown, title, note, ("age_years", "age of the map (years)"))
-
-
-def _of(row: Mapping[str, Any] | pd.Series) -> str:
-    """Of which queries a figure is."""
-    return f"{row['suite']}, {row['track']}, prior {row['prior_group']}"
-
-
-def _there(rows: pd.DataFrame, shown: Sequence[str]) -> list[str]:
-    return [name for name in shown if (rows["matcher"] == name).any()]
 
 
 def _draw_lines(
     path: Path, rows: pd.DataFrame, shown: Sequence[str], title: str, note: str, axis: tuple[str, str]
 ) -> None:
     column, label = axis
-    names = _there(rows, shown)
+    names = those_there(rows, shown)
     kinds, sizes = (sorted(set(rows[name])) for name in ("kind", "view_cells"))
     about = Page(title=title, note=note, below=label, rows=len(kinds), columns=len(sizes), keys=names, gap_inches=0.25)
     measure = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
@@ -97,33 +94,17 @@ def _draw_lines(
                 mine = rows[(rows["kind"] == kind) & (rows["view_cells"] == size)]
                 chart.set_title(f"{kind}, view of {size:g} cells", fontsize=8.5, loc="left", pad=4)
                 chart.set_xlim(-0.1 * high, 1.1 * high)
-                _dress_share(chart)
+                dress_share(chart)
                 if chart is not line[0]:
                     chart.tick_params(labelleft=False)
                 if mine.empty:  # not every kind is drawn at every size
                     chart.set_visible(False)
                 for number, name in enumerate(names):
                     shift = _DODGE * high * (number - (len(names) - 1) / 2)
-                    _line(chart, mine[mine["matcher"] == name].sort_values(column), column, number, shift)
+                    line_of = mine[mine["matcher"] == name].sort_values(column)
+                    draw_line(chart, line_of, line_of[column].to_numpy(float) + shift, number)
                 _write_counts(chart, mine, column)
             line[0].set_ylabel(measure)
-
-
-def _dress_share(chart: Axes) -> None:
-    """An axis of shares, with room below for numbers of queries."""
-    chart.set_ylim(-0.13, 1.04)
-    chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
-    chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
-
-
-def _line(chart: Axes, mine: pd.DataFrame, column: str, number: int, shift: float) -> None:
-    if mine.empty:
-        return
-    look = look_of(number)
-    value, lo, hi = (mine[name].to_numpy(float) for name in ("value", "lo", "hi"))
-    at = mine[column].to_numpy(float) + shift
-    chart.plot(at, value, color=look.colour, ls=look.dash, marker=look.mark, ms=4, lw=1.3)
-    chart.vlines(at, lo, hi, color=look.colour, lw=0.9, alpha=0.75)
 
 
 def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
@@ -149,12 +130,12 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     shown : sequence of str
         Matchers, in the order of their looks.
     """
-    names, suites = _there(rows, shown), sorted(set(rows["suite"]))
+    names, suites = those_there(rows, shown), sorted(set(rows["suite"]))
     first = rows.iloc[0]
-    columns = min(_ACROSS, len(suites))
+    columns = min(ACROSS, len(suites))
     about = Page(
         title=f"Success under stress, suite by suite: {first['track']}, prior {first['prior_group']}",
-        note=_INTERVALS.replace("each point", "each bar"),
+        note=INTERVALS.replace("each point", "each bar"),
         below=PRIMARY[primary_of(str(first["track"])).name].replace("\n", " "),
         rows=-(-len(suites) // columns),
         columns=columns,
@@ -173,24 +154,9 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             counts = mine.iloc[0]
             head = f"{suites[number]}\nn {counts['n']:g}, {counts['blocks']:g} blocks"
             chart.set_title(head, fontsize=8, loc="left")
-            _bars(chart, mine, names)
+            draw_bars_of(chart, mine, names)
             if number % columns:
                 chart.set_yticklabels([])
-
-
-def _bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
-    for at, name in enumerate(names):
-        for row in mine[mine["matcher"] == name].to_dict("records"):
-            chart.barh(at, row["value"], height=0.72, color=look_of(at).colour, alpha=0.75)
-            chart.hlines(at, row["lo"], row["hi"], color="#000000", lw=1.0)
-            chart.vlines([row["lo"], row["hi"]], at - 0.18, at + 0.18, color="#000000", lw=1.0)
-            chart.text(1.03, at, f"{row['value']:.2f}", fontsize=6.5, va="center")
-    chart.set_yticks(range(len(names)), list(names))
-    chart.set_ylim(len(names) - 0.4, -0.6)
-    chart.set_xlim(0.0, 1.0)
-    chart.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])
-    chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
-    chart.tick_params(axis="y", length=0)
 
 
 def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequence[PlaceDifference]) -> None:
@@ -262,14 +228,14 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     shown : sequence of str
         Matchers.
     """
-    names, rejectors = _there(rows, shown), sorted(set(rows["rejector"]))
+    names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     mixtures = list(dict.fromkeys(rows["mixture"]))
     first = rows.iloc[0]
     cells = [(name, mixture) for name in names for mixture in mixtures]
-    columns = min(_ACROSS, len(cells)) if len(mixtures) == 1 else len(mixtures)
+    columns = min(ACROSS, len(cells)) if len(mixtures) == 1 else len(mixtures)
     pooled = " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
     about = Page(
-        title=f"Risk against coverage: {_of(first)}",
+        title=f"Risk against coverage: {of_which(first)}",
         note=(
             "Answers are accepted from the surest down, by each rejector; what it says of a place was fitted on other "
             "places. Risk: false fixes among the accepted; coverage: accepted among all n queries, absent places among "
@@ -296,7 +262,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             chart.set_title(f"{head}\n{_counts(mine)}", fontsize=7.5, loc="left", pad=3)
             _risk_lines(chart, mine, rejectors)
             chart.set_xlim(0.0, 1.0)
-            chart.set_xticks(_HALVES)
+            chart.set_xticks(HALVES)
             chart.set_ylim(0.0, max(high, 0.02))
             chart.grid(visible=True, color=FAINT, lw=0.6)
             chart.tick_params(labelleft=number % columns == 0, labelbottom=number + columns >= len(cells))
@@ -334,7 +300,7 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
     shown : sequence of str
         Matchers.
     """
-    names, rejectors = _there(rows, shown), sorted(set(rows["rejector"]))
+    names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
     about = Page(
         title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
@@ -358,8 +324,8 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
                 _reliable(chart, mine)
                 chart.set_xlim(-0.03, 1.03)
                 chart.set_ylim(-0.03, 1.03)
-                chart.set_xticks(_HALVES)
-                chart.set_yticks(_HALVES)
+                chart.set_xticks(HALVES)
+                chart.set_yticks(HALVES)
                 chart.grid(visible=True, color=FAINT, lw=0.6)
                 chart.tick_params(labelleft=chart is line[0], labelbottom=line is charts[-1])
             line[0].set_ylabel("false (share of answers)")

@@ -20,6 +20,8 @@ PROTECTION: Final = "protection"
 SCORES: Final = "scores"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
+PICTURES: Final = "pictures"
+PICTURES_SAID: Final = "pictures.json"
 _AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a spreadsheet
 _VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
 _KNOWN: Final = (
@@ -28,7 +30,7 @@ _KNOWN: Final = (
     *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
-    *(FIGURES, "site"),
+    *(FIGURES, PICTURES, "site"),
 )
 
 
@@ -44,11 +46,14 @@ class Extra:
         File name -> text.
     figures : mapping of str to callable
         Name in `figures/` -> what draws it to a path.
+    pictures : mapping of str to bytes
+        Name in `pictures/`, with the folder there -> its content.
     """
 
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def write_board(
@@ -112,6 +117,10 @@ def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
     for name, draw in part.figures.items():
         (folder / FIGURES).mkdir(exist_ok=True)
         draw(folder / FIGURES / name)
+    for name, content in part.pictures.items():
+        path = folder / PICTURES / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
 
 
 def check_board(folder: Path, *, scorer_version: int) -> None:
@@ -163,4 +172,26 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         raise StoreError(message) from error
     except (OSError, ValueError, TypeError, pa.ArrowException) as error:
         message = f"{folder} holds a damaged board ({' '.join(str(error).split())[:120]}): score again"
+        raise StoreError(message) from error
+
+
+def read_pictures(folder: Path) -> dict[str, bytes]:
+    """Pictures of a board, or of stored results, as they were written: name in `pictures/` -> content.
+
+    Raises
+    ------
+    StoreError
+        If one cannot be read.
+
+    Examples
+    --------
+    >>> read_pictures(Path("nowhere"))
+    {}
+    """
+    place = folder / PICTURES
+    try:
+        paths = sorted(path for path in place.rglob("*") if path.is_file())
+        return {path.relative_to(place).as_posix(): path.read_bytes() for path in paths}
+    except OSError as error:
+        message = f"{place} cannot be read ({error.strerror or error}): remove it, or fetch it again"
         raise StoreError(message) from error

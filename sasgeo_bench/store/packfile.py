@@ -24,7 +24,7 @@ from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.boardfile import FIGURES, LEADERBOARD
+from sasgeo_bench.store.boardfile import FIGURES, LEADERBOARD, PICTURES
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.regiondir import MANIFEST, fresh_folder, locked
 from sasgeo_bench.store.runrows import PREDICTION_SCHEMA, prediction_row
@@ -42,7 +42,8 @@ _PAGE_BYTES: Final = 2**24  # what is alike is told once in a page: few pages, s
 _CSV: Final = f"{LEADERBOARD}.csv"
 _TASK: Final = "task"  # column: number of the row in tasks.parquet
 _TEXTS: Final = ("query_id", "track", "suite", "part", "region", "prior_group", "status", "message")
-_DROPPED: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
+_NO_PICTURES: Final = "pictures of regions, suites and cases"
+_NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,8 +98,8 @@ def write_pack(
     settings : mapping
         How it was scored.
     most_bytes : int
-        Of all files together. What is larger is written without headings and scales of the poses beside the first, and
-        then with figures as .svg.gz.
+        Of all files together. What is larger is written without pictures, then without headings and scales of the poses
+        beside the first, and then with figures as .svg.gz.
 
     Returns
     -------
@@ -121,8 +122,12 @@ def write_pack(
             said, dropped = {**settings, "contestants": list(runs)}, ""
             found = _write_predictions(scratch, runs, is_lean=False)
             _write_settings(scratch, said, dropped)
+            if _bytes_of(scratch) > most_bytes and (scratch / PICTURES).is_dir():
+                shutil.rmtree(scratch / PICTURES)
+                dropped = _NO_PICTURES
+                _write_settings(scratch, said, dropped)
             if _bytes_of(scratch) > most_bytes:
-                dropped = _DROPPED
+                dropped = "; ".join(filter(None, (dropped, _NO_HEADINGS)))
                 found = _write_predictions(scratch, runs, is_lean=True)
                 _write_settings(scratch, said, dropped)
             if _bytes_of(scratch) > most_bytes:  # they are drawn again where results are scored

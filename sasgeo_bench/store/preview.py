@@ -53,7 +53,7 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     FigureCanvasAgg(figure)
     chart = figure.add_axes((0.3 / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))
     side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))
-    chart.imshow(_picture(manifest, overview), extent=(0, side_m[0], 0, side_m[1]), interpolation="antialiased")
+    chart.imshow(paint_overview(manifest, overview), extent=(0, side_m[0], 0, side_m[1]), interpolation="antialiased")
     chart.set_xticks([])
     chart.set_yticks([])
     chart.set_anchor("NW")
@@ -71,7 +71,7 @@ def _cell_m(manifest: Manifest, overview: NDArray[np.uint8]) -> float:
     return manifest.cell_size_m * round(manifest.cols / overview.shape[2]) if overview.shape[2] else 1.0
 
 
-def _picture(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.float64]:
+def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Colours, shape (rows, cols, 3), 0..1."""
     rows, cols = overview.shape[1:]
     picture = np.empty((rows, cols, 3))

@@ -78,11 +78,17 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
     panels : sequence of Panel
         Its rows.
     """
+    figure = sheet_figure(title, panels)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+
+
+def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Figure:
+    """A contact sheet as a figure; see `write_sheet`."""
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     columns = (*_COLUMNS, "perceived vectors") if has_vectors else _COLUMNS
     width, height = 2.6 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     legend = (
         "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"
@@ -109,7 +115,7 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
             if at == 0:
                 chart.set_title(name, fontsize=9, pad=3)
     figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
-    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+    return figure
 
 
 def _draw_legend(figure: Figure, width: float, height: float) -> None:

@@ -82,6 +82,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
             "ratebookfile",
             "catalog",
         ),
+        *("columntexts", "releasedir", "stacfile", "croissantfile", "datasetcard", "datasheet"),
     ),
     "build": None,
     "request": None,
@@ -121,9 +122,22 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "packing": None,
     "paperboard": None,
     "pipeline": None,
+    "release": None,
     "scaffold": None,
     "testing": None,
-    "cli": ("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "boards", "program"),
+    "cli": (
+        "console",
+        "regions",
+        "ageing",
+        "queries",
+        "looking",
+        "weights",
+        "matchers",
+        "runs",
+        "boards",
+        "releasing",
+        "program",
+    ),
 }
 
 # The rooms that touch the disk, and the few calls others may make, each with its reason.

@@ -218,6 +218,10 @@ def _map(folder: Path) -> ReleaseMap:
     """Read a map, after a look at its licence and its raster."""
     manifest = regiondir.read_manifest(folder)
     path = folder / regiondir.MANIFEST
+    stray = next((name for name in manifest.files if Path(name).name != name), None)
+    if stray is not None:
+        message = f"{path} is damaged (it names the file {stray!r}): build the region again"
+        raise StoreError(message)
     if not manifest.licence.strip() or not manifest.attribution.strip():
         message = f"{path} says no licence or no attribution, and a release must: build the region again"
         raise StoreError(message)

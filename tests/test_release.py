@@ -291,6 +291,12 @@ def test_the_same_regions_and_tasks_give_the_same_bytes(written: Path, source: P
     assert len(again.files) < len(names)
 
 
+def test_ground_is_counted_once_whatever_the_number_of_its_maps(written: Path) -> None:
+    grid, riverside = (read_manifest(written / "regions" / name).grid for name in (GRID, RIVERSIDE))
+    area_km2 = (grid.rows * grid.cols + riverside.rows * riverside.cols) / 1e6
+    assert f"2 regions ({area_km2:.1f} km2, 2 of them made up by a program)" in (written / "datasheet.md").read_text()
+
+
 def test_in_a_cross_fit_no_truth_is_released_unless_asked_for(source: Path, written: Path, tmp_path: Path) -> None:
     told: list[str] = []
     make_release(_request(source, tmp_path / FOLDER), tell=told.append)
@@ -359,6 +365,7 @@ def _edit(path: Path, **changes: object) -> None:
     ("changes", "told"),
     [
         ({"licence": ""}, "says no licence or no attribution, and a release must: build the region again"),
+        ({"files": {"../stray": {"sha256": "0" * 64, "bytes": 1}}}, "is damaged (it names the file '../stray')"),
         ({"licence": "  "}, "says no licence or no attribution"),
         ({"attribution": ""}, "says no licence or no attribution"),
         ({"licence": "CC-BY-4.0"}, "says licence 'CC-BY-4.0': a release holds data under ODbL-1.0 alone"),

@@ -85,7 +85,7 @@ def write_croissant(folder: Path, release: Release) -> None:
         keywords=["map localization", "UAV", "OpenStreetMap", "geolocalization"],
         creators=[mlc.Organization(name="The sasgeo-bench authors")],
         cite_as=cite_as(release),
-        data_biases=["Most regions lie in Europe, where OpenStreetMap is denser than elsewhere."],
+        data_biases=["OpenStreetMap is denser in some countries than in others."],
         personal_sensitive_information=["None: names and ids of the accounts that edited the map are not kept."],
         distribution=[*_file_objects(release), *map(_file_set, tables)],
         record_sets=[_record_set(table) for table in tables],
@@ -126,7 +126,7 @@ def _query_tables(release: Release) -> Iterator[_Table]:
         title = release.tasks_of(suite)[0].about["title"]
         yield _Table(
             name=suite,
-            pattern=f"tasks/{suite}/*.parquet",
+            pattern=f"tasks/{suite}/*/*.parquet",
             description=f"Queries: {title}",
             schema=FILE_SCHEMA,
             texts=QUERY_TEXTS,
@@ -134,7 +134,7 @@ def _query_tables(release: Release) -> Iterator[_Table]:
         if release.tables_of(suite, kind="truth"):
             yield _Table(
                 name=f"{suite}-{TRUTHS}",
-                pattern=f"truth/{suite}/*.parquet",
+                pattern=f"truth/{suite}/*/*.parquet",
                 description=f"Truths: {title}",
                 schema=PLAIN_TRUTH_SCHEMA,
                 texts=TRUTH_TEXTS,

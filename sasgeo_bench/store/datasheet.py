@@ -76,8 +76,8 @@ cell present, absent or unknown, with what is known of place, heading and scale 
 
 {_class_table(objects)}
 
-**Is it a sample?** Yes. Regions were chosen for variety and for having dated extracts; most lie in Europe. Places
-within them are drawn at random among those that are mapped and not empty.
+**Is it a sample?** Yes. Regions were chosen for variety and for having dated extracts. Places within them are
+drawn at random among those that are mapped and not empty.
 
 **Is there a label?** The pose of the view, and whether the place is on the map. {kept}
 
@@ -101,7 +101,7 @@ kept; names and ids of the accounts that edited them are not."""
 def _area_km2(release: Release) -> float:
     """Ground of all regions, each counted once whatever the number of its maps."""
     areas = {
-        item.manifest.id: item.manifest.rows * item.manifest.cols * item.manifest.cell_size_m**2 / _M2_PER_KM2
+        item.region: item.manifest.rows * item.manifest.cols * item.manifest.cell_size_m**2 / _M2_PER_KM2
         for item in release.maps
     }
     return sum(areas.values())
@@ -215,9 +215,9 @@ def _maintenance(release: Release) -> str:
 
 **Who keeps it?** The authors of sasgeo-bench.
 
-**Will it be updated?** A release does not change. A release of other maps has another data version, one of other
-queries another task version; this one is {release.version} (data, task). Figures of two versions are never put on one
-board.
+**Will it be updated?** A release does not change. Its version, {release.version}, says how its maps are made (first
+number) and how its queries are (second): figures of two versions are never put on one board. Two releases of one
+version may hold other regions and queries; `release.json` says which, and `SHA256SUMS` whether two are the same.
 
 **How can others add to it?** A region is one TOML file, a suite one module: sasgeo-bench says how. What is derived
 from the data is offered under the ODbL."""

@@ -65,6 +65,11 @@ class ReleaseMap:
         """The folder's name, which is what queries call the map: as in "vaduz" or "vaduz@2021-10-28"."""
         return self.folder.name
 
+    @property
+    def region(self) -> str:
+        """The region it is a map of, whatever its date and whether a suite has edited it."""
+        return self.name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseTask:
@@ -122,7 +127,7 @@ class Release:
 
     @property
     def version(self) -> str:
-        """Of the data, then of the tasks: as in 1.1.0."""
+        """How maps are made, then how queries are: as in 1.1.0; not which regions there are."""
         return f"{DATA_VERSION}.{TASK_VERSION}.0"
 
     @property
@@ -372,7 +377,7 @@ def _map_said(item: ReleaseMap) -> dict[str, Any]:
     about = item.manifest
     return {
         "map": item.name,
-        "region": about.id,
+        "region": item.region,
         "title": about.title,
         "date": about.extract.date.isoformat(),
         "epsg": about.epsg,

@@ -88,7 +88,7 @@ docs: $(STAMP) ## run the examples in the docstrings and follow the links betwee
 	$(VENV_PYTHON) -m pytest -q -p no:benchmark tests/test_repository.py -k "link or document"
 
 lock: ## resolve requirements.lock anew from pyproject.toml (needs uv: make lock UV=/path/to/uv)
-	$(UV) pip compile pyproject.toml --extra dev --extra dask --universal --python-version 3.11 --generate-hashes --no-config \
+	$(UV) pip compile pyproject.toml --extra dev --extra dask --extra publish --universal --python-version 3.11 --generate-hashes --no-config \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 	  --output-file requirements.lock $(ARGS)
 

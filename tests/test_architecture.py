@@ -85,6 +85,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
             "ratebookfile",
             "catalog",
         ),
+        *("columntexts", "releasedir", "stacfile", "croissantfile", "datasetcard", "datasheet"),
     ),
     "build": None,
     "request": None,
@@ -130,6 +131,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissions": None,
     "paperboard": None,
     "pipeline": None,
+    "release": None,
     "scaffold": None,
     "testing": None,
     "cli": (
@@ -143,6 +145,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         "runs",
         "submissions",
         "boards",
+        "releasing",
         "program",
     ),
 }

@@ -33,7 +33,12 @@ GENERATED = {
 MAX_FILE_BYTES = 500_000
 
 # Distributions whose module has another name.
-IMPORTED_AS = {"opencv-python-headless": "cv2", "scikit-image": "skimage", "scikit-learn": "sklearn"}
+IMPORTED_AS = {
+    "opencv-python-headless": "cv2",
+    "rio-cogeo": "rio_cogeo",
+    "scikit-image": "skimage",
+    "scikit-learn": "sklearn",
+}
 
 # Declared, though no file of ours imports them: another library needs them for what we ask of it.
 INDIRECT = {"tqdm": "the progress bar of pooch"}

@@ -22,6 +22,7 @@ from sasgeo_bench.cli.matchers import (
 )
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
+from sasgeo_bench.cli.releasing import release_command
 from sasgeo_bench.cli.runs import merge_command, run_command
 from sasgeo_bench.cli.submissions import submit_command, validate_command
 from sasgeo_bench.cli.weights import lookalike_command, weights_command
@@ -63,6 +64,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "submit": submit_command,
     "score": score_command,
     "leaderboard": leaderboard_command,
+    "release": release_command,
 }
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)

@@ -296,8 +296,10 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     """Some maps may be read; other maps, truths, and whatever other runs wrote, may not."""
     folders = (*request.tasks, *request.train)
     roots = {folder.resolve().parent.parent.parent for folder in folders} | {request.out.resolve()}
-    hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards")]
     readable = [region.resolve() for region in regions]
+    hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards", "release")]
+    # A release that lies where others are written is hidden too, unless it is itself what is run on.
+    hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would give the world away.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
     hidden += [path for path in maps if path not in readable]

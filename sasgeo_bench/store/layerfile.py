@@ -151,3 +151,21 @@ def read_layers(path: Path, *, window: tuple[int, int, int, int] | None = None) 
         raise StoreError(message) from error
     layers.flags.writeable = False
     return layers
+
+
+def cog_faults(path: Path) -> list[str]:
+    """What a validator of cloud-optimized GeoTIFFs finds wrong with a file; nothing where it is good.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be read.
+    """
+    from rio_cogeo.cogeo import cog_validate  # noqa: PLC0415 - an extra: only whoever writes a release needs it
+
+    try:
+        is_valid, faults, _ = cog_validate(path, quiet=True)
+    except (RasterioError, RasterioIOError) as error:
+        message = f"{path} cannot be read ({error}): build the region again"
+        raise StoreError(message) from error
+    return [] if is_valid else list(faults) or ["not valid"]

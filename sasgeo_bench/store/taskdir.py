@@ -403,6 +403,24 @@ def read_truths(folder: Path) -> Iterator[Truth]:
         yield truth_of(row)
 
 
+def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """Some columns of queries or truths, a row group in memory at a time.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or damaged, or lacks a column.
+    """
+    with _named(path):
+        yield from _batches_of(path, list(columns))
+
+
+def check_columns(path: Path, needed: Sequence[str]) -> None:
+    """Refuse queries or truths without some columns; raises as `read_batches` does."""
+    with _named(path):
+        _check_columns(path, pq.read_schema(path).names, needed)
+
+
 def _check_columns(path: Path, found: Sequence[str], needed: Sequence[str]) -> None:
     missing = [name for name in needed if name not in found]
     if missing:

@@ -109,6 +109,13 @@ TRUTH_SCHEMA: Final = pa.schema(
 )
 
 
+# Truths as a release holds them: lists of pairs where not every reader of parquet knows maps.
+_PAIR: Final = pa.struct([("name", pa.string()), ("value", pa.float64())])
+PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
+    TRUTH_SCHEMA.get_field_index("measured"), pa.field("measured", pa.list_(_PAIR))
+)
+
+
 def query_row(query: Query) -> dict[str, Any]:
     """One query as a row of `QUERY_SCHEMA`."""
     seen, prior = query.evidence, query.prior
@@ -232,11 +239,12 @@ def truth_row(truth: Truth) -> dict[str, Any]:
 
 
 def truth_of(row: dict[str, Any]) -> Truth:
-    """Inverse of `truth_row`."""
+    """Inverse of `truth_row`; rows of a release (`PLAIN_TRUTH_SCHEMA`) are read too."""
     names = ("easting_m", "northing_m", "yaw_deg", "scale")
     pose = None if row["easting_m"] is None else Pose(**{name: row[name] for name in names})
     rest = {name: value for name, value in row.items() if name not in (*names, "measured")}
-    return Truth(**rest, pose=pose, measured=dict(row["measured"]))
+    pairs = [(pair["name"], pair["value"]) if isinstance(pair, dict) else pair for pair in row["measured"]]
+    return Truth(**rest, pose=pose, measured=dict(pairs))
 
 
 def truth_sha256(truth: Truth) -> str:

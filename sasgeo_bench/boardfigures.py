@@ -22,18 +22,16 @@ from sasgeo_bench.report.plots import (
     draw_steps,
 )
 from sasgeo_bench.report.plottables import (
-    GROUP,
     ages_frame,
-    queries_of,
     reliability_frame,
     risk_frame,
     shown_matchers,
-    steps_frame,
     stress_frame,
 )
 from sasgeo_bench.report.poolplots import draw_ablation, draw_costs, draw_errors, draw_prices, draw_recall
 from sasgeo_bench.report.pools import COSTS, ablation_frame, cost_frame, errors_frame, price_frame, recall_frame
 from sasgeo_bench.report.protection import ToldLevels, told_levels
+from sasgeo_bench.report.steps import GROUP, queries_of, steps_frame
 from sasgeo_bench.score import FIX_M
 from sasgeo_bench.split import Split
 from sasgeo_bench.store.boardfile import Extra

@@ -4,7 +4,7 @@
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -12,9 +12,10 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.apart import set_apart
-from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks, read_scored_task
+from sasgeo_bench.boardtasks import ScoredTask, read_scored_task
+from sasgeo_bench.contestants import Told, read_told
 from sasgeo_bench.entries import Entry, find_entries, leave_out
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
 from sasgeo_bench.region import DATA_VERSION
@@ -28,18 +29,18 @@ from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, judge, own_word, remarks_of, rules_of, why_not
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
+from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, write_board
 from sasgeo_bench.validate import submission_faults, validate
 
 Tell = Callable[[str], None]
 
-MOST_NAMED: Final = 3  # runs that are left out; the others are counted
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
 _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
 
@@ -150,10 +151,9 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
     entries = leave_out(find_entries(request.predictions, request.submissions), request.without)
-    told = _read_told(request, entries, tell)
-    folders = list(dict.fromkeys(_kept(request.tasks, request.without))) or sorted(
-        {folder for item in told for folder in item.held}
-    )
+    wanted = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
+    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell)
+    folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
     _check_files([item.entry for item in told], folders, request.split)
     everything = {item.entry.name: _scored(item, tasks, request) for item in told}
@@ -211,11 +211,6 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     return board
 
 
-def _kept(tasks: Sequence[Path], regions: Collection[str]) -> list[Path]:
-    """Task folders but those of some regions."""
-    return [folder for folder in tasks if base_of(folder.name) not in regions]
-
-
 def _apart(
     entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None, tell: Tell
 ) -> dict[str, str]:
@@ -270,7 +265,7 @@ def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
     return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
 
 
-def _asked_whole(told: Sequence["_Told"], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
+def _asked_whole(told: Sequence[Told], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
     """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
     suites = {task.about["suite"] for task in tasks}
     found = {}
@@ -294,106 +289,6 @@ def _leaderboards(
         yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws, apart=apart)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Told:
-    """One contestant and its answers to the tasks of a board.
-
-    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
-    file is asked all tasks, and brings those that it holds an answer to; a submission is asked those that it names.
-    `entry` has only the runs that count.
-    """
-
-    entry: Entry
-    predictions: dict[str, Prediction]
-    held: frozenset[Path]
-    asked: frozenset[Path]
-
-
-def _read_told(request: ScoreRequest, entries: Sequence[Entry], tell: Tell) -> list[_Told]:
-    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves."""
-    files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
-    folders = _kept(request.tasks, request.without) or _named(entries, request.root)
-    folders = list(dict.fromkeys([*folders, *(() if request.tasks else held_tasks(files.values(), request.root))]))
-    tasks = [AskedTask.of(folder) for folder in folders]
-    told: list[_Told] = []
-    stale: list[Path] = []
-    for entry in entries:
-        if entry.runs:
-            item, others = _read_runs(entry, tasks)
-            stale += others
-        else:
-            rows = files[entry.name]
-            held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-            item = _Told(entry=entry, predictions=rows, held=held, asked=_asked_of(entry, tasks))
-        if item.asked:
-            told.append(item)
-    named = next((source for source in stale if source in request.predictions), None)
-    if named is not None or (stale and not told):
-        holder = "these tasks do" if request.tasks else "its task does"
-        message = (
-            f"{named or stale[0]} holds answers to other queries than {holder} now: "
-            "run again (what is answered already is kept), or make the old queries again"
-        )
-        raise StoreError(message)
-    if not told:
-        message = (
-            f"there is nothing to score: no task in {request.root / 'tasks'} is answered "
-            "(--out names another root, --tasks the tasks themselves)"
-        )
-        raise ConfigError(message)
-    if stale:
-        listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
-        tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
-    return told
-
-
-def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
-    """Folders of the tasks that a file or a submission is asked."""
-    if entry.submission is None:
-        return frozenset(task.folder for task in tasks)
-    named = {(item.suite, item.region) for item in entry.submission.tasks}
-    return frozenset(task.folder for task in tasks if (task.about["suite"], task.about["region"]) in named)
-
-
-def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
-    return {item.query_id: item for source in entry.sources for item in rundir.read_predictions(source)}
-
-
-def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[_Told, list[Path]]:
-    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
-    by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
-    rows: dict[str, Prediction] = {}
-    runs: list[tuple[Path, Mapping[str, Any]]] = []
-    asked: set[Path] = set()
-    stale: list[Path] = []
-    for source, about in zip(entry.sources, entry.runs, strict=True):
-        task = by_name.get((about["suite"], about["region"]))
-        is_same = task is not None and about["queries_sha256"] == task.about["files"][taskdir.QUERIES]["sha256"]
-        found = rundir.Answers({}, 0) if task is None else rundir.read_answers(source, task.asked, is_tied=is_same)
-        if task is None or not (found.found or is_same):
-            stale.append(source)
-            continue
-        rows |= found.found
-        asked.add(task.folder)
-        runs.append((source, _share_of(about, found)))
-    mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
-    return _Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
-
-
-def _share_of(about: Mapping[str, Any], answers: rundir.Answers) -> Mapping[str, Any]:
-    """What a run took, of its processor seconds the share of the answers that count."""
-    if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
-        return about
-    return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
-
-
-def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
-    """Task folders that runs were made on."""
-    names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
-    folders = [root / "tasks" / suite / region for suite, region in names]
-    return [folder for folder in folders if (folder / taskdir.TASK).is_file()]
-
-
 def _check_files(entries: Sequence[Entry], folders: Sequence[Path], split: Split | None) -> None:
     """Refuse files and submissions that are not what the tasks ask for."""
     for entry in entries:
@@ -415,7 +310,7 @@ def _check_file(entry: Entry, folders: Sequence[Path], split: Split | None) -> N
         raise ConfigError(message)
 
 
-def _scored(told: _Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> pd.DataFrame:
+def _scored(told: Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> pd.DataFrame:
     """All tasks that one contestant was asked, one row for each query."""
     place_of = {} if request.split is None else request.split.place_of
     frames = []
@@ -481,7 +376,14 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
             **({PROTECTION: board.protection} if len(board.protection) else {}),
         },
         texts={
-            "leaderboard.md": board_markdown(board.table, about, board.findings, board.falsifiers, board.verdicts),
+            "leaderboard.md": board_markdown(
+                board.table,
+                about,
+                board.findings,
+                board.falsifiers,
+                board.verdicts,
+                steps_frame(board.table, queries_of(board.scores), sorted(board.scores)),
+            ),
             "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },
         about=about,

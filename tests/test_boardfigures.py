@@ -17,16 +17,15 @@ from sasgeo_bench.report.plottables import (
     BEYOND_M,
     MOST_MATCHERS,
     ages_frame,
-    queries_of,
     reliability_frame,
     risk_frame,
     shown_matchers,
     stanford_areas,
     stanford_cells,
-    steps_frame,
 )
 from sasgeo_bench.report.protection import protection_frame, told_levels
 from sasgeo_bench.report.rejection import answers_of
+from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.sasgeo.protection import level_name

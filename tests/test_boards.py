@@ -616,6 +616,7 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
         "leaderboard.md",
         "leaderboard.parquet",
         "leaderboard.tex",
+        "pictures",
         "scores.parquet",
     ]
 

@@ -43,7 +43,7 @@ def draw_steps(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     path : Path
         A .svg or .png to write.
     rows : pandas.DataFrame
-        From `plottables.steps_frame`, of one suite, track and prior group.
+        From `steps.steps_frame`, of one suite, track and prior group.
     shown : sequence of str
         Matchers, in the order of their looks.
     """

@@ -13,17 +13,16 @@ from sasgeo_bench.metrics.decisions import PRESENT_SHARES, Answers, presence_wei
 from sasgeo_bench.metrics.integrity import aurc, risk_coverage
 from sasgeo_bench.metrics.intervals import effective_count, wilson
 from sasgeo_bench.report.contrasts import Contrast
-from sasgeo_bench.report.measures import MEASURES, primary_of
 from sasgeo_bench.report.protection import ToldLevels
 from sasgeo_bench.report.rejection import answers_of
 from sasgeo_bench.report.rows import ALL_SUITES, is_apart, is_unranked
-from sasgeo_bench.report.strata import ALL, CONTROL, STRESS, control_name, step_name
+from sasgeo_bench.report.steps import GROUP, primary_rows
+from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 
 MOST_MATCHERS: Final = 8  # more are not told apart at a glance
 ARMS: Final = ("uniform", "hand", "oracle")  # parts of names of what contrasts are seen beside
 AS_DRAWN: Final = "as drawn"
 AGE: Final = "age_years"  # as truths say that it was measured
-GROUP: Final = ("suite", "track", "prior_group")
 _MOST_POINTS: Final = 80  # of a curve: more cannot be seen, and make a file large
 _CELLS_PER_DECADE: Final = 8
 LEAST_M: Final = 0.1  # what is less is drawn here
@@ -69,61 +68,6 @@ def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[
 # --- success by what was done -----------------------------------------------------------------------------------------
 
 
-def queries_of(scores: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """What scored rows say of their queries, each query once."""
-    return pd.concat(list(scores.values()), ignore_index=True).drop_duplicates("query_id", ignore_index=True)
-
-
-def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
-    """The figure that matchers are ranked by, at each step of each kind that has several.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        The leaderboard.
-    queries : pandas.DataFrame
-        From `queries_of`.
-    shown : sequence of str
-        Matchers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Rows of the leaderboard with the columns kind, strength, strength_unit and view_cells; controls stand at
-        strength 0 of each kind. A size of view is a part of its own: not every size has every step.
-    """
-    places = pd.DataFrame(_ladders(queries))
-    if places.empty:
-        return pd.DataFrame(columns=[*table.columns, "kind", "strength", "strength_unit", "view_cells"])
-    rows = table[(table["rejector"] == "") & table["matcher"].isin(list(shown)) & table["value"].notna()]
-    return _primary(rows).merge(places, on=[*GROUP, "stratum"], how="inner")
-
-
-def _primary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the figure of each track that matchers are ranked by."""
-    wanted = {track: primary_of(track).name for track in MEASURES}
-    return rows[(rows["metric"] == rows["track"].map(wanted)).to_numpy(bool)]
-
-
-def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Names that the leaderboard gives to the steps of each kind, with what they stand for."""
-    some = queries[queries["is_present"].to_numpy(bool)]
-    for key, group in some.groupby(list(GROUP), sort=True):
-        sizes = sorted(set(group.loc[group["role"] == CONTROL, "view_cells"]))
-        stress = group[group["role"] == STRESS]
-        for kind, mine in stress.groupby("kind", sort=True):
-            if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
-                continue
-            said = {**dict(zip(GROUP, key, strict=True)), "kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
-            steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})
-            for strength, size in steps:
-                name = step_name(str(kind), strength, size)
-                yield {**said, "stratum": name, "strength": strength, "view_cells": size}
-            for size in sorted({size for _, size in steps} & {*sizes}):
-                name = control_name(size) if len(sizes) > 1 else CONTROL
-                yield {**said, "stratum": name, "strength": 0.0, "view_cells": size}
-
-
 def ages_frame(steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
     """Those steps that are ages of a map, with the ages that the maps really had.
 
@@ -153,7 +97,7 @@ def ages_frame(steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str
 def stress_frame(table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
     """The figure that matchers are ranked by on the stresses of each suite: rows of the leaderboard."""
     rows = table[(table["rejector"] == "") & table["matcher"].isin(list(shown)) & table["value"].notna()]
-    return _primary(rows[rows["stratum"] == STRESS])
+    return primary_rows(rows[rows["stratum"] == STRESS])
 
 
 # --- what is known of the answers -------------------------------------------------------------------------------------

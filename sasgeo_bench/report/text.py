@@ -16,6 +16,7 @@ from sasgeo_bench.report.falsifiers import Falsifier
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES, REPRODUCED, is_apart, is_unranked
+from sasgeo_bench.report.steps import GROUP
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 
 _INTEGRITY: Final = (
@@ -288,8 +289,9 @@ def board_markdown(
     findings: Sequence[Finding] = (),
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
+    steps: pd.DataFrame | None = None,
 ) -> str:
-    """The board as a document."""
+    """The board as a document; `steps` are those of `steps.steps_frame`."""
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
         "",
@@ -306,10 +308,41 @@ def board_markdown(
         lines += ["## Falsifiers", "", _FALSIFIERS_NOTE, "", *markdown_table(falsifier_table(falsifiers)), ""]
     for title, table in tables_of(board):
         lines += [f"## {title}", "", *markdown_table(table), ""]
+    for title, table in step_tables(steps) if steps is not None else ():
+        lines += [f"## {title}", "", *markdown_table(table), ""]
     if verdicts:
         lines += ["## Controls", "", _CONTROLS_NOTE, "", *markdown_table(control_table(verdicts)), ""]
     lines += ["## How to read", "", *(f"- **{term}**: {meaning}." for term, meaning in _TERMS.items()), ""]
     return "\n".join(lines)
+
+
+def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Success along each ladder of strengths, each with its title: a matcher a line, a step a column.
+
+    Parameters
+    ----------
+    steps : pandas.DataFrame
+        From `steps.steps_frame`.
+
+    Yields
+    ------
+    tuple of str, pandas.DataFrame
+        Figures with intervals; strength 0 is the control.
+    """
+    for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
+        suite, track, prior_group, kind, unit = map(str, key)
+        most = part.groupby(["view_cells", "strength"], sort=True)["n"].max().reset_index()
+        counts = list(zip(most["view_cells"], most["strength"], most["n"], strict=True))
+        rows = []
+        for matcher, mine in part.groupby("matcher", sort=True):
+            at = {(row["view_cells"], row["strength"]): row for _, row in mine.iterrows()}
+            cells = {
+                f"{strength:g}, {size} cells, n = {n}": _figure(at[size, strength]) if (size, strength) in at else "-"
+                for size, strength, n in counts
+            }
+            rows.append({"matcher": str(matcher), **cells, "_key": -mine["value"].mean()})
+        table = pd.DataFrame(rows).sort_values(["_key", "matcher"], kind="stable").drop(columns="_key")
+        yield f"{suite}, {track}, prior group {prior_group}, step by step: {kind} ({unit})", table
 
 
 _FALSIFIERS_NOTE: Final = (

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who was asked what, and what they answered: the entries of a board with their answers to its tasks."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.boardtasks import AskedTask, held_tasks
+from sasgeo_bench.entries import Entry
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.results import Prediction
+from sasgeo_bench.store import rundir, taskdir
+
+MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """One contestant and its answers to the tasks of a board.
+
+    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
+    file is asked all tasks, and brings those that it holds an answer to; a submission is asked those that it names.
+    `entry` has only the runs that count.
+    """
+
+    entry: Entry
+    predictions: dict[str, Prediction]
+    held: frozenset[Path]
+    asked: frozenset[Path]
+
+
+def read_told(
+    entries: Sequence[Entry],
+    folders: Sequence[Path],
+    *,
+    root: Path,
+    named: Sequence[Path],
+    tell: Callable[[str], None],
+) -> list[Told]:
+    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Who.
+    folders : sequence of Path
+        Of tasks; without any, those that runs were made on, and that files hold answers to.
+    root : Path
+        Where tasks/ is.
+    named : sequence of Path
+        Folders and files that the user named.
+    tell : callable
+        Gets a line for what is left out.
+
+    Raises
+    ------
+    StoreError
+        If a run that is named by itself answers none of the queries.
+    ConfigError
+        If nobody answers any task.
+    """
+    files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
+    is_chosen = bool(folders)
+    found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
+    tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
+    told: list[Told] = []
+    stale: list[Path] = []
+    for entry in entries:
+        if entry.runs:
+            item, others = _read_runs(entry, tasks)
+            stale += others
+        else:
+            rows = files[entry.name]
+            held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
+            item = Told(entry=entry, predictions=rows, held=held, asked=_asked_of(entry, tasks))
+        if item.asked:
+            told.append(item)
+    refused = next((source for source in stale if source in named), None)
+    if refused is not None or (stale and not told):
+        holder = "these tasks do" if is_chosen else "its task does"
+        message = (
+            f"{refused or stale[0]} holds answers to other queries than {holder} now: "
+            "run again (what is answered already is kept), or make the old queries again"
+        )
+        raise StoreError(message)
+    if not told:
+        message = (
+            f"there is nothing to score: no task in {root / 'tasks'} is answered "
+            "(--out names another root, --tasks the tasks themselves)"
+        )
+        raise ConfigError(message)
+    if stale:
+        listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
+        tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
+    return told
+
+
+def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
+    """Folders of the tasks that a file or a submission is asked."""
+    if entry.submission is None:
+        return frozenset(task.folder for task in tasks)
+    named = {(item.suite, item.region) for item in entry.submission.tasks}
+    return frozenset(task.folder for task in tasks if (task.about["suite"], task.about["region"]) in named)
+
+
+def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
+    return {item.query_id: item for source in entry.sources for item in rundir.read_predictions(source)}
+
+
+def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Path]]:
+    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
+    by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
+    rows: dict[str, Prediction] = {}
+    runs: list[tuple[Path, Mapping[str, Any]]] = []
+    asked: set[Path] = set()
+    stale: list[Path] = []
+    for source, about in zip(entry.sources, entry.runs, strict=True):
+        task = by_name.get((about["suite"], about["region"]))
+        is_same = task is not None and about["queries_sha256"] == task.about["files"][taskdir.QUERIES]["sha256"]
+        found = rundir.Answers({}, 0) if task is None else rundir.read_answers(source, task.asked, is_tied=is_same)
+        if task is None or not (found.found or is_same):
+            stale.append(source)
+            continue
+        rows |= found.found
+        asked.add(task.folder)
+        runs.append((source, _share_of(about, found)))
+    mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
+    return Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
+
+
+def _share_of(about: Mapping[str, Any], answers: rundir.Answers) -> Mapping[str, Any]:
+    """What a run took, of its processor seconds the share of the answers that count."""
+    if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
+        return about
+    return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
+
+
+def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
+    """Task folders that runs were made on."""
+    names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
+    folders = [root / "tasks" / suite / region for suite, region in names]
+    return [folder for folder in folders if (folder / taskdir.TASK).is_file()]

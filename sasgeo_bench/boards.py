@@ -27,7 +27,7 @@ from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_fals
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
-from sasgeo_bench.report.rejection import OWN, judge, own_word, remarks_of, rules_of, why_not
+from sasgeo_bench.report.rejection import OWN, Rule, judge, own_word, remarks_of, rules_of, why_not
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
 from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
@@ -172,19 +172,9 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     for entry in entries:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
-        is_taught = entry.is_taught
-        own = own_word(frame, request.split, is_taught=is_taught)
-        if len(own):
-            all_judged[entry.name, OWN] = own
-            rows.append(to_frame(list(integrity_rows(entry.name, OWN, own))))
-        for name, rule in rules.items():
-            judged = judge(frame, predictions[entry.name], rule.make, rule.split, is_taught=is_taught)
-            all_judged[entry.name, name] = judged
-            if not len(judged):
-                tell(f"{name} on {entry.name}: not applied, {why_not(frame, is_taught=is_taught)}")
-            if len(judged):
-                is_calibrated = rule.card.is_calibrated
-                rows.append(to_frame(list(integrity_rows(entry.name, name, judged, is_calibrated=is_calibrated))))
+        judged = _judged(entry, frame, predictions[entry.name], rules, request.split, tell)
+        rows += _integrity(entry.name, judged, rules)
+        all_judged |= {(entry.name, name): said for name, said in judged.items()}
         tell(f"{entry.name}: {_in_words(frame)}")
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
@@ -209,6 +199,32 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _judged(
+    entry: Entry,
+    frame: pd.DataFrame,
+    predictions: Mapping[str, Prediction],
+    rules: Mapping[str, Rule],
+    split: Split | None,
+    tell: Tell,
+) -> dict[str, pd.DataFrame]:
+    """What rejectors say of the answers of one contestant, its own word among them; no row where one is not applied."""
+    own = own_word(frame, split, is_taught=entry.is_taught)
+    found = {OWN: own} if len(own) else {}
+    for name, rule in rules.items():
+        found[name] = judge(frame, predictions, rule.make, rule.split, is_taught=entry.is_taught)
+        if not len(found[name]):
+            tell(f"{name} on {entry.name}: not applied, {why_not(frame, is_taught=entry.is_taught)}")
+    return found
+
+
+def _integrity(matcher: str, judged: Mapping[str, pd.DataFrame], rules: Mapping[str, Rule]) -> Iterator[pd.DataFrame]:
+    """Figures of a contestant with each rejector that was applied; its own word is taken for a probability."""
+    for name, frame in judged.items():
+        if len(frame):
+            is_calibrated = name == OWN or rules[name].card.is_calibrated
+            yield to_frame(list(integrity_rows(matcher, name, frame, is_calibrated=is_calibrated)))
 
 
 def _apart(
@@ -324,8 +340,9 @@ def _scored(told: Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> p
     return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 
-def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
-    about = {
+def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
+    """What `board.json` says."""
+    return {
         "scorer_version": SCORER_VERSION,
         "task_version": TASK_VERSION,
         "data_version": DATA_VERSION,
@@ -364,6 +381,10 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
             for item in board.tasks
         ],
     }
+
+
+def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
+    about = _about(request, board, cards)
     scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
     write_board(
         request.board,

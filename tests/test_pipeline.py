@@ -438,3 +438,10 @@ def test_matchers_of_a_task_are_asked_there_alone():
 def test_matchers_of_a_task_that_nobody_asks_are_refused(tasks, changes, fault):
     with pytest.raises(ValueError, match=fault):
         with_tasks(*tasks, **changes)
+
+
+def test_the_towns_rehearse_the_registered_experiment():
+    real, towns = (read_pipeline_file(find_pipeline_file(name)) for name in ("leaderboard", "towns"))
+    apart = {"id", "title", "regions"}
+    assert real.model_dump(exclude=apart) == towns.model_dump(exclude=apart)
+    assert all(name.startswith("town-") for name in towns.regions)

@@ -382,6 +382,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
         "pipeline": dict(request.pipeline) or None,
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
+        "contrasts": [asdict(item) for item in request.contrasts],
         "by_region": sorted(request.by_region),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "remarks": list(board.remarks),

@@ -68,7 +68,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir"),
-        *("boardfile", "packfile", "pluginfiles"),
+        *("boardfile", "packfile", "sitedir", "pluginfiles"),
         *(
             "preview",
             "sheet",
@@ -112,7 +112,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "report": (
         *("measures", "rows", "strata", "tables", "rejection", "integrity", "contrasts", "controls", "costs", "text"),
         *("latex", "protection"),
-        *("paper", "papertext", "plottables", "plots", "site"),
+        *("paper", "papertext", "plottables", "plots"),
+        *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "siteplots", "site"),
     ),
     "boardtasks": None,
     "entries": None,
@@ -121,9 +122,13 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "packing": None,
     "paperboard": None,
     "pipeline": None,
+    "publish": None,
     "scaffold": None,
     "testing": None,
-    "cli": ("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "boards", "program"),
+    "cli": (
+        *("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "boards", "publishing"),
+        "program",
+    ),
 }
 
 # The rooms that touch the disk, and the few calls others may make, each with its reason.

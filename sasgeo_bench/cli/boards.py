@@ -92,6 +92,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         board = make_board(request_laid, tell=tell)
     show_board(board)
     typer.echo(str(request.board))
+    tell(_how_to_publish(request.board))
     _check_controls(board)
 
 
@@ -137,6 +138,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         board = run_pipeline(plan, tell=tell, results=results)
     show_board(board)
     typer.echo(str(board_folder(plan)))
+    tell(_how_to_publish(board_folder(plan)))
     tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")
     _check_controls(board)
 
@@ -144,6 +146,10 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
 def _split(name: str, folders: list[Path]) -> Split:
     grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
     return make_split(read_split_file(find_split_file(name)), grids)
+
+
+def _how_to_publish(folder: Path) -> str:
+    return f"its site: publish --board {folder}"
 
 
 def _check_controls(board: Board) -> None:

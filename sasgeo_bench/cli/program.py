@@ -20,6 +20,7 @@ from sasgeo_bench.cli.matchers import (
     list_rejectors_command,
     new_matcher_command,
 )
+from sasgeo_bench.cli.publishing import publish_command
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
 from sasgeo_bench.cli.runs import merge_command, run_command, validate_command
@@ -61,6 +62,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "validate": validate_command,
     "score": score_command,
     "leaderboard": leaderboard_command,
+    "publish": publish_command,
 }
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)

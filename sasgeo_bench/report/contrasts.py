@@ -171,7 +171,7 @@ def _pair(
             there = ", ".join(sorted(known)) or "nothing of the kind"
             message = f"contrast {contrast.name!r} names {name!r}, which is not on the board: there is {there}"
             raise ConfigError(message)
-        frames.append(_chosen(contrast, known[name]))
+        frames.append(chosen_rows(contrast, known[name]))
     shared = sorted(set(frames[0]["query_id"]) & set(frames[1]["query_id"]))
     first, second = (frame.set_index("query_id", drop=False).loc[shared] for frame in frames)
     return first, second
@@ -247,8 +247,8 @@ def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, pla
     )
 
 
-def _chosen(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
-    """The queries of a contrast: stresses of its suites and kinds on its track."""
+def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
+    """The scored rows that a contrast counts: stresses of its suites and kinds on its track."""
     rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
     if contrast.metric == "primary":
         rows = rows[rows["is_present"].to_numpy(bool) & (rows["role"] == "stress").to_numpy(bool)]

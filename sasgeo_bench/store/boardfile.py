@@ -27,7 +27,7 @@ _KNOWN: Final = (
     *(f"{SCORES}.parquet", "contrasts.parquet", "controls.parquet", "contrasts.md", "controls.md", BOARD),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
-    *(FIGURES, "site"),
+    *(FIGURES, "pictures", "site", ".site.partial", ".site.replaced"),  # the latter two where publishing was killed
 )
 
 

@@ -4,7 +4,7 @@
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -351,6 +351,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
         "pipeline": dict(request.pipeline) or None,
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
+        "contrasts": [asdict(item) for item in request.contrasts],
         "by_region": sorted(request.by_region),
         "without": sorted(set(request.without)),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],

@@ -69,7 +69,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissionfile": None,
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
-        *("boardfile", "packfile", "pluginfiles"),
+        *("boardfile", "packfile", "sitedir", "pluginfiles"),
         *(
             "preview",
             "picture",
@@ -117,7 +117,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "report": (
         *("measures", "rows", "strata", "steps", "tables", "rejection", "integrity", "contrasts", "falsifiers"),
         *("controls", "costs", "text", "latex", "protection", "cases"),
-        *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots", "site"),
+        *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots"),
+        *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "siteplots", "site"),
     ),
     "boardtasks": None,
     "entries": None,
@@ -132,21 +133,13 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissions": None,
     "paperboard": None,
     "pipeline": None,
+    "publish": None,
     "release": None,
     "scaffold": None,
     "testing": None,
     "cli": (
-        "console",
-        "regions",
-        "ageing",
-        "queries",
-        "looking",
-        "weights",
-        "matchers",
-        "runs",
-        "submissions",
-        "boards",
-        "releasing",
+        *("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "submissions"),
+        *("boards", "publishing", "releasing"),
         "program",
     ),
 }

@@ -163,6 +163,8 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {"sasgeo_bench/py.typed", "sasgeo_bench/taxonomy.toml", "sasgeo_bench/cli/program.py"}
     expected.add("sasgeo_bench/ageing/ratebook.toml")
+    templates = (ROOT / "sasgeo_bench" / "report" / "templates").iterdir()
+    expected |= {f"sasgeo_bench/report/templates/{path.name}" for path in templates}
     for folder in SHIPPED:
         expected |= {f"sasgeo_bench/shipped/{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
     assert expected - names == set()

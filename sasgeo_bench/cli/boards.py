@@ -108,6 +108,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         board = make_board(replace(laid, extras=(figures, pictures)), tell=tell)
     show_board(board)
     typer.echo(str(request.board))
+    tell(_how_to_publish(request.board))
     _check_controls(board)
 
 
@@ -154,8 +155,13 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         board = run_pipeline(plan, tell=tell, results=results, has_cases=cases)
     show_board(board)
     typer.echo(str(board_folder(plan)))
+    tell(_how_to_publish(board_folder(plan)))
     tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")
     _check_controls(board)
+
+
+def _how_to_publish(folder: Path) -> str:
+    return f"its site: publish --board {folder}"
 
 
 def _check_controls(board: Board) -> None:

@@ -20,6 +20,7 @@ from sasgeo_bench.cli.matchers import (
     list_rejectors_command,
     new_matcher_command,
 )
+from sasgeo_bench.cli.publishing import publish_command
 from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
 from sasgeo_bench.cli.regions import build_region_command, list_regions_command
 from sasgeo_bench.cli.releasing import release_command
@@ -64,6 +65,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "submit": submit_command,
     "score": score_command,
     "leaderboard": leaderboard_command,
+    "publish": publish_command,
     "release": release_command,
 }
 

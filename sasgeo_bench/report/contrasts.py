@@ -270,7 +270,7 @@ def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, pla
 
 
 def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
-    """The queries of a contrast: stresses of its suites and kinds on its track."""
+    """The scored rows that a contrast counts: stresses of its suites and kinds on its track."""
     return _rows_of(contrast, frame, _stressed if contrast.metric == "primary" else _unfalsified)
 
 

@@ -75,7 +75,7 @@ def _for_nothing(part: pd.DataFrame, primary: str) -> str:
         "the prior alone": _main(part[part["matcher"] == _PRIOR_ALONE], primary),
         "chance": _main(part, CHANCE.name),
     }
-    words = [f"{name}: {_number(row['value'])}" for name, row in told.items() if row is not None]
+    words = [f"{name}: {number_text(row['value'])}" for name, row in told.items() if row is not None]
     return f" ({', '.join(words)})" if words else ""
 
 
@@ -98,12 +98,12 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
             {
                 "matcher": matcher,
                 "how": main.get("how", REPRODUCED),
-                primary: _figure(main) if main["is_applicable"] else "not applicable",
-                "rank": _rank(main),
-                WITHIN.name: "-" if near is None else _figure(near),
-                "control": "-" if control is None else _figure(control),
-                "false fixes": "-" if absent is None else _figure(absent),
-                "detectable": _number(main["detectable"]),
+                primary: figure_text(main) if main["is_applicable"] else "not applicable",
+                "rank": rank_text(main),
+                WITHIN.name: "-" if near is None else figure_text(near),
+                "control": "-" if control is None else figure_text(control),
+                "false fixes": "-" if absent is None else figure_text(absent),
+                "detectable": number_text(main["detectable"]),
                 "n": str(main["n"]),
                 "missing": str(main["missing"]),
                 "blocks": f"{main['blocks']} in {counted(main['places'], 'place')}",
@@ -130,7 +130,7 @@ def _judged_table(part: pd.DataFrame) -> pd.DataFrame:
     for (matcher, rejector), mine in part.groupby(["matcher", "rejector"], sort=True):
         by_name = {str(row["metric"]): row for _, row in mine.iterrows()}
         row = {"matcher": matcher, "rejector": rejector}
-        row |= {name: _figure(by_name[name]) if name in by_name else "-" for name in _INTEGRITY}
+        row |= {name: figure_text(by_name[name]) if name in by_name else "-" for name in _INTEGRITY}
         rows.append(row | {"n": str(mine["n"].iloc[0]), "_key": by_name["aurc"]["value"]})
     table = pd.DataFrame(rows).sort_values(["_key", "matcher", "rejector"], kind="stable")
     return table.drop(columns="_key")
@@ -143,22 +143,29 @@ def _cost_table(part: pd.DataFrame) -> pd.DataFrame:
         for _, one in mine.iterrows():
             if one["metric"] in _COSTS:
                 name = one["metric"] if one["track"] == "all" else f"{one['metric']}, {one['track']}"
-                row[f"{name} ({one['unit']})"] = _number(one["value"])
+                row[f"{name} ({one['unit']})"] = number_text(one["value"])
         rows.append(row)
     return pd.DataFrame(rows).fillna("-")
 
 
-def _figure(row: pd.Series) -> str:
+def figure_text(row: pd.Series | Mapping[str, Any]) -> str:
     """A figure with its interval, as in "0.63 [0.55, 0.70]"; a dagger where that is Wilson's."""
     mark = DAGGER if row["interval"] == "wilson" else ""
-    return _with_interval(row["value"], row["lo"], row["hi"]) + mark
+    return interval_text(row["value"], row["lo"], row["hi"]) + mark
 
 
-def _with_interval(value: float, lo: float, hi: float) -> str:
-    return _number(value) if math.isnan(lo) else f"{_number(value)} [{_number(lo)}, {_number(hi)}]"
+def interval_text(value: float, lo: float, hi: float) -> str:
+    """A figure with the ends of its interval, alone where it has none.
+
+    Examples
+    --------
+    >>> interval_text(0.63, 0.55, 0.7), interval_text(0.63, math.nan, math.nan)
+    ('0.630 [0.550, 0.700]', '0.630')
+    """
+    return number_text(value) if math.isnan(lo) else f"{number_text(value)} [{number_text(lo)}, {number_text(hi)}]"
 
 
-def _number(value: float) -> str:
+def number_text(value: float) -> str:
     """Three digits that say something; "-" where there is no number."""
     if math.isnan(value):
         return "-"
@@ -167,7 +174,7 @@ def _number(value: float) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"  # noqa: PLR2004 - a digit less from ten on
 
 
-def _rank(row: pd.Series) -> str:
+def rank_text(row: pd.Series | Mapping[str, Any]) -> str:
     """A rank or ranks that cannot be told apart; controls have none, nor has what is set apart."""
     if pd.isna(row["rank_best"]):
         is_beside = pd.notna(row.get("set_apart"))
@@ -337,7 +344,9 @@ def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         for matcher, mine in part.groupby("matcher", sort=True):
             at = {(row["view_cells"], row["strength"]): row for _, row in mine.iterrows()}
             cells = {
-                f"{strength:g}, {size} cells, n = {n}": _figure(at[size, strength]) if (size, strength) in at else "-"
+                f"{strength:g}, {size} cells, n = {n}": figure_text(at[size, strength])
+                if (size, strength) in at
+                else "-"
                 for size, strength, n in counts
             }
             rows.append({"matcher": str(matcher), **cells, "_key": -mine["value"].mean()})
@@ -361,7 +370,7 @@ def control_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     """Verdicts in words."""
     table = verdict_frame(verdicts)
     words = {name: table[name].map(lambda value: f"{value:.3g}") for name in ("found", "expected")}
-    p, holds = table["p"].map(_number), table["holds"].map({True: "held", False: "FAILED"})
+    p, holds = table["p"].map(number_text), table["holds"].map({True: "held", False: "FAILED"})
     return table.assign(**words, p=p, holds=holds).rename(columns={"holds": "verdict"})
 
 
@@ -370,12 +379,12 @@ def finding_table(findings: Sequence[Finding]) -> pd.DataFrame:
     rows = [
         {
             "contrast": item.name,
-            "first": f"{item.first}: {_number(item.first_value)}",
-            "second": f"{item.second}: {_number(item.second_value)}",
-            "difference": _with_interval(item.difference, item.lo, item.hi),
-            "p (Holm)": _number(item.p_holm),
+            "first": f"{item.first}: {number_text(item.first_value)}",
+            "second": f"{item.second}: {number_text(item.second_value)}",
+            "difference": interval_text(item.difference, item.lo, item.hi),
+            "p (Holm)": number_text(item.p_holm),
             "discordant": f"{item.first_only} and {item.second_only}",
-            "detectable": _number(item.detectable),
+            "detectable": number_text(item.detectable),
             "n": f"{item.n} in {counted(item.blocks, 'block')}",
             "verdict": item.verdict,
         }
@@ -391,9 +400,9 @@ def falsifier_table(found: Sequence[Falsifier]) -> pd.DataFrame:
             "contrast": item.contrast,
             "suite": item.suite,
             "kind": item.kind,
-            "first": f"{item.finding.first}: {_number(item.finding.first_value)}",
-            "second": f"{item.finding.second}: {_number(item.finding.second_value)}",
-            "difference": _with_interval(item.finding.difference, item.finding.lo, item.finding.hi),
+            "first": f"{item.finding.first}: {number_text(item.finding.first_value)}",
+            "second": f"{item.finding.second}: {number_text(item.finding.second_value)}",
+            "difference": interval_text(item.finding.difference, item.finding.lo, item.finding.hi),
             "discordant": f"{item.finding.first_only} and {item.finding.second_only}",
             "n": f"{item.finding.n} in {counted(item.finding.blocks, 'block')}",
             "verdict": item.verdict,
@@ -454,7 +463,7 @@ def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple
 def _heading(suite: str, rows: pd.DataFrame, shown: pd.Series) -> str:
     """A suite with its queries, and what guessing among candidates is worth."""
     chance = _main(rows, CHANCE.name)
-    return f"{suite}, n = {shown['n']}" + ("" if chance is None else f", chance {_number(chance['value'])}")
+    return f"{suite}, n = {shown['n']}" + ("" if chance is None else f", chance {number_text(chance['value'])}")
 
 
 def _cell(row: pd.Series) -> str:
@@ -462,4 +471,4 @@ def _cell(row: pd.Series) -> str:
     if not row["is_applicable"]:
         return "n/a"
     ends = "" if math.isnan(row["lo"]) else f" [{row['lo']:.2f}, {row['hi']:.2f}]"
-    return f"{_number(row['value'])}{ends} ({_rank(row)})"
+    return f"{number_text(row['value'])}{ends} ({rank_text(row)})"

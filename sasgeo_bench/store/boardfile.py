@@ -30,7 +30,7 @@ _KNOWN: Final = (
     *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
-    *(FIGURES, PICTURES, "site"),
+    *(FIGURES, PICTURES, "site", ".site.partial", ".site.replaced"),  # the latter two where publishing was killed
 )
 
 

@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sorting, filtering and turning pages of cases. Every page can be read without it.
+"use strict";
+
+document.documentElement.classList.add("js");
+
+function keyOf(row, at, isNumber) {
+  const cell = row.cells[at];
+  if (cell.dataset.key !== undefined) return Number(cell.dataset.key);
+  return isNumber ? NaN : cell.textContent.trim();
+}
+
+// What has no number stays last, whichever way is sorted; what is alike keeps its order.
+function compare(a, b, sign) {
+  if (typeof a === "string" || typeof b === "string") return sign * String(a).localeCompare(String(b), "en", { numeric: true });
+  if (Number.isNaN(a) || Number.isNaN(b)) return Number(Number.isNaN(a)) - Number(Number.isNaN(b));
+  return sign * (a - b);
+}
+
+function sortBy(head) {
+  const table = head.closest("table");
+  const at = head.cellIndex;
+  const isNumber = head.classList.contains("num");
+  const before = head.getAttribute("aria-sort");
+  const order = before === "none" ? (isNumber ? "descending" : "ascending") : before === "ascending" ? "descending" : "ascending";
+  const sign = order === "ascending" ? 1 : -1;
+  const rows = Array.from(table.tBodies[0].rows, (row) => ({ row, key: keyOf(row, at, isNumber) }));
+  rows.sort((a, b) => compare(a.key, b.key, sign));
+  table.tBodies[0].append(...rows.map((item) => item.row));
+  for (const other of table.tHead.rows[0].cells) other.setAttribute("aria-sort", other === head ? order : "none");
+}
+
+for (const button of document.querySelectorAll("thead button")) {
+  button.addEventListener("click", () => sortBy(button.closest("th")));
+}
+
+// Escape puts a tip away until the pointer or the focus moves on.
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape") document.body.classList.add("calm");
+});
+for (const kind of ["pointerover", "focusin"]) {
+  document.addEventListener(kind, () => document.body.classList.remove("calm"));
+}
+
+const form = document.querySelector("form.filter");
+if (form) {
+  const groups = Array.from(document.querySelectorAll("section.group"));
+  const filter = () => {
+    const wanted = Array.from(form.querySelectorAll("select"), (one) => [one.name, one.value]);
+    for (const group of groups) group.hidden = !wanted.every(([name, value]) => !value || group.dataset[name] === value);
+    const shown = groups.filter((group) => !group.hidden).length;
+    form.querySelector("output").textContent = `${shown} of ${groups.length} tables shown`;
+  };
+  form.hidden = false;
+  form.addEventListener("submit", (event) => event.preventDefault());
+  form.addEventListener("change", filter);
+  filter(); // a browser may keep what was chosen before
+  // A link to a table that is filtered away shows it all the same.
+  const reveal = () => {
+    const found = location.hash && document.getElementById(location.hash.slice(1));
+    const group = found && found.closest("section.group[hidden]");
+    if (group) {
+      form.reset();
+      filter();
+      found.scrollIntoView();
+    }
+  };
+  addEventListener("hashchange", reveal);
+}
+
+const cases = Array.from(document.querySelectorAll("article.case"));
+if (cases.length) {
+  const current = () => Math.max(0, cases.findIndex((one) => `#${one.id}` === location.hash));
+  const show = (isAsked) => {
+    const at = current();
+    cases.forEach((one, number) => { one.hidden = number !== at; });
+    for (const section of document.querySelectorAll("main > section")) section.hidden = !section.querySelector("article:not([hidden])");
+    if (isAsked) cases[at].focus();
+  };
+  addEventListener("hashchange", () => show(true));
+  document.addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    const isTaken = event.altKey || event.ctrlKey || event.metaKey || event.shiftKey || event.target.closest("input, select, textarea");
+    const next = step && !isTaken ? cases[current() + step] : undefined;
+    if (next) {
+      event.preventDefault();
+      location.hash = next.id;
+    }
+  });
+  show(false);
+}

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board's folder read for its site, and the folder of the site; written whole or not at all."""
+
+import gzip
+import html
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, PROTECTION, SCORES, read_board
+from sasgeo_bench.store.packfile import is_pack, read_settings
+from sasgeo_bench.store.regiondir import fresh_folder, locked
+
+SITE: Final = "site"
+MANIFEST: Final = "site.json"  # without it a folder is no site, and is not replaced
+PICTURES: Final = "pictures"
+FILES: Final = "files"
+MOST_BYTES: Final = 5_000_000  # of a site, pictures of regions and cases apart; more is said
+_TABLES: Final = ("contrasts", "controls", SCORES, PROTECTION)
+_OFFERED: Final = {  # what is offered for download, and what it is
+    f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
+    f"{LEADERBOARD}.csv": "the same for a spreadsheet",
+    f"{LEADERBOARD}.tex": "tables for a paper",
+    f"{LEADERBOARD}.md": "tables as text",
+    "contrasts.parquet": "registered contrasts",
+    "controls.parquet": "controls of every matcher",
+    f"{PROTECTION}.parquet": "protection levels, counted",
+    "paper.md": "the paper's experiment beside its Table II",
+    "paper.parquet": "the same as a table",
+    f"{SCORES}.parquet": "a row for each query of each matcher",
+    BOARD: "versions, hashes and cards",
+}
+_LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
+_LEFT_OUT_BYTES: Final = 1_500_000  # what is more, packed, stays with the board
+_IMAGES: Final = (".webp", ".png", ".jpg", ".jpeg")
+_TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
+_SIZE: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
+_HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drawn:
+    """An SVG: its text, and what it says of its title and size in points."""
+
+    text: str
+    title: str
+    width: float
+    height: float
+
+    @classmethod
+    def of(cls, text: str, name: str) -> "Drawn":
+        """Of the text of a figure; one without a title has its name.
+
+        Examples
+        --------
+        >>> drawn = Drawn.of('<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>', "mine")
+        >>> drawn.title, drawn.width, drawn.height
+        ('A & B', 90.0, 45.0)
+        """
+        title, *sizes = (pattern.search(text) for pattern in (_TITLE, _SIZE, _HEIGHT))
+        width, height = (float(found[1]) if found else 480.0 for found in sizes)
+        shown = html.unescape(title[1]).strip() if title else name
+        return cls(text=text, title=" ".join(shown.split()), width=width, height=height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardFiles:
+    """What a board's folder holds for a site.
+
+    `tables` are contrasts, controls, scores and protection, empty where there is none; `figures` by file name;
+    `downloads` the bytes to be offered, by file name, with what each is; `pictures` what `pictures.json` says;
+    `settings` how stored results were scored, empty of a board that is not stored.
+    """
+
+    folder: Path
+    about: Mapping[str, Any]
+    board: pd.DataFrame
+    tables: Mapping[str, pd.DataFrame]
+    figures: Mapping[str, Drawn]
+    downloads: Mapping[str, tuple[bytes, str]]
+    pictures: Mapping[str, Sequence[Mapping[str, Any]]]
+    settings: Mapping[str, Any]
+
+
+def read_board_files(folder: Path) -> BoardFiles:
+    """Read a board, or stored results, for its site.
+
+    Raises
+    ------
+    StoreError
+        If there is no board, or a file of it is damaged.
+    """
+    about, board = read_board(folder)
+    with _sound(folder):
+        missing = {"matcher", "rejector", "suite", "track", "prior_group", "stratum", "metric"} - set(board.columns)
+        if missing:
+            message = f"{folder} holds a board without the column {min(missing)!r}: score again"
+            raise StoreError(message)
+        _check_about(folder, about)
+        return BoardFiles(
+            folder=folder,
+            about=about,
+            board=board,
+            tables={name: _read_table(folder / f"{name}.parquet") for name in _TABLES},
+            figures=_read_figures(folder / FIGURES),
+            downloads=dict(_read_downloads(folder)),
+            pictures=_read_pictures(folder / PICTURES),
+            settings=read_settings(folder) if is_pack(folder) else {},
+        )
+
+
+def _check_about(folder: Path, about: Mapping[str, Any]) -> None:
+    """Refuse a `board.json` whose lists are none: pages go through them."""
+    for name, needed in (("entries", "name"), ("tasks", "region")):
+        listed = about.get(name, [])
+        if not isinstance(listed, list) or not all(isinstance(item, dict) and needed in item for item in listed):
+            message = f"{folder / BOARD} is damaged ({name!r} is no list of entries with {needed!r}): score again"
+            raise StoreError(message)
+
+
+@contextmanager
+def _sound(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except SasgeoError:
+        raise
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, pa.ArrowException) as error:
+        text = " ".join(str(error).split())[:160]
+        message = f"{folder} holds a damaged board ({text}): score again, or fetch the results again"
+        raise StoreError(message) from error
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    return pq.read_table(path).to_pandas() if path.is_file() else pd.DataFrame()
+
+
+def _plain_or_packed(path: Path) -> bytes | None:
+    """Bytes of a file, or of its .gz unpacked; None where there is neither."""
+    packed = path.with_name(f"{path.name}.gz")
+    if path.is_file():
+        return path.read_bytes()
+    return gzip.decompress(packed.read_bytes()) if packed.is_file() else None
+
+
+def _read_figures(folder: Path) -> dict[str, Drawn]:
+    names = sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")})
+    found = {name: _plain_or_packed(folder / name) for name in names if name.endswith(".svg")}
+    return {name: Drawn.of(data.decode(), name.removesuffix(".svg")) for name, data in found.items() if data}
+
+
+def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
+    for name, what in _OFFERED.items():
+        data = _plain_or_packed(folder / name)
+        if data is None:
+            continue
+        is_packed = len(data) > _LARGE_BYTES and not name.endswith(".parquet")
+        data = gzip.compress(data, mtime=0) if is_packed else data
+        if len(data) <= _LEFT_OUT_BYTES:
+            yield f"{name}.gz" if is_packed else name, (data, what)
+
+
+def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """What `pictures.json` says of regions, suites and cases, every file of it held against the folder."""
+    said = folder / f"{PICTURES}.json"
+    if not said.is_file():
+        return {}
+    try:
+        content = json.loads(said.read_text(encoding="utf-8"))
+        found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
+        for item in (one for listed in found.values() for one in listed):
+            _check_picture(folder, str(item["file"]))
+    except SasgeoError:
+        raise
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        text = " ".join(repr(error).split())[:120]
+        message = f"{said} is damaged ({text}): make the pictures again, or move the folder away"
+        raise StoreError(message) from error
+    return found
+
+
+def _check_picture(folder: Path, name: str) -> None:
+    """Refuse a picture that is none, is missing, or lies elsewhere."""
+    path = folder / name
+    is_inside = path.resolve().is_relative_to(folder.resolve()) and not Path(name).is_absolute()
+    if not is_inside or path.suffix.lower() not in _IMAGES or not path.is_file():
+        message = (
+            f"{folder / PICTURES}.json names {name!r}, which is no picture in {folder}: "
+            "make the pictures again, or move the folder away"
+        )
+        raise StoreError(message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Written:
+    """What was written: the folder, its bytes without pictures and those of pictures, and how many pages."""
+
+    folder: Path
+    site_bytes: int
+    picture_bytes: int
+    pages: int
+
+    def to_text(self) -> str:
+        """In a line.
+
+        Examples
+        --------
+        >>> Written(folder=Path("site"), site_bytes=1_200_000, picture_bytes=0, pages=12).to_text()
+        'site: 12 pages, 1.20 MB and 0.00 MB of pictures'
+        """
+        sizes = f"{self.site_bytes / 1e6:.2f} MB and {self.picture_bytes / 1e6:.2f} MB of pictures"
+        return f"{self.folder}: {self.pages} pages, {sizes}"
+
+
+@contextmanager
+def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
+    """Hold a board, and the site that is made of it: nobody else writes either of them meanwhile.
+
+    Raises
+    ------
+    StoreError
+        If there is no board, or the target holds something that is no site.
+    """
+    if not (folder / BOARD).is_file():
+        message = f"{folder} holds no board ({BOARD}): name the folder of one, as out/boards/demo"
+        raise StoreError(message)
+    check_target(target)
+    if target.parent.resolve() == folder.resolve():
+        with locked(folder, tell=tell):  # a lock beside the site would be a strange file in the board's folder
+            yield
+        return
+    with locked(folder, tell=tell), locked(target, tell=tell):
+        yield
+
+
+def check_target(target: Path) -> None:
+    """Refuse a folder that a site cannot take the place of.
+
+    Raises
+    ------
+    StoreError
+        If it is a file, or holds something and is no site.
+    """
+    if target.exists() and not target.is_dir():
+        message = f"{target} is a file: move it away, or name another folder"
+        raise StoreError(message)
+    if target.is_dir() and any(target.iterdir()) and not (target / MANIFEST).is_file():
+        message = f"{target} holds something else than a site, which would be lost: name another folder"
+        raise StoreError(message)
+
+
+def write_site(
+    target: Path,
+    board: BoardFiles,
+    *,
+    pages: Mapping[str, str],
+    drawn: Mapping[str, str],
+    about: Mapping[str, Any],
+) -> Written:
+    """Write a site, whole or not at all.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of the site; an older one there is replaced.
+    board : BoardFiles
+        Whose figures, downloads and pictures go with it.
+    pages : mapping of str to str
+        File name -> text: pages, style and script.
+    drawn : mapping of str to str
+        More figures, by file name.
+    about : mapping
+        What `site.json` says.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be written; an older site is then as it was.
+    """
+    check_target(target)
+    named = {str(item["file"]) for listed in board.pictures.values() for item in listed}
+    figures = {name: item.text for name, item in board.figures.items()} | dict(drawn)
+    files: dict[str, bytes] = {name: text.encode() for name, text in pages.items()}
+    files |= {f"{FIGURES}/{name}": text.encode() for name, text in figures.items()}
+    files |= {f"{FILES}/{name}": data for name, (data, _) in board.downloads.items()}
+    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
+    files[MANIFEST] = (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
+    pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
+    try:
+        with fresh_folder(target) as scratch:
+            for name, data in files.items():
+                _put(scratch / name, data)
+            for name, path in pictures.items():
+                _put(scratch / name, path.read_bytes())
+        picture_bytes = sum((target / name).stat().st_size for name in pictures)
+    except OSError as error:
+        message = (
+            f"{target} cannot be written ({error.strerror or error}): check the free space and your rights, and "
+            "publish again; a site that was there is as it was"
+        )
+        raise StoreError(message) from error
+    return Written(
+        folder=target,
+        site_bytes=sum(map(len, files.values())),
+        picture_bytes=picture_bytes,
+        pages=sum(name.endswith(".html") for name in pages),
+    )
+
+
+def _put(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+def draw_text(draw: Callable[[Path], None], folder: Path) -> str:
+    """Text of an SVG that a function draws into a path; the folder is scratch."""
+    path = folder / "drawn.svg"
+    draw(path)
+    return path.read_text(encoding="utf-8")

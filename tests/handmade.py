@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards made by hand, for their sites: ranks, ties, controls, hostile names, pictures of failures."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.report.contrasts import Contrast, contrast_frame, hold_contrasts
+from sasgeo_bench.report.controls import Verdict, verdict_frame
+from sasgeo_bench.report.rows import Row, to_frame, with_contestants
+from sasgeo_bench.report.tables import leaderboard
+from sasgeo_bench.score import SCORER_VERSION
+from sasgeo_bench.store.boardfile import Extra, write_board
+from sasgeo_bench.store.boardplot import Page, page
+from tests.report.test_tables import scores
+
+HOSTILE = "<script>alert(1)</script>"
+MARKUP = "<img src=x onerror=alert(2)> & <b>bold</b> \"quoted\" 'too'"
+SHARES = {"graph": 0.9, "raster": 0.88, "weak": 0.2, "far": 0.05, "random": 0.02}  # of right answers
+COUNT = 160
+CONTRASTS = (
+    Contrast(name="real", first="graph", second="weak", suites=("real-age",)),
+    Contrast(name="close", first="graph", second="raster", suites=("real-age",)),
+)
+
+
+def asked(share, *, suite="real-age", track="localization", prior="r500-weak-s3", count=COUNT):
+    """Rows of one matcher that is right on a share of the queries, the easiest; half of them are controls."""
+    at = np.arange(count)
+    is_right = ((at * 37) % count) < share * count
+    is_stress = at % 2 > 0
+    return scores(
+        np.where(is_right, 2.0, 80.0),
+        blocks=40,
+        suite=suite,
+        track=track,
+        prior_group=prior,
+        kind=np.where(is_stress, "S1", "control"),
+        role=np.where(is_stress, "stress", "control"),
+        strength=np.where(is_stress, np.where(at % 4 == 1, 5.0, 10.0), 0.0),
+        query_id=[f"{suite}-{track}-{prior}-{one:05d}" for one in at],
+        place=[f"place{one % 4}" for one in at],
+        block=[f"place{one % 4}/{one % 40}" for one in at],
+        pool=10 if track == "retrieval" else 0,
+        above=np.where(is_right, 0, 1),
+        tied=1,
+        right=1,
+    )
+
+
+def asked_everything(share):
+    """Two suites, both tracks and two prior groups."""
+    return pd.concat(
+        [
+            asked(share),
+            asked(share, prior="rnone-unknown-s15", count=80),
+            asked(share, suite="occlusion"),
+            asked(share, suite="occlusion", track="retrieval", prior="rnone-weak-s3"),
+        ],
+        ignore_index=True,
+    )
+
+
+def card_of(name, **changes):
+    said = {"name": name, "version": "1", "title": f"Title of {name}", "source": "original", "ours": "all of it"}
+    said |= {"licence": "MIT", "tracks": ["localization", "retrieval"], "needs": [], "limits": "", "trained_on": []}
+    return said | changes
+
+
+def entry_of(name, **changes):
+    said = {"name": name, "version": "1", "hash": "0123abcd", "how": "reproduced", "card": card_of(name), "learned": []}
+    return said | {"isolation": {"network": "none"}} | changes
+
+
+def about_of(entries, **changes):
+    regions = ("vaduz@2015-07-27", "vaduz+alias", "monaco", "oakland", "town-grid")
+    tasks = [
+        {"suite": "real-age", "region": name, "map_date": "2015-07-27", "queries_sha256": "ab"} for name in regions
+    ]
+    said = {"scorer_version": SCORER_VERSION, "task_version": 1, "data_version": 1, "made_by": "sasgeo-bench 0.1.0"}
+    said |= {"libraries": {"numpy": "2"}, "pipeline": None, "split": "crossfit", "draws": 200, "by_region": []}
+    said |= {"rejectors": [], "remarks": [], "entries": entries, "tasks": tasks}
+    return said | changes
+
+
+def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):
+    """Write a board of these parts."""
+    table = to_frame([]) if table is None else table
+    named = {entry["name"]: (entry["version"], entry["hash"]) for entry in entries}
+    write_board(
+        folder,
+        tables={
+            "leaderboard": with_contestants(table, dict.fromkeys(table["matcher"], ("1", "")) | named),
+            "scores": pd.DataFrame() if scored is None else scored,
+            "contrasts": contrast_frame(findings),
+            "controls": verdict_frame(verdicts),
+        },
+        texts={"leaderboard.md": "# Board\n", "leaderboard.tex": "% board\n"},
+        about=about_of(list(entries), **about),
+        extras=extras,
+    )
+    return folder
+
+
+def verdict(*, holds=True):
+    return Verdict(control="blind views withheld", matcher="graph", n=4, found=0, expected=0, p=np.nan, holds=holds)
+
+
+def draw(path):
+    """A figure of the board's."""
+    about = Page(title="Success against the age of the map: real-age", note="n 80 each", below="years")
+    with page(path, about) as charts:
+        charts[0][0].plot([0, 1], [1, 0])
+
+
+def full_board(folder, *, shares=SHARES, holds=True, changes=None):
+    """A board with all there can be but pictures; `changes` are of entries, by name."""
+    scored = {name: asked_everything(share) for name, share in shares.items()}
+    facts = {"track": "localization", "n": 160, "answered": 160, "missing": 0, "blocks": 40, "places": 4}
+    facts |= {"suite": "all suites", "prior_group": "r500-weak-s3", "better": "lower"}
+    judged = [
+        Row(
+            matcher=name,
+            rejector="own",
+            stratum="as drawn",
+            metric=metric,
+            unit="1",
+            value=0.2,
+            lo=0.1,
+            hi=0.3,
+            **facts,
+        )
+        for name in list(shares)[:2]
+        for metric in ("aurc", "coverage_at_risk_0.05", "brier")
+    ]
+    costs = [
+        Row(matcher=name, rejector="", stratum="all", metric=metric, unit=unit, value=1.5, **facts | {"track": track})
+        for name in shares
+        for metric, unit, track in (("latency_p50", "s", "localization"), ("peak_memory", "MB", "all"))
+    ]
+    known = [item for item in CONTRASTS if {item.first, item.second} <= shares.keys()]
+    return put_board(
+        folder,
+        table=pd.concat([leaderboard(scored, draws=200), to_frame([*judged, *costs])], ignore_index=True),
+        entries=[entry_of(name, **(changes or {}).get(name, {})) for name in shares],
+        findings=hold_contrasts(known, scored, {}, draws=200),
+        verdicts=[verdict(holds=holds)],
+        scored=pd.concat([frame.assign(matcher=name) for name, frame in scored.items()], ignore_index=True),
+        extras=[Extra(figures={"age-real-age-localization-r500-weak-s3.svg": draw})],
+        contrasts=[
+            {name: getattr(item, name) for name in ("name", "first", "second", "suites", "kinds", "metric", "track")}
+            for item in known
+        ],
+    )
+
+
+def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **changes):
+    """Previews, examples and failures beside a board."""
+    home = Path(folder) / "pictures"
+    (home / "cases").mkdir(parents=True)
+    image = np.full((60, 80, 3), 200, np.uint8)
+    names = ["vaduz.png", "example.png", *(f"cases/{at}.png" for at in range(len(failures)))]
+    for name in names:
+        cv2.imwrite(str(home / name), image)
+    said = {
+        "regions": [{"region": "vaduz", "file": "vaduz.png", "alt": "Vaduz from above"}],
+        "suites": [{"suite": "real-age", "file": "example.png", "alt": f"Example {MARKUP}"}],
+        "cases": [
+            {"query_id": f"q{at}", "matcher": "graph", "failure": failure, "file": f"cases/{at}.png"}
+            | {"suite": "real-age", "region": "vaduz", "kind": "S1", "alt": f"Case {at}"}
+            | {"said": {"error (m)": 412.5, "note": MARKUP}}
+            for at, failure in enumerate(failures)
+        ],
+    }
+    (home / "pictures.json").write_text(json.dumps(said | changes), encoding="utf-8")
+
+
+def many_rows(count):
+    """Rows of so many matchers, two of them with hostile names."""
+    names = [HOSTILE, MARKUP, *(f"matcher-{at:03d}" for at in range(count - 2))][:count]
+    return to_frame(
+        [
+            Row(
+                matcher=name,
+                rejector="",
+                suite="real-age",
+                track="localization",
+                prior_group="r500-weak-s3",
+                stratum="stress",
+                n=80,
+                answered=80,
+                missing=0,
+                blocks=20,
+                places=4,
+                metric="success_25m",
+                unit="1",
+                better="higher",
+                value=value,
+                lo=max(0.0, value - 0.1),
+                hi=min(1.0, value + 0.1),
+                interval="blocks",
+                rank_best=max(1, at - 2),
+                rank_worst=min(count, at + 4),
+                detectable=0.1,
+            )
+            for at, name in enumerate(names)
+            for value in (round(1 - at / count, 4),)
+        ]
+    )

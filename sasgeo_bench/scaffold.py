@@ -19,7 +19,7 @@ _TAKEN: Final = frozenset(
         *("affine", "cv2", "filelock", "geopandas", "matplotlib", "numpy", "osmium", "pandas", "pooch", "psutil"),
         *("pyarrow", "pydantic", "pyproj", "rasterio", "rich", "scipy", "shapely", "tqdm", "typer", "click"),
         *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
-        *("hatchling", "hypothesis", "pip", "pytest", "setuptools"),
+        *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),
     }
 )

@@ -10,7 +10,7 @@ import pandas as pd
 
 from sasgeo_bench.report.contrasts import Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, verdict_frame
-from sasgeo_bench.report.rows import Row, to_frame, with_contestants
+from sasgeo_bench.report.rows import REPRODUCED, Contestant, Row, to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.store.boardfile import Extra, write_board
@@ -89,11 +89,12 @@ def about_of(entries, **changes):
 def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):
     """Write a board of these parts."""
     table = to_frame([]) if table is None else table
-    named = {entry["name"]: (entry["version"], entry["hash"]) for entry in entries}
+    named = {entry["name"]: Contestant(entry["version"], entry["hash"], REPRODUCED) for entry in entries}
+    nobody = Contestant("1", "", REPRODUCED)
     write_board(
         folder,
         tables={
-            "leaderboard": with_contestants(table, dict.fromkeys(table["matcher"], ("1", "")) | named),
+            "leaderboard": with_contestants(table, dict.fromkeys(table["matcher"], nobody) | named),
             "scores": pd.DataFrame() if scored is None else scored,
             "contrasts": contrast_frame(findings),
             "controls": verdict_frame(verdicts),

@@ -105,6 +105,7 @@ def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:
         board=files.board,
         rates=book,
         contrasts=tables["contrasts"],
+        falsifiers=tables["falsifiers"],
         controls=tables["controls"],
         scores=tables["scores"],
         protection=tables["protection"],

@@ -238,7 +238,8 @@ def _for_nothing(book: Book, key: Key) -> str:
 class Told:
     """A registered contrast in plain words.
 
-    `outcome` is "decided", "null" or "not decided"; `bar` spans from -`reach` to `reach`, with `least` of it on both
+    `outcome` is "decided", "null" or "not decided"; `unstressed` says how both fare where they should not differ, empty
+    where nobody looked; `bar` spans from -`reach` to `reach`, with `least` of it on both
     sides of the middle too small to matter, in per cent.
     """
 
@@ -247,6 +248,7 @@ class Told:
     headline: str
     sentence: str
     facts: tuple[str, ...]
+    unstressed: str
     why: str
     figure: str
     bar: Bar | None
@@ -282,6 +284,7 @@ def _told(row: Record, source: SiteSource, reach: float) -> Told:
         headline=_headline(row, verdict, outcome),
         sentence=_sentence(row, least),
         facts=tuple(_contrast_facts(row, source, contrast)),
+        unstressed=_unstressed(source.falsifiers, name),
         why=source.reasons.get(name, ""),
         figure=figure,
         bar=bar,
@@ -306,6 +309,20 @@ def _sentence(row: Record, least: float) -> str:
     values = f"{number_text(float(row['first_value']))} against {number_text(float(row['second_value']))}"
     what = "share of queries that are right" if row["metric"] == "primary" else "area under risk (lower is better)"
     return f"Difference {difference} in the {what}: {values}. A difference from {number_text(least)} on was to matter."
+
+
+def _unstressed(falsifiers: pd.DataFrame, contrast: str) -> str:
+    """How both sides fare without the stress, all suites together: the first row of a contrast."""
+    mine = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
+    if mine.empty:
+        return ""
+    row = mine.iloc[0]
+    difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
+    gained = " What it gains there is not owed to what the contrast is named for." if row["lo"] > 0 else ""
+    return (
+        f"Without the stress, where they should not differ: {difference}, {row['verdict'].lower()} "
+        f"(n = {row['n']}, {counted(int(row['blocks']), 'block')}).{gained}"
+    )
 
 
 def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) -> Iterator[str]:

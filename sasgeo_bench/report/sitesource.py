@@ -85,7 +85,7 @@ class SiteSource:
         Of the board; the title is that of its pipeline where it is known.
     about : mapping
         What `board.json` says.
-    board, contrasts, controls, scores, protection : pandas.DataFrame
+    board, contrasts, falsifiers, controls, scores, protection : pandas.DataFrame
         Its tables; empty where it has none.
     registered : tuple of Contrast
         As they were registered, where that is known.
@@ -111,6 +111,7 @@ class SiteSource:
     board: pd.DataFrame
     rates: RateBook
     contrasts: pd.DataFrame = field(default_factory=pd.DataFrame)
+    falsifiers: pd.DataFrame = field(default_factory=pd.DataFrame)
     controls: pd.DataFrame = field(default_factory=pd.DataFrame)
     scores: pd.DataFrame = field(default_factory=pd.DataFrame)
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)

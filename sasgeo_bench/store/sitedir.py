@@ -26,13 +26,14 @@ MANIFEST: Final = "site.json"  # without it a folder is no site, and is not repl
 PICTURES: Final = "pictures"
 FILES: Final = "files"
 MOST_BYTES: Final = 5_000_000  # of a site, pictures of regions and cases apart; more is said
-_TABLES: Final = ("contrasts", "controls", SCORES, PROTECTION)
+_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, PROTECTION)
 _OFFERED: Final = {  # what is offered for download, and what it is
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
     f"{LEADERBOARD}.csv": "the same for a spreadsheet",
     f"{LEADERBOARD}.tex": "tables for a paper",
     f"{LEADERBOARD}.md": "tables as text",
     "contrasts.parquet": "registered contrasts",
+    "falsifiers.parquet": "the same two methods where they should not differ",
     "controls.parquet": "controls of every matcher",
     f"{PROTECTION}.parquet": "protection levels, counted",
     "paper.md": "the paper's experiment beside its Table II",

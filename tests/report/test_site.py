@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame
+from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame
 from sasgeo_bench.report.siteboard import Book, contrasts_of, group_table, places_of, sections_of
 from sasgeo_bench.report.sitepages import places_on_map, regions_of
 from sasgeo_bench.report.siteplots import draw_places, draw_rates
@@ -208,3 +209,19 @@ def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path
 def test_words_of_files_are_plain():
     assert file_stem("board", *KEY) == "board-real-age-localization-r500-weak-s3"
     assert file_stem("../..", "..") == "page"
+
+
+def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
+    rows = [
+        Falsifier(contrast=FINDING.name, suite="all", kind="all", finding=replace(FINDING, n=80, blocks=9)),
+        Falsifier(contrast="other", suite="all", kind="all", finding=FINDING),
+    ]
+    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame(rows)))
+    assert told.unstressed.startswith("Without the stress, where they should not differ: ")
+    assert "(n = 80, 9 blocks). What it gains there is not owed" in told.unstressed
+    (silent,) = contrasts_of(source(findings=[FINDING]))
+    assert silent.unstressed == ""
+    none = replace(rows[0], finding=replace(FINDING, lo=-0.1))
+    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame([none])))
+    assert "no gain shown" in told.unstressed
+    assert "not owed" not in told.unstressed

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.boardfigures import figures_extra
+from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.boardtasks import AskedTask
 from sasgeo_bench.errors import ConfigError, StoreError, counted
@@ -341,7 +342,10 @@ def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, 
         draws=settings.draws,
         by_region=settings.by_region,
         pipeline=settings.pipeline,
-        extras=(partial(figures_extra, tell=tell, contrasts=settings.contrasts, split=split),),
+        extras=(
+            partial(figures_extra, tell=tell, contrasts=settings.contrasts, split=split),
+            partial(pictures_extra, tell=tell, root=stored, contrasts=settings.contrasts, kept=stored),
+        ),
         submissions=submissions_for(board_of([stored]), submissions, tell=tell),
     )
     with laid_out(request) as laid:

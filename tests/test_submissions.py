@@ -514,6 +514,29 @@ def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, t
     assert (f"mine: set apart, {why}" in lines) == (why is not None)
 
 
+def test_one_command_publishes_stored_results_and_submissions(copied, stored, program, tmp_path):
+    words = (
+        "publish",
+        "--board",
+        stored,
+        "--submissions",
+        copied.parent,
+        "--into",
+        tmp_path / "site",
+        "--out",
+        tmp_path,
+    )
+    code, said, err = program(*words)
+    assert code == 0, err
+    assert said.split()[-1] == str(tmp_path / "site" / "index.html")
+    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert "as submitted" in page
+    assert "reproduced" in page
+    code, _, err = program("publish", "--board", tmp_path, "--submissions", copied.parent, "--out", tmp_path)
+    assert code == 2
+    assert "holds no stored results" in err
+
+
 def test_one_command_scores_stored_results_and_submissions(copied, stored, program, tmp_path):
     words = ("score", "--predictions", stored, "--submissions", copied.parent, "--name", "both", "--out", tmp_path)
     code, out, err = program(*words)

@@ -6,16 +6,29 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import tell
+from sasgeo_bench.cli.console import Out, tell
+from sasgeo_bench.packing import board_of
 from sasgeo_bench.publish import publish
+from sasgeo_bench.submissions import with_submissions
 
 
 def publish_command(
     *,
     board: Annotated[Path, typer.Option(help="folder of a board (OUT/boards/<name>), or of stored results")],
     into: Annotated[Path | None, typer.Option(help="folder to write; default: site in the board's folder")] = None,
+    submissions: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="a submission, or a folder of them, to be scored with stored results first: OUT/boards/<id>; may be "
+            "repeated"
+        ),
+    ] = None,
+    out: Out = Path("out"),
 ) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
+    if submissions:
+        stored, board = board, out / "boards" / (board_of([board]) or board.resolve().name)
+        with_submissions(stored, submissions, board, tell=tell)
     written = publish(board, into, tell=tell)
     tell(written.to_text())
     typer.echo(str(written.folder / "index.html"))

@@ -308,7 +308,7 @@ def _judged_table(part: pd.DataFrame, name: str, title: str) -> Table:
             *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_JUDGED, "n")),
         ),
         rows=tuple(row for *_, row in rows),
-        notes=("A figure without an interval has none: it is a mean of chances, told for the order alone.",),
+        notes=("Brier, ECE and costs have no interval on this board: they decide nothing.",),
     )
 
 

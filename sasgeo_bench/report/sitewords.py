@@ -18,8 +18,8 @@ MEANINGS: Final[dict[str, str]] = {
     "queries where nothing is stressed. No answer is a miss. Matchers are ranked by it",
     "recall_1": "Share of the stressed queries whose first candidate is the right one, with its 95 % interval. Ties "
     "count in proportion, no answer is a miss. Matchers are ranked by it",
-    "rank": f"Ranks it can have, all pairs compared at once. Who shares a rank cannot be told apart. - : fewer than "
-    f"{LEAST_BLOCKS} blocks rank nobody",
+    "rank": "Ranks it can have, all pairs compared at once. Who shares a rank cannot be told apart. With fewer than "
+    f"{LEAST_BLOCKS} blocks nobody is ranked (-)",
     "within_25m": "The same as success_25m whatever the heading: what counts as a fix that is not false",
     "control": "The same figure at the same places without the stress",
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",

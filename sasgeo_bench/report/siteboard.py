@@ -173,7 +173,7 @@ def group_table(book: Book, key: Key, names: Sequence[str]) -> Table:
         rows=rows,
         notes=_notes(ties, found, ranked),
     )
-    return table.without_empty(WITHIN.name, "false fixes", "control")
+    return table.without_empty(WITHIN.name, "false fixes", "control", "detectable", "missing")
 
 
 def _value(row: Record) -> float:
@@ -202,7 +202,7 @@ def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Ro
             figure_cell(book.pick(key, name, FALSE_ABSENT.name)),
             number_cell(float(main["detectable"])),
             plain_cell(int(main["n"])),
-            plain_cell(int(main["missing"])),
+            plain_cell(int(main["missing"])) if main["missing"] else Cell(text="-", key=0.0),
             Cell(text=f"{main['blocks']} in {places}", key=float(main["blocks"])),
         ),
         tone=tone,

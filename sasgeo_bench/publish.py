@@ -187,6 +187,7 @@ def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 
 def _pictures(said: Mapping[str, Any]) -> Pictures:
     def plain(item: Mapping[str, Any], *names: str) -> dict[str, str]:
+        """Some fields of a picture as text, empty where it has none."""
         return {name: str(item.get(name, "")) for name in names}
 
     return Pictures(

@@ -174,17 +174,24 @@ def reliability_frame(
         alone. Wilson's intervals of as many trials as there are sites.
     """
     rows: list[dict[str, Any]] = []
-    for (matcher, rejector), frame in judged.items():
-        if matcher not in shown or (matcher, rejector) not in calibrated:
-            continue
-        for (track, prior_group), part in frame.groupby(["track", "prior_group"], sort=True):
-            answered = part[part["is_answered"].to_numpy(bool)]
-            p_false = 1.0 - answered["p_right"].to_numpy(float)
-            if len(answered) and not np.isnan(p_false).any():
-                said = {"track": track, "prior_group": prior_group, "matcher": matcher, "rejector": rejector}
-                rows += [{**said, **one} for one in _bins(answered, p_false)]
+    for said, part in calibrated_parts(judged, calibrated, shown):
+        answered = part[part["is_answered"].to_numpy(bool)]
+        p_false = 1.0 - answered["p_right"].to_numpy(float)
+        if len(answered) and not np.isnan(p_false).any():
+            rows += [{**said, **one} for one in _bins(answered, p_false)]
     columns = ["track", "prior_group", "matcher", "rejector", "predicted", "observed", "lo", "hi", "n", "sites"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def calibrated_parts(
+    judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
+) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+    """What is judged by probabilities, track by track and prior group by prior group, and what each part is of."""
+    for (matcher, rejector), frame in judged.items():
+        if matcher in shown and (matcher, rejector) in calibrated:
+            for (track, prior_group), part in frame.groupby(["track", "prior_group"], sort=True):
+                said = {"track": track, "prior_group": prior_group, "matcher": matcher, "rejector": rejector}
+                yield said, part
 
 
 def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[dict[str, float]]:

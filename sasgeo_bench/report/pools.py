@@ -22,6 +22,7 @@ from sasgeo_bench.query import Truth
 from sasgeo_bench.report.contrasts import Contrast, chosen_rows
 from sasgeo_bench.report.integrity import SLOW_DRAWS
 from sasgeo_bench.report.measures import primary_of, ranks_of
+from sasgeo_bench.report.plottables import calibrated_parts
 from sasgeo_bench.report.rejection import answers_of
 from sasgeo_bench.report.rows import ALL_SUITES
 from sasgeo_bench.report.strata import ALL, STRESS
@@ -262,18 +263,14 @@ def cost_frame(
         `cost_20_place` of a board: a present place without an accepted fix costs 1, a false fix `ratio`.
     """
     rows: list[dict[str, Any]] = []
-    for (matcher, rejector), frame in judged.items():
-        if matcher not in shown or (matcher, rejector) not in calibrated:
-            continue
-        for (track, prior_group), part in frame.groupby(["track", "prior_group"], sort=True):
-            some = answers_of(part)
-            said = {"track": track, "prior_group": prior_group, "matcher": matcher, "rejector": rejector}
-            withhold = float(some.is_present.mean())
-            for ratio in _RATIOS.tolist():
-                cost = decision_cost(some, ratio, charged="place")
-                all_accepted = float(cost_values(some, some.is_answered, ratio, charged="place").mean())
-                costs = {"cost": cost, "accept_all": all_accepted, "withhold_all": withhold}
-                rows.append({**said, "n": len(some), "ratio": ratio, **costs})
+    for said, part in calibrated_parts(judged, calibrated, shown):
+        some = answers_of(part)
+        withhold = float(some.is_present.mean())
+        for ratio in _RATIOS.tolist():
+            cost = decision_cost(some, ratio, charged="place")
+            all_accepted = float(cost_values(some, some.is_answered, ratio, charged="place").mean())
+            costs = {"cost": cost, "accept_all": all_accepted, "withhold_all": withhold}
+            rows.append({**said, "n": len(some), "ratio": ratio, **costs})
     columns = ["track", "prior_group", "matcher", "rejector", "n", "ratio", "cost", "accept_all", "withhold_all"]
     return pd.DataFrame(rows, columns=columns)
 

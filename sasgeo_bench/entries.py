@@ -155,7 +155,7 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
     Raises
     ------
     ConfigError
-        If no run is on one of them, or an entry is a file, which does not say where its queries are.
+        If no run is on one of them, or all are, or an entry is a file, which does not say where its queries are.
 
     Examples
     --------
@@ -172,6 +172,9 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
     unknown = sorted(set(regions) - known)
     if unknown:
         message = f"no run is on {unknown[0]!r}: regions that can be left out are {', '.join(sorted(known))}"
+        raise ConfigError(message)
+    if known <= set(regions):
+        message = "there is nothing to score: every run is on a region that is left out, leave fewer out (--without)"
         raise ConfigError(message)
     kept = [[base_of(about["region"]) not in regions for about in entry.runs] for entry in entries]
     return tuple(

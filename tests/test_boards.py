@@ -525,7 +525,7 @@ def test_a_region_that_is_left_out_is_as_if_it_had_never_been_asked(out):
 def test_what_cannot_be_left_out_is_told(out, tmp_path):
     with pytest.raises(ConfigError, match=f"no run is on 'nowhere': regions that can be left out are {TOWNS[0]}, "):
         told_by(out, out / "runs", without=["nowhere"])
-    with pytest.raises(ConfigError, match="there is nothing to score"):
+    with pytest.raises(ConfigError, match="every run is on a region that is left out"):
         told_by(out, out / "runs", without=TOWNS)
     submission(out, tmp_path / "mine.parquet")
     with pytest.raises(ConfigError, match=r"mine.parquet is a file of predictions, of which no region can be left out"):

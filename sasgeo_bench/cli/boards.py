@@ -161,7 +161,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
 
 
 def _how_to_publish(folder: Path) -> str:
-    return f"its site: publish --board {folder}"
+    return f"next: sasgeo-bench publish --board {folder} makes a site of it"
 
 
 def _check_controls(board: Board) -> None:

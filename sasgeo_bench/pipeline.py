@@ -237,7 +237,11 @@ def plan_pipeline(
             may_be_fewer=True,
             choice=Choice(views_cells=tuple(task.views_cells), kinds=tuple(task.kinds), tracks=tuple(task.tracks)),
         )
-        requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
+        try:
+            requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
+        except ConfigError as error:
+            message = f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}"
+            raise ConfigError(message) from error
     if spec.task and not requests:
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)

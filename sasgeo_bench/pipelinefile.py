@@ -34,7 +34,8 @@ class TaskSpec(Document):
     """Suites that are drawn alike; several of these make up a pipeline.
 
     `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
-    `views_cells`, `kinds` and `tracks` choose of the variants of each suite: fewer variants at more sites say more.
+    `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
+    at more sites say more.
     """
 
     suites: Annotated[list[str], Field(min_length=1)]

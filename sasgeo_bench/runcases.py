@@ -206,21 +206,25 @@ def _truth(task: ScoredTask, query_id: str) -> Truth:
 
 def _find(cases: RunCases, query: str) -> str:
     """The one id that begins so."""
+    if not query:
+        message = f"--query is empty: name the beginning of an id, as 'inspect {cases.run}' lists some"
+        raise ConfigError(message)
     known = sorted(cases.scores["query_id"])
-    found = [name for name in known if name.startswith(query)] if query else []
+    found = [name for name in known if name.startswith(query)]
     if len(found) > 1:
         message = f"{counted(len(found), 'query', 'queries')} begin with {query!r} ({', '.join(found[:_NAMED])}, ...)"
         message = f"{message}: name more of the id"
         raise ConfigError(message)
     answered = {tie.query_id for source in cases.entry.sources for tie in rundir.read_ties(source)}
     is_old = found and found[0] in answered and found[0] not in cases.predictions
-    if is_old or (not found and query and any(name.startswith(query) for name in answered)):
+    if is_old or (not found and any(name.startswith(query) for name in answered)):
         message = (
             f"query {query!r} was drawn anew since {cases.run} answered it: run again, or make the old queries again"
         )
         raise StoreError(message)
     if not found:
-        near = difflib.get_close_matches(query, known, n=_NAMED, cutoff=0.0)
-        message = f"{cases.run} was asked no query {query!r}; the nearest are {', '.join(near)}"
+        near = difflib.get_close_matches(query, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"'inspect {cases.run}' lists some that went wrong"
+        message = f"{cases.run} was asked no query {query!r}; {hint}"
         raise ConfigError(message)
     return str(found[0])

@@ -2,6 +2,7 @@
 """TOML text into a frozen pydantic model, with every fault told in one line."""
 
 import difflib
+import json
 import tomllib
 from typing import Any, TypeVar
 
@@ -98,6 +99,8 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         return f"unknown key {where!r}, {hint}"
     if item["type"] == "missing":
         return f"{where!r} is missing"
+    if item["type"] == "list_type" and not isinstance(item["input"], dict):
+        return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
     text = item["msg"].removeprefix("Value error, ")
     return f"{where!r}: {text}, got {item['input']!r}" if where and "got " not in text else text
 

@@ -3,6 +3,7 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -90,13 +91,16 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
     assert "oracle_pose" in {row[0] for row in rows}
 
 
-def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path) -> None:
+def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     code, told, err = program("new-matcher", "my-matcher")
     assert code == 0
     assert "submit --card my-matcher/card.toml" in err
     assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check-matcher my-matcher\n"
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
+    monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named
     code, told, _ = program("new-matcher", "other", "--into", "deep/er")
+    assert f"next: {Path(sys.executable).parent / 'pip'} install -e deep/er && " in told
     assert (code, told.split(":")[0]) == (0, "deep/er")
     assert (tmp_path / "deep" / "er" / "pyproject.toml").is_file()
 

@@ -377,6 +377,14 @@ def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp
     assert not (tmp_path / "out").exists()
 
 
+def test_a_choice_that_leaves_nothing_names_the_pipeline_and_the_task(tmp_path):
+    spec = small(**{"sites = 1": "sites = 1\nviews_cells = [191]"})
+    with pytest.raises(
+        ConfigError, match=r"^pipeline 'small', \[\[task\]\] 1 of 1: suite 'clean' has nothing of views_cells 191"
+    ):
+        plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+
+
 @pytest.mark.parametrize(("old", "new"), [("random", "randon"), ("prior_centre", "prior_center")])
 def test_a_matcher_that_nobody_has_is_refused_before_anything_is_made(tmp_path, old, new):
     spec = parse_toml(TEXT.replace(f'"{old}"', f'"{new}"'), PipelineFile, source="small.toml")

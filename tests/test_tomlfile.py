@@ -47,6 +47,16 @@ def test_a_wrong_type_says_what_was_found():
     assert "got 3" in fault("name = 3")
 
 
+def test_one_thing_where_a_list_is_wanted_is_shown_as_a_list():
+    class Sizes(Document):
+        sizes: list[int]
+
+    with pytest.raises(ConfigError, match=r"a\.toml: 'sizes' is a list: write \[192\]$"):
+        parse_toml("sizes = 192", Sizes, source="a.toml")
+    with pytest.raises(ConfigError, match=r"'sizes': Input should be a valid list"):
+        parse_toml("[sizes]\nx = 1", Sizes, source="a.toml")
+
+
 def test_a_missing_key_is_named():
     assert "'name' is missing" in fault("")
 

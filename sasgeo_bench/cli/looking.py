@@ -68,6 +68,11 @@ def inspect_command(
         _inspect_run(cases, out, query)
         return
     _check_target(target, out)
+    if query is not None:
+        message = (
+            f"--query draws a query of a task or a run, and {target} is neither: leave it out, or name one of these"
+        )
+        raise ConfigError(message)
     if target.endswith(".toml") or target in list_split_files():
         _inspect_split(target, out, region_folders or [])
         return

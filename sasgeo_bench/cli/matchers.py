@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands for authors of matchers."""
 
+import shlex
+import shutil
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
@@ -45,8 +48,18 @@ def new_matcher_command(
     files = plugin_files(name)
     target = folder or Path(name)
     write_plugin(target, files)
-    typer.echo(f"{target}: {len(files)} files; next: pip install -e {target} && sasgeo-bench check-matcher {name}")
+    install = f"{_pip()} install -e {shlex.quote(str(target))}"
+    typer.echo(f"{target}: {len(files)} files; next: {install} && sasgeo-bench check-matcher {name}")
     tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/adding-a-matcher.md walks the path)")
+
+
+def _pip() -> str:
+    """The pip of this environment: another one, first on the user's path, would install where nothing finds it."""
+    mine = Path(sys.executable).with_name("pip")
+    if shutil.which("pip") == str(mine):
+        return "pip"
+    here = Path.cwd()
+    return shlex.quote(str(mine.relative_to(here) if mine.is_relative_to(here) else mine))
 
 
 def check_matcher_command(

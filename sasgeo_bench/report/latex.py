@@ -22,6 +22,7 @@ _ESCAPED: Final = {
     "\\": r"\textbackslash{}",
     DAGGER: r"$^\dagger$",
 }
+_LAST_LATIN: Final = 0x17F  # of Latin Extended-A
 _HEAD: Final = (
     r"% \usepackage{booktabs} for the rules. A table too wide for its column: table* spans two columns,",
     r"% \resizebox{\linewidth}{!}{...} (package graphicx) around a tabular shrinks it, sidewaystable (rotating)",
@@ -74,4 +75,11 @@ def _table(title: str, name: str, table: pd.DataFrame) -> Iterator[str]:
 
 
 def _tex(text: object) -> str:
-    return "".join(_ESCAPED.get(letter, letter) for letter in str(text))
+    """Any text as TeX; letters that pdfTeX has no glyph of by their number, for it stops at them."""
+    said = "".join(letter if ord(letter) <= _LAST_LATIN else f"[U+{ord(letter):04X}]" for letter in _known(str(text)))
+    return "{}" + said if said.startswith(("[", "*")) else said  # which belong to the end of the row before, else
+
+
+def _known(text: str) -> Iterator[str]:
+    for letter in text:
+        yield from _ESCAPED.get(letter, letter)

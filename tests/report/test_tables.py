@@ -330,6 +330,7 @@ def test_no_name_breaks_a_table():
     (row,) = (line for line in board_markdown(board, ABOUT).splitlines() if "mine 1" in line)
     assert r"mine 1\|2 &lt;b>" in row
     assert row.replace(r"\|", "").count("|") == 10
+    assert "[U+2122]" in board_latex(leaderboard({"mine \u2122": scores([1.0])}, draws=200), ABOUT)
     expected = r"mine 1$|$2 $<$b$>$ \textbackslash{}\$ \{x\} \textasciitilde{} \textasciicircum{}"
     assert expected in board_latex(board, ABOUT)
 

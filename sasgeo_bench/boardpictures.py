@@ -275,7 +275,7 @@ def _cases(
 
 
 def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
-    """What rejectors say of one answer: how likely it is false, and whether they accept it.
+    """What rejectors say of one answer: how likely it is false, or only in which order; and whether they accept it.
 
     Parameters
     ----------
@@ -285,13 +285,15 @@ def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_
         Whose answer to what.
     """
     p_false: dict[str, float] = {}
+    orders: dict[str, float] = {}
     accepted: dict[str, bool] = {}
     for (name, rejector), frame in words.items():
         if name != matcher or query_id not in frame.index:
             continue
         row: Any = frame.loc[query_id]
         if pd.notna(row["p_right"]):
-            p_false[rejector] = 1.0 - float(row["p_right"])
+            is_chance = bool(row.get("is_calibrated", True))
+            (p_false if is_chance else orders)[rejector] = 1.0 - float(row["p_right"])
         if pd.notna(row[OPERATING]) and row["is_answered"]:
             accepted[rejector] = bool(row[OPERATING])
-    return {"p_false": p_false, "accepted": accepted}
+    return {"p_false": p_false, "orders": orders, "accepted": accepted}

@@ -16,6 +16,7 @@ from sasgeo_bench.boardtasks import ScoredTask, read_scored_task
 from sasgeo_bench.contestants import Told, read_told
 from sasgeo_bench.entries import Entry, find_entries, leave_out
 from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.judging import Judging, carry_out
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
 from sasgeo_bench.region import DATA_VERSION
@@ -24,10 +25,9 @@ from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame, hol
 from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
-from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
-from sasgeo_bench.report.rejection import OWN, Rule, judge, own_word, remarks_of, rules_of, why_not
+from sasgeo_bench.report.rejection import OWN, remarks_of, rules_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
 from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
@@ -80,6 +80,8 @@ class ScoreRequest:
         Regions that are left out, on each of their maps.
     submissions : sequence of Path
         Folders of submissions, scored as files are, but held to more (`validate.submission_faults`).
+    jobs : int
+        Processes that fit rejectors.
     """
 
     predictions: Sequence[Path]
@@ -96,6 +98,7 @@ class ScoreRequest:
     extras: Sequence[Callable[["Board"], Extra]] = ()
     without: Collection[str] = ()
     submissions: Sequence[Path] = ()
+    jobs: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,10 +175,23 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     for entry in entries:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
-        judged = _judged(entry, frame, predictions[entry.name], rules, request.split, tell)
-        rows += _integrity(entry.name, judged, rules)
-        all_judged |= {(entry.name, name): said for name, said in judged.items()}
         tell(f"{entry.name}: {_in_words(frame)}")
+    judgings = [
+        Judging(
+            matcher=entry.name,
+            scores=scores[entry.name],
+            predictions=predictions[entry.name],
+            rules=rules,
+            split=request.split,
+            is_taught=entry.is_taught,
+        )
+        for entry in entries
+    ]
+    for judged in carry_out(judgings, jobs=request.jobs):
+        rows += judged.rows
+        all_judged |= {(judged.matcher, name): said for name, said in judged.said.items()}
+        for line in judged.lines:
+            tell(line)
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
     table = with_contestants(figures, _contestants(entries, apart))
@@ -199,32 +215,6 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
-
-
-def _judged(
-    entry: Entry,
-    frame: pd.DataFrame,
-    predictions: Mapping[str, Prediction],
-    rules: Mapping[str, Rule],
-    split: Split | None,
-    tell: Tell,
-) -> dict[str, pd.DataFrame]:
-    """What rejectors say of the answers of one contestant, its own word among them; no row where one is not applied."""
-    own = own_word(frame, split, is_taught=entry.is_taught)
-    found = {OWN: own} if len(own) else {}
-    for name, rule in rules.items():
-        found[name] = judge(frame, predictions, rule.make, rule.split, is_taught=entry.is_taught)
-        if not len(found[name]):
-            tell(f"{name} on {entry.name}: not applied, {why_not(frame, is_taught=entry.is_taught)}")
-    return found
-
-
-def _integrity(matcher: str, judged: Mapping[str, pd.DataFrame], rules: Mapping[str, Rule]) -> Iterator[pd.DataFrame]:
-    """Figures of a contestant with each rejector that was applied; its own word is taken for a probability."""
-    for name, frame in judged.items():
-        if len(frame):
-            is_calibrated = name == OWN or rules[name].card.is_calibrated
-            yield to_frame(list(integrity_rows(matcher, name, frame, is_calibrated=is_calibrated)))
 
 
 def _apart(

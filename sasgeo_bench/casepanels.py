@@ -47,6 +47,8 @@ class Case:
         The answer; None for a missing row.
     p_false : mapping of str to float
         By rejector, how likely it says that the answer is false.
+    orders : mapping of str to float
+        The same of rejectors that order answers by it, and tell no probability.
     accepted : mapping of str to bool
         By rejector, whether the threshold for a risk of 5 % accepts it.
     """
@@ -57,6 +59,7 @@ class Case:
     truth: Truth
     prediction: Prediction | None
     p_false: Mapping[str, float] = field(default_factory=dict)
+    orders: Mapping[str, float] = field(default_factory=dict)
     accepted: Mapping[str, bool] = field(default_factory=dict)
 
     @property
@@ -78,8 +81,8 @@ def said_of(case: Case) -> dict[str, float | str]:
     """What is known of a case, as plain numbers and words; what is not known is left out.
 
     `error_m` is the distance from where the view was taken, also of absent places; `score_margin` the score of the
-    first pose less that of the second; `p_false_<rejector>` and `accepted_<rejector>` what a rejector says, and
-    `told_<name>` what the answer told of itself.
+    first pose less that of the second; `p_false_<rejector>` (`order_<rejector>` where it is no probability) and
+    `accepted_<rejector>` what a rejector says, and `told_<name>` what the answer told of itself.
     """
     prediction, truth = case.prediction, case.truth
     status: str = MISSING if prediction is None else prediction.status
@@ -92,6 +95,7 @@ def said_of(case: Case) -> dict[str, float | str]:
         "score_margin": scores[0] - scores[1] if len(scores) > 1 else None,
         "confidence": None if prediction is None else prediction.confidence,
         **{f"p_false_{name}": value for name, value in case.p_false.items()},
+        **{f"order_{name}": value for name, value in case.orders.items()},
         **{f"accepted_{name}": "yes" if value else "no" for name, value in case.accepted.items()},
         "present": "yes" if truth.is_present else "no",
         "strength": truth.strength,
@@ -217,12 +221,14 @@ def _lines(case: Case) -> list[str]:
         lines.append(f"right candidate: {_right_candidate(case)}")
     if "confidence" in said:
         lines.append(f"own confidence: {said['confidence']:.3g}")
-    for name, value in case.p_false.items():
+    said_by = [(f"P(false) {name}", name, value) for name, value in case.p_false.items()]
+    said_by += [(f"{name} (an order, no probability)", name, value) for name, value in case.orders.items()]
+    for label, name, value in said_by:
         taken = "" if name not in case.accepted else f", {'accepted' if case.accepted[name] else 'rejected'}"
-        lines.append(f"P(false) {name}: {value:.3g}{taken}")
+        lines.append(f"{label}: {value:.3g}{taken}")
     lines.append(f"unknown {case.truth.unknown_share:.2f}, changed {case.truth.changed_share:.2f}" + _alias(case))
     told = {} if case.prediction is None else dict(case.prediction.diagnostics)
-    lines += ["", "what the integrity model saw"] if told or case.p_false else ["", "the answer told nothing of itself"]
+    lines += ["", "what the integrity model saw"] if told or said_by else ["", "the answer told nothing of itself"]
     known = [(item.name, item.unit) for item in EVIDENCE if item.name in told]
     known += [(name, "") for name in sorted(told) if name not in {name for name, _ in known}]
     lines += [f"{name}: {told[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known]

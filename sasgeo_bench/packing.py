@@ -5,14 +5,18 @@ import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sasgeo_bench.boards import Board, ScoreRequest
+from sasgeo_bench.boardfigures import figures_extra
+from sasgeo_bench.boardpictures import pictures_extra
+from sasgeo_bench.boards import Board, ScoreRequest, Tell, make_board
 from sasgeo_bench.entries import Entry
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.report.contrasts import Contrast
+from sasgeo_bench.store.catalog import find_split
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.packfile import (
     MOST_BYTES,
@@ -159,6 +163,79 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
     except (KeyError, TypeError, ValueError) as error:
         message = f"{stored[0]} does not say how it was scored ({error!r}): fetch it again"
         raise StoreError(message) from error
+
+
+def request_of(
+    predictions: Sequence[Path], *, board: Path, root: Path, split: str | None = None, folders: Sequence[Path] = ()
+) -> ScoreRequest:
+    """What is asked of a board, set as the stored results among its predictions were; as ever where there are none.
+
+    Parameters
+    ----------
+    predictions : sequence of Path
+        Runs, files of predictions, and at most one folder of stored results.
+    board : Path
+        Folder to write.
+    root : Path
+        Where tasks/ and truth/ are.
+    split : str, optional
+        Instead of that of the stored results, or of "crossfit" where none are.
+    folders : sequence of Path
+        With region files of one's own.
+
+    Raises
+    ------
+    ConfigError, StoreError
+        As `stored_settings` does, or if there is no such split.
+
+    Examples
+    --------
+    >>> request_of([Path("nowhere")], board=Path("board"), root=Path("out")).split.spec.id
+    'crossfit'
+    """
+    settings = stored_settings(predictions)
+    name = split or settings.split or (None if stored_among(predictions) else "crossfit")
+    return ScoreRequest(
+        predictions=predictions,
+        root=root,
+        split=None if name is None else find_split(name, folders=folders),
+        contrasts=settings.contrasts,
+        rejectors=settings.rejectors,
+        board=board,
+        draws=settings.draws,
+        by_region=settings.by_region,
+        pipeline=settings.pipeline,
+    )
+
+
+def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True) -> Board:
+    """Score what is asked for, stored results laid out, and write the board with its figures and pictures.
+
+    Parameters
+    ----------
+    request : ScoreRequest
+        Without extras.
+    tell : callable
+        Gets a line now and then.
+    has_cases : bool
+        Whether queries that went wrong are shown, with their truths.
+
+    Raises
+    ------
+    ConfigError, StoreError
+        As `laid_out` and `make_board` do.
+    """
+    with laid_out(request) as laid:
+        figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
+        pictures = partial(
+            pictures_extra,
+            tell=tell,
+            root=laid.root,
+            contrasts=request.contrasts,
+            kept=stored_among(request.predictions),
+            has_cases=has_cases,
+        )
+        return make_board(replace(laid, extras=(figures, pictures)), tell=tell)
 
 
 def stored_among(predictions: Sequence[Path]) -> Path | None:

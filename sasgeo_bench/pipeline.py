@@ -331,6 +331,7 @@ def run_pipeline(
         pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
+        jobs=plan.jobs,
     )
     board = make_board(request, tell=tell)
     if results is not None:

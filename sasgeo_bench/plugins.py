@@ -5,6 +5,7 @@ import difflib
 import importlib
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
@@ -77,7 +78,7 @@ def load_matcher(spec: str) -> Matcher:
         ...
     sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list-matchers shows all; or module:Class)
     """
-    matcher: Matcher = _load(spec, MATCHERS, "matcher")()
+    matcher: Matcher = _made(spec, _find(spec, MATCHERS, "matcher"))
     _check(spec, matcher, MatcherCard, "matcher", ("prepare", "match"))
     return matcher
 
@@ -95,7 +96,27 @@ def load_rejector(spec: str) -> Rejector:
     MatchError
         If there is none of that name, it cannot be imported or made, is not a rejector, or has no sound card.
     """
-    rejector: Rejector = _load(spec, REJECTORS, "rejector")()
+    return rejector_maker(spec)()
+
+
+def rejector_maker(spec: str) -> Callable[[], Rejector]:
+    """What makes rejectors of a name, as `load_rejector` does, but looks for them once: a board makes thousands.
+
+    Parameters
+    ----------
+    spec : str
+        A name, or "module:Class".
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name, or it cannot be imported.
+    """
+    return partial(_rejector, spec, _find(spec, REJECTORS, "rejector"))
+
+
+def _rejector(spec: str, target: Callable[[], Any]) -> Rejector:
+    rejector: Rejector = _made(spec, target)
     _check(spec, rejector, RejectorCard, "rejector", ("fit", "p_false"))
     return rejector
 
@@ -117,19 +138,18 @@ def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequenc
         raise MatchError(message)
 
 
-def _load(spec: str, group: str, kind: str) -> Callable[[], Any]:
-    """The class behind a name or module:Class, wrapped so that what goes wrong is told in one line."""
-    target = _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
+def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
+    """The class behind a name or module:Class."""
+    return _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
 
-    def make() -> Any:  # noqa: ANN401 - whatever the plugin is
-        """Make one, telling in a line what went wrong."""
-        try:
-            return target()
-        except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
-            message = f"{spec}: cannot be made ({told(error)})"
-            raise MatchError(message) from error
 
-    return make
+def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever the plugin is
+    """One of it; what goes wrong is told in one line."""
+    try:
+        return target()
+    except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+        message = f"{spec}: cannot be made ({told(error)})"
+        raise MatchError(message) from error
 
 
 def _from_module(spec: str) -> Callable[[], Any]:

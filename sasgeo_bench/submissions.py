@@ -2,20 +2,17 @@
 """Answers of others: a submission made of predictions and a card, held against a board, and scored with it."""
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.boardfigures import figures_extra
-from sasgeo_bench.boardpictures import pictures_extra
-from sasgeo_bench.boards import Board, ScoreRequest, make_board
+from sasgeo_bench.boards import Board, Tell
 from sasgeo_bench.boardtasks import AskedTask
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.packing import board_of, laid_out, laid_tasks, stored_settings
+from sasgeo_bench.packing import board_of, laid_tasks, request_of, score_all, stored_settings
 from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.report.rows import is_unranked, name_alone
@@ -28,8 +25,6 @@ from sasgeo_bench.store.packfile import is_pack, read_settings
 from sasgeo_bench.store.submissiondir import list_submissions, read_card, read_submission, write_submission
 from sasgeo_bench.submissionfile import SCHEMA_VERSION, Card, Submission, TaskSaid
 from sasgeo_bench.validate import Violation, submission_faults, validate
-
-Tell = Callable[[str], None]
 
 FOLDER: Final = Path("submissions")  # where they lie, unless said otherwise
 
@@ -330,23 +325,5 @@ def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, 
     if not is_pack(stored):
         message = f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written"
         raise StoreError(message)
-    settings = stored_settings([stored])
-    split = None if settings.split is None else find_split(settings.split)
-    request = ScoreRequest(
-        predictions=[stored],
-        root=stored,
-        split=split,
-        contrasts=settings.contrasts,
-        rejectors=settings.rejectors,
-        board=board,
-        draws=settings.draws,
-        by_region=settings.by_region,
-        pipeline=settings.pipeline,
-        extras=(
-            partial(figures_extra, tell=tell, contrasts=settings.contrasts, split=split),
-            partial(pictures_extra, tell=tell, root=stored, contrasts=settings.contrasts, kept=stored),
-        ),
-        submissions=submissions_for(board_of([stored]), submissions, tell=tell),
-    )
-    with laid_out(request) as laid:
-        return make_board(laid, tell=tell)
+    found = submissions_for(board_of([stored]), submissions, tell=tell)
+    return score_all(replace(request_of([stored], board=board, root=stored), submissions=found), tell=tell)

@@ -123,6 +123,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "boardtasks": None,
     "entries": None,
     "contestants": None,
+    "judging": None,
     "apart": None,
     "boards": None,
     "boardfigures": None,

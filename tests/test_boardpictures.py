@@ -8,9 +8,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
-from sasgeo_bench.boardpictures import CASE_BYTES, MOST_BYTES, REGION_BYTES, SUITE_BYTES, pictures_extra
+from sasgeo_bench.boardpictures import CASE_BYTES, MOST_BYTES, REGION_BYTES, SUITE_BYTES, pictures_extra, words_of
 from sasgeo_bench.boards import ScoreRequest, make_board
 from sasgeo_bench.casepanels import Case, read_picture, said_of
 from sasgeo_bench.errors import StoreError
@@ -139,14 +140,27 @@ def case_at(root, suite, region, number=0, **changes):
 @pytest.mark.parametrize("asked", [*ASKED, ("no-priors", "town-riverside")])
 def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, asked, prediction):
     changes = {} if prediction == "answer" else {"prediction": prediction}
-    case, about = case_at(root, *asked, p_false={"margin": 0.25}, accepted={"margin": True}, **changes)
+    said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
+    case, about = case_at(root, *asked, **said, **changes)
     first, again = (case_pixels(read_picture(case, root / "regions" / asked[1], about)) for _ in range(2))
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert fitted(first, CASE_BYTES) == fitted(again, CASE_BYTES)
     text = "\n".join(read_picture(case, root / "regions" / asked[1], about).said)
-    assert "P(false) margin: 0.25, accepted" in text
+    assert "P(false) sure: 0.25, accepted" in text
+    assert "margin (an order, no probability): 0.5\n" in text
     assert ("margin_nats: 1.25 nat" in text) == (prediction == "answer")
+
+
+def test_what_orders_answers_alone_is_told_apart_from_a_probability():
+    rows = pd.DataFrame({"query_id": ["q"], "p_right": [0.25], "accepted_0.05": [True], "is_answered": [True]})
+    words = {
+        ("mine", "margin"): rows.assign(is_calibrated=False).set_index("query_id"),
+        ("mine", "own"): rows.set_index("query_id"),
+    }
+    said = words_of(words, "mine", "q")
+    assert (said["orders"], said["p_false"]) == ({"margin": 0.75}, {"own": 0.75})
+    assert said["accepted"] == {"margin": True, "own": True}
 
 
 def test_the_map_of_a_case_holds_both_places(root):
@@ -204,7 +218,12 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
         assert "\n" not in err.strip().splitlines()[-1]
         return err
 
-    assert "was asked no query 'zz'; the nearest are " in fault(run, "--query", "zz")
+    assert "was asked no query 'zz'; 'inspect " in fault(run, "--query", "zz")
+    assert "lists some that went wrong" in fault(run, "--query", "zz")
+    known = taskdir.read_ids(root / "tasks" / "alias" / "town-grid+alias")[0]
+    assert f"did you mean {known}?" in fault(run, "--query", known[:-1] + "z")
+    assert "--query is empty: name the beginning of an id" in fault(run, "--query", "")
+    assert "draws a query of a task or a run" in fault("crossfit", "--query", known)
     assert "queries begin with" in fault(run, "--query", next(_beginnings(root)))
     out = shutil.copytree(root, tmp_path / "out", symlinks=True)
     for kind in ("tasks", "truth"):

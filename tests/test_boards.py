@@ -225,6 +225,17 @@ def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_
     assert {"present 0.9", "present 0.7", "present 0.5"} < set(pooled["stratum"])
 
 
+def test_no_figure_hangs_on_how_many_processes_judge(out, tmp_path, split):
+    rejectors = ["sasgeo_bench.sasgeo.rejectors:SasgeoLogistic", "margin"]
+    submission(out, tmp_path / "mine.parquet")
+    submission(out, tmp_path / "yours.parquet", keep=lambda at: at % 2)
+    files = [tmp_path / name for name in ("mine.parquet", "yours.parquet")]
+    one, two = (board_of(out, *files, rejectors=rejectors, split=split, jobs=jobs) for jobs in (1, 2))
+    pd.testing.assert_frame_equal(one.table, two.table)
+    assert one.judged.keys() == two.judged.keys()
+    assert one.remarks == two.remarks
+
+
 def test_a_rejector_that_is_not_applied_says_why(out, split):
     lines = []
     run(plan_run(RunRequest(spec="random", tasks=[out / "tasks" / "clean" / TOWNS[0]], out=out)), tell=lambda _: None)

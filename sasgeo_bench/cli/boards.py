@@ -4,23 +4,20 @@
 import re
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 from rich.table import Table
 
-from sasgeo_bench.boardfigures import figures_extra
-from sasgeo_bench.boardpictures import pictures_extra
-from sasgeo_bench.boards import Board, ScoreRequest, make_board
+from sasgeo_bench.boards import Board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.packing import board_of, laid_out, stored_among, stored_settings
+from sasgeo_bench.packing import board_of, request_of, score_all
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
-from sasgeo_bench.store.catalog import find_pipeline_file, find_split, read_pipeline_file
+from sasgeo_bench.store.catalog import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.submissions import submissions_for
 
 CONTROL_FAILED: Final = 3  # exit status
@@ -67,6 +64,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         int | None,
         typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
     ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="processes that fit rejectors")] = 1,
     cases: Cases = True,
     out: Out = Path("out"),
 ) -> None:
@@ -77,35 +75,20 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     if truth is not None and not truth.is_dir():
         message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
         raise ConfigError(message)
-    stored = stored_settings(predictions)
     submitted = submissions_for(board_of(predictions), submissions, tell=tell) if submissions else ()
-    chosen = find_split(split or stored.split or "crossfit", folders=region_folders or ())
-    figures = partial(figures_extra, tell=tell, contrasts=stored.contrasts, split=chosen)
-    request = ScoreRequest(
-        predictions=predictions,
+    root = out if truth is None else truth.resolve().parent
+    usual = request_of(predictions, board=out / "boards" / name, root=root, split=split, folders=region_folders or ())
+    request = replace(
+        usual,
         tasks=tasks or (),
-        root=out if truth is None else truth.resolve().parent,
         truth=truth,
-        split=chosen,
-        contrasts=stored.contrasts,
-        rejectors=rejector or stored.rejectors,
-        board=out / "boards" / name,
-        draws=draws or stored.draws,
-        by_region=stored.by_region,
-        pipeline=stored.pipeline,
+        rejectors=rejector or usual.rejectors,
+        draws=draws or usual.draws,
         without=without or (),
         submissions=submitted,
+        jobs=jobs,
     )
-    with laid_out(request) as laid:
-        pictures = partial(
-            pictures_extra,
-            tell=tell,
-            root=laid.root,
-            contrasts=stored.contrasts,
-            kept=stored_among(predictions),
-            has_cases=cases,
-        )
-        board = make_board(replace(laid, extras=(figures, pictures)), tell=tell)
+    board = score_all(request, tell=tell, has_cases=cases)
     show_board(board)
     typer.echo(str(request.board))
     tell(_how_to_publish(request.board))

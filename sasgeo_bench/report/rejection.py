@@ -6,7 +6,6 @@ A matcher's own confidence stands beside the rejectors as one that needs no fit.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.metrics.base import Bools, Floats
 from sasgeo_bench.metrics.decisions import Answers, accept
 from sasgeo_bench.metrics.integrity import choose_threshold
-from sasgeo_bench.plugins import load_rejector
+from sasgeo_bench.plugins import rejector_maker
 from sasgeo_bench.rejector import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.results import Prediction, told
 from sasgeo_bench.score import NOT_APPLICABLE
@@ -24,6 +23,7 @@ from sasgeo_bench.split import Split
 
 OWN: Final = "own"  # what a board calls a matcher's own confidence; no rejector can have the name
 RISKS: Final = (0.01, 0.05)
+_SAID: Final = ("p_right", "remark", "is_calibrated")
 _PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
 
 Make = Callable[[], Rejector]
@@ -64,14 +64,15 @@ def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
         if split is None:
             message = "rejectors are fitted on the calibration places of a split: name one with --split"
             raise ConfigError(message)
-        card = load_rejector(spec).card
+        make = rejector_maker(spec)
+        card = make().card
         if named.setdefault(card.name, spec) != spec:
             message = f"{named[card.name]} and {spec} are both named {card.name!r}: rename one, or leave it out"
             raise ConfigError(message)
         if card.name == OWN:
             message = f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
             raise ConfigError(message)
-        found[card.name] = Rule(card=card, make=partial(load_rejector, spec), split=split)
+        found[card.name] = Rule(card=card, make=make, split=split)
     return found
 
 
@@ -139,8 +140,9 @@ def judge(
     Returns
     -------
     pandas.DataFrame
-        The rows that were tested, with the columns `p_right` (NaN without an answer), `accepted_<risk>` for each of
-        `RISKS`, `is_own_calibration`, and `remark`, what the rejector said of its fit.
+        The rows that were tested, with the columns `p_right` (NaN without an answer), `is_calibrated` (else that is an
+        order and no chance), `accepted_<risk>` for each of `RISKS`, `is_own_calibration`, and `remark`, what the
+        rejector said of its fit.
     """
     frames = []
     usable = scores[scores["status"] != NOT_APPLICABLE]
@@ -149,7 +151,7 @@ def judge(
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
-    return _together(frames, [*scores.columns, "p_right", "remark", *map(_accepted, RISKS), "is_own_calibration"])
+    return _together(frames, [*scores.columns, *_SAID, *map(_accepted, RISKS), "is_own_calibration"])
 
 
 def remarks_of(judged: pd.DataFrame) -> list[str]:
@@ -205,8 +207,8 @@ def own_word(scores: pd.DataFrame, split: Split | None = None, *, is_taught: boo
     Returns
     -------
     pandas.DataFrame
-        As of `judge`, with `accepted_<risk>` NaN where no place calibrates. Only tracks and prior groups in which some
-        answer has a confidence; an answer without one is trusted least.
+        As of `judge`, with `accepted_<risk>` NaN where no place calibrates, and always a chance. Only tracks and prior
+        groups in which some answer has a confidence; an answer without one is trusted least.
 
     Examples
     --------
@@ -248,7 +250,7 @@ def _judged(
     test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
 ) -> pd.DataFrame:
     p_false, remark = _fit_and_say(make, calibration, test, predictions)
-    asked = test.assign(p_right=1.0 - p_false, remark=remark)
+    asked = test.assign(p_right=1.0 - p_false, remark=remark, is_calibrated=make().card.is_calibrated)
     known = calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
     return asked.assign(**_accepted_rows(known, asked))
 

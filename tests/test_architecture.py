@@ -118,7 +118,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("measures", "rows", "strata", "steps", "tables", "rejection", "integrity", "contrasts", "falsifiers"),
         *("controls", "costs", "text", "latex", "protection", "cases"),
         *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots"),
-        *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "siteplots", "site"),
+        *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "coast", "siteplots", "site"),
     ),
     "boardtasks": None,
     "entries": None,

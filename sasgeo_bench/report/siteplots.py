@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from sasgeo_bench.ageing.ratebook import Estimate, RateBook
+from sasgeo_bench.report.coast import COASTS
 from sasgeo_bench.report.sitepages import PlaceOnMap
 from sasgeo_bench.store.boardplot import FAINT, GREY, Page, look_of, page
 from sasgeo_bench.taxonomy import load_taxonomy
@@ -38,7 +39,7 @@ def draw_places(path: Path, places: Sequence[PlaceOnMap]) -> None:
     about = Page(
         title="Places of this board",
         note="Numbers: as in the table. Hollow: made-up towns, which lie where they lie only so that they have "
-        "coordinates. Plain longitude and latitude; no coast is drawn.",
+        "coordinates. Plain longitude and latitude; coasts: Natural Earth.",
         below="longitude (deg)",
         columns=len(panels),
         panel_inches=(3.6, 2.9) if len(panels) > 1 else (5.4, 3.2),
@@ -73,6 +74,8 @@ def _draw_spots(chart: Axes, places: Sequence[PlaceOnMap], parts: Sequence[str])
         chart.annotate(
             str(item.number), at, xytext=(3.5, 3.0), textcoords="offset points", fontsize=_LABEL_POINTS, color=GREY
         )
+    for line in COASTS:
+        chart.plot(line[:, 0], line[:, 1], color=GREY, lw=0.5, alpha=0.6, zorder=1)
     for values, limits in ((lon, chart.set_xlim), (lat, chart.set_ylim)):
         limits(float(values.min()) - _MARGIN_DEG, float(values.max()) + _MARGIN_DEG)
     chart.grid(visible=True, color=FAINT, lw=0.6)

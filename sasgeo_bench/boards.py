@@ -27,7 +27,7 @@ from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
-from sasgeo_bench.report.rejection import OWN, remarks_of, rules_of
+from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
 from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
@@ -176,18 +176,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
         tell(f"{entry.name}: {_in_words(frame)}")
-    judgings = [
-        Judging(
-            matcher=entry.name,
-            scores=scores[entry.name],
-            predictions=predictions[entry.name],
-            rules=rules,
-            split=request.split,
-            is_taught=entry.is_taught,
-        )
-        for entry in entries
-    ]
-    for judged in carry_out(judgings, jobs=request.jobs):
+    for judged in carry_out(_judgings(entries, scores, predictions, rules, request.split), jobs=request.jobs):
         rows += judged.rows
         all_judged |= {(judged.matcher, name): said for name, said in judged.said.items()}
         for line in judged.lines:
@@ -215,6 +204,27 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     )
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _judgings(
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    predictions: Mapping[str, Mapping[str, Prediction]],
+    rules: Mapping[str, Rule],
+    split: Split | None,
+) -> list[Judging]:
+    """What rejectors are to judge: the answers of each contestant."""
+    return [
+        Judging(
+            matcher=entry.name,
+            scores=scores[entry.name],
+            predictions=predictions[entry.name],
+            rules=rules,
+            split=split,
+            is_taught=entry.is_taught,
+        )
+        for entry in entries
+    ]
 
 
 def _apart(

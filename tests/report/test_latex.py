@@ -23,8 +23,8 @@ PAPER = r"""\documentclass{article}
 pytestmark = pytest.mark.skipif(TEX is None, reason="no TeX is installed: Debian has texlive-latex-recommended")
 
 
-def is_set(tables: str, folder: Path) -> str:
-    """Set a paper that holds nothing but some tables; what TeX said."""
+def paper_of(tables: str, folder: Path) -> Path:
+    """Set a paper that holds nothing but some tables."""
     # As the head of the file tells: whoever sets tables too wide shrinks them; and one page for each, as floats.
     shrunk = tables.replace(r"\begin{tabular}", r"\resizebox{\linewidth}{!}{\begin{tabular}")
     shrunk = shrunk.replace(r"\end{tabular}", r"\end{tabular}}").replace(r"\end{table}", "\\end{table}\n\\clearpage")
@@ -35,8 +35,7 @@ def is_set(tables: str, folder: Path) -> str:
         [str(TEX), *flags, "paper.tex"], cwd=folder, capture_output=True, text=True, errors="replace", check=False
     )
     assert done.returncode == 0, done.stdout[-3000:]
-    assert (folder / "paper.pdf").stat().st_size > 1000
-    return done.stdout
+    return folder / "paper.pdf"
 
 
 def test_a_board_compiles_whatever_its_matchers_are_called(tmp_path: Path) -> None:
@@ -49,9 +48,9 @@ def test_a_board_compiles_whatever_its_matchers_are_called(tmp_path: Path) -> No
         "*",
     )
     board = leaderboard({name: asked(0.5) for name in names}, draws=200)
-    is_set(board_latex(board, about_of([])), tmp_path)
+    assert paper_of(board_latex(board, about_of([])), tmp_path).is_file()
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*/leaderboard.tex")), ids=lambda path: path.parent.name)
 def test_stored_results_compile(path: Path, tmp_path: Path) -> None:
-    is_set(path.read_text(encoding="utf-8"), tmp_path)
+    assert paper_of(path.read_text(encoding="utf-8"), tmp_path).is_file()

@@ -20,7 +20,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@printf '\nVariables: REGION=<id> PIPELINE=<id> DATE=<yyyy-mm-dd> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
+	@printf '\nVariables: REGION=<id> PIPELINE=<id> RESULTS=<folder to store a board in> DATE=<yyyy-mm-dd> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
 
 # Rebuilt when the lock or the packages' own metadata change; otherwise nothing runs, so a second call is quick.
 $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
@@ -52,9 +52,9 @@ queries: $(STAMP) ## draw every suite on the towns, and on each real region whos
 	$(SASGEO) make-queries --up-to --skip $(if $(N),--n $(N)) $(if $(SEED),--seed $(SEED)) \
 	  $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
 
-leaderboard: $(STAMP) ## carry out an experiment of pipelines/: PIPELINE=demo, or a file; goes on where it was cut off
-	@test -n "$(PIPELINE)" || { echo "name the pipeline: make leaderboard PIPELINE=demo (pipelines/ holds all)" >&2; exit 2; }
-	$(SASGEO) leaderboard $(PIPELINE) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
+leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, or a file; goes on where it was cut off
+	$(SASGEO) leaderboard $(or $(PIPELINE),leaderboard) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
+	  $(if $(RESULTS),--results "$(RESULTS)") --out $(OUT) $(ARGS)
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(ARGS)
@@ -83,6 +83,9 @@ figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extra
 	$(SASGEO) build-region vaduz --date 2015-07-27 --extracts "$(EXTRACTS)" --out $(OUT)
 	$(SASGEO) lookalike vaduz@2015-07-27 --world vaduz --out $(OUT)
 	cp $(OUT)/sheets/lookalike-vaduz-2015-07-27.png docs/figures/lookalike.png
+	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/regions/vaduz/preview.png docs/figures/region.webp
+	$(SASGEO) publish --board docs/results/leaderboard --into $(OUT)/public
+	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/public/index.html docs/figures/board.webp
 
 docs: $(STAMP) ## run the examples in the docstrings and follow the links between the documents; builds no site
 	$(VENV_PYTHON) -m pytest -q -p no:benchmark sasgeo_bench

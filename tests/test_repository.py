@@ -111,8 +111,9 @@ def test_the_licence_is_apache_and_the_data_licence_names_its_duties() -> None:
 
 
 def test_no_file_is_larger_than_half_a_megabyte() -> None:
-    # Answers of others have a limit of their own, which `read_submission` holds.
-    files = [path for path in repository_files() if not path.match("submissions/*/predictions/*.parquet")]
+    # Answers of others and stored results have limits of their own, which `read_submission` and test_results.py hold.
+    apart = ("submissions/*/predictions/*.parquet", "docs/results/*/*", "docs/results/*/*/*")
+    files = [path for path in repository_files() if not any(path.match(pattern) for pattern in apart)]
     large = [str(path.relative_to(ROOT)) for path in files if path.stat().st_size > MAX_FILE_BYTES]
     assert large == []
 
@@ -225,6 +226,12 @@ def test_the_package_says_the_version_it_is_released_under() -> None:
 
 def test_the_baselines_ask_for_the_package_by_its_name() -> None:
     assert requirement_names(project("baselines/pyproject.toml")["dependencies"]) == {project()["name"], "scikit-learn"}
+
+
+def test_the_version_to_cite_is_that_of_the_package() -> None:
+    version = project()["version"]
+    assert re.search(r"^version: (.*)$", read("CITATION.cff"), flags=re.MULTILINE)[1] == version
+    assert re.search(r"version = \{(.*)\}", read("README.md"))[1] == version
 
 
 @pytest.mark.parametrize("folder", SHIPPED)

@@ -14,6 +14,7 @@ from sasgeo_bench.store.packfile import MOST_BYTES
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 BOARDS = sorted(folder.name for folder in RESULTS.glob("*/") if folder.is_dir())
+PROGRAM = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.DOTALL)
 ROW = re.compile(r"^\|(?!---).*\|$", re.MULTILINE)
 
 pytestmark = pytest.mark.skipif(not BOARDS, reason="no results are stored yet")
@@ -45,3 +46,12 @@ def test_every_row_of_a_table_on_the_page_stands_on_a_board():
     rows = ROW.findall((RESULTS / "README.md").read_text(encoding="utf-8"))
     assert len(rows) > len(BOARDS)
     assert [row for row in rows if row not in boards] == []
+
+
+def test_every_program_on_the_page_prints_what_the_page_says(monkeypatch, capsys):
+    monkeypatch.chdir(RESULTS.parents[1])
+    found = PROGRAM.findall((RESULTS / "README.md").read_text(encoding="utf-8"))
+    assert len(found) > 1
+    for program, said in found:
+        exec(program, {})  # noqa: S102 - of our own page
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == said.splitlines()

@@ -440,6 +440,7 @@ def _stanford(chart: Axes, item: ToldLevels, cells: pd.DataFrame, limit_m: float
         marker="s",
         s=13,
         linewidths=0,
+        rasterized=True,  # thousands of squares, each with a style of its own, are most of a site else
     )
     total = len(item.level_m)
     at = {"unavailable": (0.04, 0.93), "misleading": (0.3, 0.03), "hazardous": (0.99, 0.3)}

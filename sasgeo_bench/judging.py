@@ -2,13 +2,11 @@
 """What rejectors say of the answers of many contestants, and the figures of it, by several processes."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing import get_context
-from signal import SIG_DFL, SIGINT, signal
 
 import pandas as pd
 
+from sasgeo_bench.processes import spread
 from sasgeo_bench.report.integrity import integrity_rows
 from sasgeo_bench.report.rejection import OWN, Rule, judge, own_word, why_not
 from sasgeo_bench.report.rows import to_frame
@@ -79,12 +77,7 @@ def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]
     >>> list(carry_out([], jobs=2))
     []
     """
-    if jobs == 1 or len(judgings) < 2:  # noqa: PLR2004 - one contestant is no work to share
-        yield from map(judged, judgings)
-        return
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=signal, initargs=(SIGINT, SIG_DFL)) as pool:
-        yield from pool.map(judged, judgings)
+    yield from spread(judged, judgings, jobs=jobs)
 
 
 def judged(judging: Judging) -> Judged:

@@ -2,13 +2,11 @@
 """Many requests -> tasks on disk, by several processes."""
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
-from signal import SIG_DFL, SIGINT, signal
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.processes import spread
 from sasgeo_bench.request import Request
 from sasgeo_bench.tasks import ensure_tasks
 
@@ -47,13 +45,7 @@ def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
     >>> list(carry_out([], jobs=2))
     []
     """
-    if jobs == 1 or len(requests) < 2:  # noqa: PLR2004 - one request is no work to share
-        yield from map(_carry_out, requests)
-        return
-    # An interrupt ends the processes where they are: what they write is whole or not there, and the next run goes on.
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=signal, initargs=(SIGINT, SIG_DFL)) as pool:
-        yield from pool.map(_carry_out, requests)
+    yield from spread(_carry_out, requests, jobs=jobs)
 
 
 def _carry_out(request: Request) -> Drawn:

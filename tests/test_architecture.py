@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # nothing imports it.
 HOUSE: dict[str, tuple[str, ...] | None] = {
     "errors": None,
+    "processes": None,
     "tomlfile": None,
     "angles": None,
     "pose": None,

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that draw queries and list the suites they are drawn by."""
 
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +10,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import ExtractFolders, Out, print_table, tell
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.processes import spread
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.suites.all_suites import EVERY_SUITE, SUITES, find_suite
@@ -80,13 +79,8 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
     for item in requests:
         by_region.setdefault(item.region.id, []).append(item)
     work = partial(_make_all, skip=skip)
-    if jobs == 1 or len(by_region) == 1:
-        for items in by_region.values():
-            work(items)
-        return
-    with ProcessPoolExecutor(max_workers=jobs, mp_context=get_context("spawn")) as pool:
-        for _ in pool.map(work, by_region.values()):
-            pass
+    for _ in spread(work, list(by_region.values()), jobs=jobs):
+        pass
 
 
 def _make_all(requests: list[Request], *, skip: bool) -> None:

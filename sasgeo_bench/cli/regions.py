@@ -2,8 +2,6 @@
 """Commands that build regions and list them."""
 
 import datetime as dt
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +17,7 @@ from sasgeo_bench.cli.console import (
     read_date,
     tell,
 )
+from sasgeo_bench.processes import spread
 from sasgeo_bench.store.catalog import (
     find_region_file,
     list_region_files,
@@ -44,16 +43,11 @@ def build_region_command(
     if dry_run:
         typer.echo("\n".join(plan.to_text() for plan in plans))
         return
-    if jobs == 1 or len(plans) == 1:
-        for plan in plans:
-            build_region(plan, tell=tell)
-        return
-    with ProcessPoolExecutor(max_workers=jobs, mp_context=get_context("spawn")) as pool:
-        for _ in pool.map(_build_quietly, plans):
-            pass
+    for _ in spread(_build, plans, jobs=jobs):
+        pass
 
 
-def _build_quietly(plan: BuildPlan) -> None:
+def _build(plan: BuildPlan) -> None:
     """Build in a process of its own; only there because a process pool needs a function it can name."""
     build_region(plan, tell=tell)
 

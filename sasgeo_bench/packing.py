@@ -50,7 +50,9 @@ class Stored:
         )
 
 
-def pack_board(board: Board, request: ScoreRequest, folder: Path, *, most_bytes: int = MOST_BYTES) -> Stored:
+def pack_board(
+    board: Board, request: ScoreRequest, folder: Path, *, lacks: str = "", most_bytes: int = MOST_BYTES
+) -> Stored:
     """Store a board that was just written.
 
     Parameters
@@ -59,6 +61,8 @@ def pack_board(board: Board, request: ScoreRequest, folder: Path, *, most_bytes:
         What came of what was asked for.
     folder : Path
         To write; older results there are replaced.
+    lacks : str
+        What the stored results that were scored had left out already.
     most_bytes : int
         Of all files together.
 
@@ -86,7 +90,13 @@ def pack_board(board: Board, request: ScoreRequest, folder: Path, *, most_bytes:
     ids = {name: read_ids(item.task) for name, item in zip(names, tasks, strict=True)}
     runs = {entry.name: list(_runs_of(entry, board, ids)) for entry in board.everyone}
     packed = write_pack(
-        folder, board=request.board, tasks=tasks, runs=runs, settings=_settings_of(request), most_bytes=most_bytes
+        folder,
+        board=request.board,
+        tasks=tasks,
+        runs=runs,
+        settings=_settings_of(request),
+        lacks=lacks,
+        most_bytes=most_bytes,
     )
     return Stored(folder=folder, packed=packed)
 
@@ -208,7 +218,7 @@ def request_of(
     )
 
 
-def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True) -> Board:
+def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True, results: Path | None = None) -> Board:
     """Score what is asked for, stored results laid out, and write the board with its figures and pictures.
 
     Parameters
@@ -219,12 +229,17 @@ def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True) -> B
         Gets a line now and then.
     has_cases : bool
         Whether queries that went wrong are shown, with their truths.
+    results : Path, optional
+        Folder to store the board in, with all it was made of: under its name.
 
     Raises
     ------
     ConfigError, StoreError
-        As `laid_out` and `make_board` do.
+        As `laid_out`, `make_board` and `pack_board` do, or if the board to be stored is of a part of the queries.
     """
+    if results is not None:
+        _check_whole(request)
+    kept = stored_among(request.predictions)
     with laid_out(request) as laid:
         figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
         pictures = partial(
@@ -232,10 +247,28 @@ def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True) -> B
             tell=tell,
             root=laid.root,
             contrasts=request.contrasts,
-            kept=stored_among(request.predictions),
+            kept=kept,
             has_cases=has_cases,
         )
-        return make_board(replace(laid, extras=(figures, pictures)), tell=tell)
+        board = make_board(replace(laid, extras=(figures, pictures)), tell=tell)
+        if results is not None:
+            lacks = "" if kept is None else str(read_settings(kept)["dropped"])
+            tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())
+        return board
+
+
+def _check_whole(request: ScoreRequest) -> None:
+    """Stored results hold every query that was asked, and answers of runs alone: said before an hour is lost."""
+    if request.without:
+        message = "a board without some regions is not stored: leave --without or --results away"
+        raise ConfigError(message)
+    if request.submissions:
+        message = "submissions stay apart from the results of their board: leave --submissions or --results away"
+        raise ConfigError(message)
+    submitted = next((path for path in request.predictions if path.is_file()), None)
+    if submitted is not None:
+        message = f"{submitted} is a file of predictions: only boards of runs are stored"
+        raise ConfigError(message)
 
 
 def stored_among(predictions: Sequence[Path]) -> Path | None:

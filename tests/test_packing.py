@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -12,7 +13,7 @@ import pytest
 from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import ScoreRequest
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.packing import laid_out, pack_board, stored_settings
+from sasgeo_bench.packing import laid_out, pack_board, score_all, stored_settings
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.query import base_of
@@ -155,6 +156,42 @@ def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
     for name in TABLES:
         first = pd.read_parquet(plan.out / "boards" / "kept" / f"{name}.parquet")
         pd.testing.assert_frame_equal(first, pd.read_parquet(tmp_path / "out" / "boards" / "again" / f"{name}.parquet"))
+
+
+def test_stored_again_nothing_but_the_board_changes(kept, program, tmp_path):
+    board, plan, folder, _ = kept
+    program("score", "--predictions", folder, "--name", "kept", "--results", tmp_path / "same", "--out", tmp_path)
+    files = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    place = tmp_path / "same" / "kept"
+    assert {path.relative_to(place): path.read_bytes() for path in place.rglob("*") if path.is_file()} == files
+    lean = tmp_path / "lean" / "kept"  # what is left out stays said
+    total = pack_board(board, request_of(plan), lean).packed.total_bytes
+    for _ in range(2):  # without pictures, then without headings
+        total = pack_board(board, request_of(plan), lean, most_bytes=total - 1).packed.total_bytes
+    dropped = read_settings(lean)["dropped"]
+    assert "heading and scale" in dropped
+    _, _, err = program("score", "--predictions", lean, "--name", "kept", "--results", lean.parent, "--out", tmp_path)
+    assert read_settings(lean)["dropped"] == dropped, err
+
+
+@pytest.mark.parametrize(
+    ("flag", "words"),
+    [
+        ("--without", "a board without some regions is not stored: leave --without or --results away"),
+        ("--predictions", r"mine.parquet is a file of predictions: only boards of runs are stored"),
+        ("--submissions", "submissions stay apart from the results of their board: leave --sub"),
+    ],
+)
+def test_what_is_no_whole_board_of_runs_is_not_stored(kept, tmp_path, flag, words):
+    _, _, folder, _ = kept
+    (tmp_path / "mine.parquet").touch()
+    more = {"--predictions": {"predictions": [folder, tmp_path / "mine.parquet"]}}.get(
+        flag, {flag.removeprefix("--"): ("mine",)}
+    )
+    asked = ScoreRequest(predictions=[folder], root=tmp_path, board=tmp_path / "board")
+    with pytest.raises(ConfigError, match=words):
+        score_all(replace(asked, **more), tell=lambda _: None, results=tmp_path / "results")
+    assert not (tmp_path / "results").exists()
 
 
 def request_of(plan):

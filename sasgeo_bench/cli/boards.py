@@ -24,6 +24,10 @@ CONTROL_FAILED: Final = 3  # exit status
 Cases = Annotated[
     bool, typer.Option("--cases/--no-cases", help="show queries that went wrong on the board, with their truths")
 ]
+Results = Annotated[
+    Path | None,
+    typer.Option(help="folder to store the board in with all it was made of, at most 20 MB: DIR/<name of the board>/"),
+]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
@@ -65,6 +69,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes that fit rejectors")] = 1,
+    results: Results = None,
     cases: Cases = True,
     out: Out = Path("out"),
 ) -> None:
@@ -88,7 +93,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         submissions=submitted,
         jobs=jobs,
     )
-    board = score_all(request, tell=tell, has_cases=cases)
+    board = score_all(request, tell=tell, has_cases=cases, results=results)
     show_board(board)
     typer.echo(str(request.board))
     tell(_how_to_publish(request.board))
@@ -108,9 +113,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
-    results: Annotated[
-        Path | None, typer.Option(help="folder to store the board in with all it was made of, at most 20 MB: DIR/<id>/")
-    ] = None,
+    results: Results = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
     ] = False,

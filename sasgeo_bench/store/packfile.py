@@ -23,7 +23,7 @@ from sasgeo_bench.errors import MatchError, SasgeoError, StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store import learnedfile, rundir, taskdir
 from sasgeo_bench.store.boardfile import FIGURES, LEADERBOARD, PICTURES
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.regiondir import MANIFEST, fresh_folder, locked
@@ -42,6 +42,7 @@ _PAGE_BYTES: Final = 2**24  # what is alike is told once in a page: few pages, s
 _CSV: Final = f"{LEADERBOARD}.csv"
 _TASK: Final = "task"  # column: number of the row in tasks.parquet
 _TEXTS: Final = ("query_id", "track", "suite", "part", "region", "prior_group", "status", "message")
+_AND: Final = "; "
 _NO_PICTURES: Final = "pictures of regions, suites and cases"
 _NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
 
@@ -81,6 +82,7 @@ def write_pack(
     tasks: Sequence[TaskFolders],
     runs: Mapping[str, Sequence[StoredRun]],
     settings: Mapping[str, Any],
+    lacks: str = "",
     most_bytes: int = MOST_BYTES,
 ) -> Packed:
     """Store a board with what it was made of, whole or not at all.
@@ -97,6 +99,8 @@ def write_pack(
         By contestant, in the order they were read.
     settings : mapping
         How it was scored.
+    lacks : str
+        What stored results it was made of had left out already.
     most_bytes : int
         Of all files together. What is larger is written without pictures, then without headings and scales of the poses
         beside the first, and then with figures as .svg.gz.
@@ -119,15 +123,15 @@ def write_pack(
             _squeeze(scratch / _CSV)
             _write_tasks(scratch, tasks)
             _write_runs(scratch, runs)
-            said, dropped = {**settings, "contestants": list(runs)}, ""
+            said, dropped = {**settings, "contestants": list(runs)}, lacks
             found = _write_predictions(scratch, runs, is_lean=False)
             _write_settings(scratch, said, dropped)
             if _bytes_of(scratch) > most_bytes and (scratch / PICTURES).is_dir():
                 shutil.rmtree(scratch / PICTURES)
-                dropped = _NO_PICTURES
+                dropped = _with(dropped, _NO_PICTURES)
                 _write_settings(scratch, said, dropped)
             if _bytes_of(scratch) > most_bytes:
-                dropped = "; ".join(filter(None, (dropped, _NO_HEADINGS)))
+                dropped = _with(dropped, _NO_HEADINGS)
                 found = _write_predictions(scratch, runs, is_lean=True)
                 _write_settings(scratch, said, dropped)
             if _bytes_of(scratch) > most_bytes:  # they are drawn again where results are scored
@@ -145,6 +149,11 @@ def write_pack(
         raise StoreError(message) from error
     count = sum(len(run.predictions) for listed in runs.values() for run in listed)
     return Packed(total_bytes=total, prediction_bytes=found, predictions=count, dropped=dropped)
+
+
+def _with(dropped: str, more: str) -> str:
+    """What was left out, and one thing more, each once."""
+    return _AND.join(dict.fromkeys(filter(None, (*dropped.split(_AND), more))))
 
 
 def _write_settings(folder: Path, said: Mapping[str, Any], dropped: str) -> None:
@@ -420,6 +429,8 @@ def _lay_runs(folder: Path, runs: pa.Table, asked: Mapping[str, str], into: Path
     for listed in by_name.values():
         stem = _folder_name(_file_of(listed[0]["about"]))
         table, start = pq.read_table(folder / _PREDICTIONS / f"{stem}.parquet"), 0
+        if (folder / _LEARNED / stem).is_dir():
+            shutil.copytree(folder / _LEARNED / stem, into / "runs" / stem / learnedfile.FOLDER)
         for row in listed:
             about, count = row["about"], row["rows"]
             place = into / "runs" / stem / _folder_name(about["suite"]) / _folder_name(about["region"])

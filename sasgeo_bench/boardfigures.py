@@ -39,6 +39,7 @@ from sasgeo_bench.store.boardfile import Extra
 Draw = Callable[[Path], None]
 Named = Iterator[tuple[str, Draw]]
 
+MOST_STANFORD: Final = 5  # matchers
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
 
 
@@ -50,7 +51,7 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
     board : Board
         In memory.
     tell : callable
-        Gets a line for each kind of figure that there are no data for.
+        Gets a line that names the kinds of figures there are no data for, if any.
     contrasts : sequence of Contrast
         Those that were registered, as of the board.
     split : Split, optional
@@ -95,13 +96,11 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         ),
         "protection levels against errors": _stanfords(board, shown, split),
     }
-    found: dict[str, Draw] = {}
-    for kind, named in kinds.items():
-        drawn = {f"{name}.svg": draw for name, draw in named}
-        if not drawn:
-            tell(f"no figure of {kind}: the board holds nothing to draw there")
-        found |= drawn
-    return Extra(figures=found)
+    drawn = {kind: {f"{name}.svg": draw for name, draw in named} for kind, named in kinds.items()}
+    empty = [kind for kind, named in drawn.items() if not named]
+    if empty:
+        tell(f"figures left out, for nothing on this board is seen in them: {', '.join(empty)}")
+    return Extra(figures={name: draw for named in drawn.values() for name, draw in named.items()})
 
 
 def _file_name(*parts: str) -> str:
@@ -140,11 +139,14 @@ def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
 
 
 def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named:
+    """A panel for each matcher and method: of few matchers, those of contrasts first; nobody reads forty panels."""
     found: dict[tuple[str, float], dict[tuple[str, str], ToldLevels]] = {}
     for matcher in (name for name in shown if name in board.scores):
         for item in told_levels(board.scores[matcher], board.predictions[matcher], split):
-            if len(item.level_m):
-                found.setdefault((item.prior_group, item.risk), {})[matcher, item.method] = item
+            key = item.prior_group, item.risk
+            rows = {name for name, _ in found.get(key, ())} | {matcher}
+            if len(item.level_m) and len(rows) <= MOST_STANFORD:
+                found.setdefault(key, {})[matcher, item.method] = item
     for (prior_group, risk), told in sorted(found.items()):
         yield (
             _file_name("stanford", f"{risk:g}", prior_group),

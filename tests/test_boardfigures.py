@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sasgeo_bench import boardfigures
 from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boards import Board
 from sasgeo_bench.metrics.calibration import calibration_error
@@ -115,10 +116,11 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
         "reliability-localization-r500-weak-s3.svg",
         "stanford-0.01-r500-weak-s3.svg",
     }
-    assert told == [
-        f"no figure of {kind}: the board holds nothing to draw there"
-        for kind in ("success against strength", "recall against K", "worth against cost")
-    ]
+    (line,) = told
+    assert line == (
+        "figures left out, for nothing on this board is seen in them: success against strength, recall against K, "
+        "worth against cost"
+    )
     for name, draw in figures.items():
         draw(tmp_path / name)
         text = (tmp_path / name).read_text(encoding="utf-8")
@@ -139,15 +141,16 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
         "ablation-localization-r500-weak-s3.svg",
         "errors-localization-r500-weak-s3.svg",
     }
-    assert [line.split(":")[0] for line in told] == [
-        "no figure of success against the age of the map",
-        "no figure of differences by place",
-        "no figure of recall against K",
-        "no figure of worth against cost",
-        "no figure of risk against coverage",
-        "no figure of reliability",
-        "no figure of the cost of decisions",
-        "no figure of protection levels against errors",
+    (line,) = told
+    assert line.partition(": ")[2].split(", ") == [
+        "success against the age of the map",
+        "differences by place",
+        "recall against K",
+        "worth against cost",
+        "risk against coverage",
+        "reliability",
+        "the cost of decisions",
+        "protection levels against errors",
     ]
 
 
@@ -228,6 +231,20 @@ def test_areas_of_a_stanford_figure_are_those_of_the_board(board):
     cells = stanford_cells(told)
     absent = int((~table["is_present"]).sum())  # an error without end
     assert cells.loc[cells["error_m"] == BEYOND_M, "n"].sum() == absent
+
+
+def test_a_stanford_figure_is_of_few_matchers_those_of_contrasts_first(board, monkeypatch):
+    answers = dict.fromkeys(board.scores, board.predictions["graph"])
+    both = replace(board, predictions=answers)
+    name = "stanford-0.01-r500-weak-s3.svg"
+
+    def rows(contrasts=CONTRASTS):
+        drawn = figures_extra(both, tell=lambda _: None, contrasts=contrasts).figures[name]
+        return {matcher for matcher, _ in drawn.keywords["told"]}
+
+    assert rows() == {"raster", "graph"}
+    monkeypatch.setattr(boardfigures, "MOST_STANFORD", 1)
+    assert rows() == {CONTRASTS[0].second}
 
 
 @pytest.mark.parametrize("contrast", CONTRASTS, ids=lambda item: item.name)

@@ -29,6 +29,7 @@ from sasgeo_bench.report.sitetable import (
 )
 from sasgeo_bench.report.sitewords import column, prior_words
 from sasgeo_bench.report.text import interval_text
+from sasgeo_bench.score import FIX_M
 from sasgeo_bench.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.suites.base import SuiteCard
 from sasgeo_bench.taxonomy import load_taxonomy
@@ -313,12 +314,16 @@ def _judged_table(part: pd.DataFrame, name: str, title: str) -> Table:
 
 
 def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
-    """How protection levels fared, a table for each prior group and alert limit."""
+    """How protection levels fared, a table for each prior group; of one alert limit, for three fill a page thrice."""
     if not len(protection):
         return ()
+    limits = sorted(set(protection["alert_limit_m"]))
+    shown_m = FIX_M if FIX_M in limits else limits[0]
+    others = " and ".join(f"{limit:g}" for limit in limits if limit != shown_m)
+    notes = (f"Alert limits of {others} m: protection.parquet holds them.",) if others else ()
     found = []
-    for key, part in protection.groupby(["prior_group", "alert_limit_m"], sort=True):
-        prior_group, limit_m = str(key[0]), float(str(key[1]))
+    for key, part in protection[protection["alert_limit_m"] == shown_m].groupby("prior_group", sort=True):
+        prior_group = str(key)
         rows = []
         for row in part.to_dict("records"):
             shares = [_share_cell(row, area) for area in _AREAS]
@@ -327,9 +332,9 @@ def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
             rows.append(Row(cells=(*names, number_cell(float(row["risk"])), *shares, *rest)))
         words = (column("matcher", is_number=False), column("method", is_number=False))
         columns = (*words, *map(column, ("risk", *_AREAS, "n")), column("supports", is_number=False))
-        name = file_stem("protection", prior_group, f"{limit_m:g}")
-        title = f"Alert limit {limit_m:g} m, {prior_words(prior_group)}"
-        found.append(Table(name=name, title=title, columns=columns, rows=tuple(rows)))
+        title = f"Alert limit {shown_m:g} m, {prior_words(prior_group)}"
+        name = file_stem("protection", prior_group)
+        found.append(Table(name=name, title=title, columns=columns, rows=tuple(rows), notes=notes))
     return tuple(found)
 
 

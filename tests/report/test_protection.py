@@ -8,6 +8,7 @@ import pytest
 
 from sasgeo_bench.metrics.intervals import wilson
 from sasgeo_bench.report.protection import ALERT_LIMITS_M, COLUMNS, CONFORMAL, protection_frame
+from sasgeo_bench.report.sitepages import protection_tables
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.sasgeo.protection import METHODS, RISKS, SCALE, level_name
 from tests.report.test_integrity import split_of
@@ -88,3 +89,16 @@ def test_conformal_levels_are_fitted_on_other_places():
 def test_without_another_place_there_is_no_conformal_level(kind):
     table = scores(ERRORS, place="place0", part="test")
     assert protection_frame("mine", table, told(table, **{SCALE: 4.0}), split_of(kind)).empty
+
+
+def test_a_page_shows_one_alert_limit_and_says_where_the_others_are():
+    table = scores(ERRORS)
+    frame = protection_frame("mine", table, told(table, **{level_name("gauss", 1e-2): 10.0}))
+    (shown,) = protection_tables(frame)
+    assert shown.title.startswith("Alert limit 25 m, ")
+    (row,) = shown.rows
+    assert [cell.text.split()[0] for cell in row.cells[:3]] == ["mine", "gauss", "0.010"]
+    assert shown.notes == ("Alert limits of 10 and 50 m: protection.parquet holds them.",)
+    (alone,) = protection_tables(frame[frame["alert_limit_m"] == 50.0])
+    assert (alone.title[:18], alone.notes) == ("Alert limit 50 m, ", ())
+    assert protection_tables(frame[:0]) == ()

@@ -32,6 +32,7 @@ from sasgeo_bench.report.measures import primary_of
 from sasgeo_bench.report.rejection import answers_of
 
 ALPHA: Final = 0.05
+LESS_THAN_MATTERS: Final = ", by less than would matter"  # ends a verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -404,7 +405,7 @@ def _with_verdict(found: Finding) -> Finding:
     least = found.min_effect * (1.0 if found.metric == "primary" else abs(found.second_value))
     is_better = found.difference > 0 if found.metric == "primary" else found.difference < 0
     if found.p_holm <= ALPHA and (found.lo > 0 or found.hi < 0):
-        size = "" if abs(found.difference) >= least else ", by less than would matter"
+        size = "" if abs(found.difference) >= least else LESS_THAN_MATTERS
         return replace(found, verdict=f"{found.first if is_better else found.second} is better{size}")
     if -least < found.lo and found.hi < least:
         return replace(found, verdict="null: any difference is smaller than would matter")

@@ -23,6 +23,7 @@ from sasgeo_bench.split import Split
 
 OWN: Final = "own"  # what a board calls a matcher's own confidence; no rejector can have the name
 RISKS: Final = (0.01, 0.05)
+_NUMBER: Final = r"\d+(?:\.\d+)?"
 _SAID: Final = ("p_right", "remark", "is_calibrated")
 _PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
 
@@ -155,17 +156,25 @@ def judge(
 
 
 def remarks_of(judged: pd.DataFrame) -> list[str]:
-    """What a rejector said of its fits, each remark once, with how many answers it was said of.
+    """What a rejector said of its fits, with how many answers it was said of; remarks that differ in numbers are one.
+
+    A board fits hundreds of times, and what is to be known is where it does not hold, and of how much.
 
     Examples
     --------
-    >>> remarks_of(pd.DataFrame({"remark": ["", "too few", "too few"], "is_answered": [True, True, False]}))
-    ['too few (1 answer judged so)']
+    >>> remarks_of(pd.DataFrame({"remark": ["", "2 too few", "2 too few"], "is_answered": [True, True, False]}))
+    ['2 too few (1 answer judged so)']
+    >>> remarks_of(pd.DataFrame({"remark": ["2 too few", "9 too few", "9 too few"], "is_answered": True}))
+    ['9 too few (and alike in 1 fit more: 3 answers judged so)']
     """
-    counts = judged.loc[judged["is_answered"].astype(bool) & (judged["remark"] != ""), "remark"].value_counts(
-        sort=False
-    )
-    return [f"{remark} ({counted(int(count), 'answer')} judged so)" for remark, count in sorted(counts.items())]
+    said = judged.loc[judged["is_answered"].astype(bool) & (judged["remark"] != ""), "remark"]
+    found = []
+    for _, alike in said.groupby(said.str.replace(_NUMBER, "#", regex=True), sort=True):
+        counts = alike.value_counts()
+        most = min(counts.index[counts == counts.max()])
+        others = f"and alike in {counted(len(counts) - 1, 'fit')} more: " if len(counts) > 1 else ""
+        found.append(f"{most} ({others}{counted(len(alike), 'answer')} judged so)")
+    return sorted(found)
 
 
 def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:

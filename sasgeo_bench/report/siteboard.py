@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.report.contrasts import Contrast, chosen_rows
+from sasgeo_bench.report.contrasts import LESS_THAN_MATTERS, Contrast, chosen_rows
 from sasgeo_bench.report.measures import CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES, is_unranked, name_alone
 from sasgeo_bench.report.sitesource import SiteSource
@@ -34,6 +34,7 @@ from sasgeo_bench.report.sitewords import column, marks_of, prior_words
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 from sasgeo_bench.report.text import interval_text, number_text
 
+OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided")  # in the order of the page
 _LEAST_P: Final = 5e-4  # less would read as nought
 _PRIOR_ALONE: Final = "prior_centre"
 _GROUP: Final = ("suite", "track", "prior_group")
@@ -238,9 +239,9 @@ def _for_nothing(book: Book, key: Key) -> str:
 class Told:
     """A registered contrast in plain words.
 
-    `outcome` is "decided", "null" or "not decided"; `unstressed` says how both fare where they should not differ, empty
-    where nobody looked; `bar` spans from -`reach` to `reach`, with `least` of it on both
-    sides of the middle too small to matter, in per cent.
+    `outcome` is one of `OUTCOMES`; the cause of a gain is open where the falsifiers of the contrast gain, too.
+    `unstressed` says how both fare where they should not differ, empty where nobody looked; `bar` spans from -`reach`
+    to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
     """
 
     name: str
@@ -262,14 +263,13 @@ def contrasts_of(source: SiteSource) -> tuple[Told, ...]:
     ends = [abs(float(row[name])) for row in records for name in ("lo", "hi", "difference")]
     reach = max((end for end in ends if math.isfinite(end)), default=1.0) or 1.0
     told = [_told(row, source, reach) for row in records]
-    order = ("decided", "null", "not decided")
-    return tuple(sorted(told, key=lambda item: order.index(item.outcome)))
+    return tuple(sorted(told, key=lambda item: OUTCOMES.index(item.outcome)))
 
 
 def _told(row: Record, source: SiteSource, reach: float) -> Told:
     verdict, name = str(row["verdict"]), str(row["name"])
-    outcome = next((word for word in ("not decided", "null") if verdict.startswith(word)), "decided")
-    outcome = "not decided" if verdict.startswith("not tested") else outcome
+    falsifier = _falsifier_of(source.falsifiers, name)
+    outcome = _outcome(row, falsifier)
     contrast = next((item for item in source.registered if item.name == name), None)
     figure = next((item.file for item in source.figures if item.file == f"{file_stem('contrast', name)}.svg"), "")
     known = [float(row[end]) for end in ("lo", "hi", "difference")]
@@ -284,7 +284,7 @@ def _told(row: Record, source: SiteSource, reach: float) -> Told:
         headline=_headline(row, verdict, outcome),
         sentence=_sentence(row, least),
         facts=tuple(_contrast_facts(row, source, contrast)),
-        unstressed=_unstressed(source.falsifiers, name),
+        unstressed="" if falsifier is None else _unstressed(falsifier),
         why=source.reasons.get(name, ""),
         figure=figure,
         bar=bar,
@@ -295,7 +295,7 @@ def _told(row: Record, source: SiteSource, reach: float) -> Told:
 
 def _headline(row: Record, verdict: str, outcome: str) -> str:
     first, second = row["first"], row["second"]
-    if outcome == "decided":
+    if outcome not in {"null", "not decided"}:
         better, worse = (first, second) if verdict.startswith(f"{first} is better") else (second, first)
         return f"{better} is better than {worse}" + verdict.partition(" is better")[2]
     return f"{first} against {second}: {verdict.partition(': ')[2] or verdict}"
@@ -311,12 +311,25 @@ def _sentence(row: Record, least: float) -> str:
     return f"Difference {difference} in the {what}: {values}. A difference from {number_text(least)} on was to matter."
 
 
-def _unstressed(falsifiers: pd.DataFrame, contrast: str) -> str:
+def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
     """How both sides fare without the stress, all suites together: the first row of a contrast."""
     mine = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
-    if mine.empty:
-        return ""
-    row = mine.iloc[0]
+    return None if mine.empty else {str(name): value for name, value in mine.iloc[0].items()}
+
+
+def _outcome(row: Record, falsifier: Record | None) -> str:
+    verdict = str(row["verdict"])
+    if verdict.startswith(("not decided", "not tested")):
+        return "not decided"
+    if verdict.startswith("null"):
+        return "null"
+    if verdict.endswith(LESS_THAN_MATTERS):
+        return "decided, small"
+    is_gained = falsifier is not None and falsifier["lo"] > 0 and verdict.startswith(f"{row['first']} is better")
+    return "cause open" if is_gained else "decided"
+
+
+def _unstressed(row: Record) -> str:
     difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
     gained = " What it gains there is not owed to what the contrast is named for." if row["lo"] > 0 else ""
     return (

@@ -2,7 +2,6 @@
 """What the other pages of a site show: suites, matchers, rejection, costs, places and measured ageing."""
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,6 +9,8 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
+from sasgeo_bench.errors import counted
+from sasgeo_bench.query import base_of
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import primary_of
 from sasgeo_bench.report.rows import ALL_SUITES
@@ -43,7 +44,6 @@ _COSTS: Final = (
     *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
 )
 _AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
-_REGION: Final = re.compile(r"[@+]")  # <region>@<date>, <region>+<suite>
 KINDS: Final = {  # of figures, by how their names begin, in the order they are shown
     "contrast": "Registered contrasts, place by place",
     "stress": "Success under stress",
@@ -117,7 +117,7 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
         tables=tuple((group_table(book, key, book.matchers[key]), _strata_table(book, key)) for key in keys),
         figures=tuple(item for item in source.figures if item.file.startswith(starts)),
         pictures=tuple(item for item in source.pictures.suites if item.of == name),
-        regions=tuple(sorted({_REGION.split(region)[0] for region in tasks})),
+        regions=tuple(sorted({base_of(region) for region in tasks})),
     )
 
 
@@ -156,6 +156,7 @@ class MatcherPage:
     entry: Mapping[str, Any]
     cell: Cell
     card: Mapping[str, Any]
+    taught: tuple[str, ...]
     cannot: tuple[str, ...]
     results: tuple[Table, ...]
     judged: Table | None
@@ -178,11 +179,23 @@ def _matcher(name: str, book: Book, judged: pd.DataFrame | None) -> MatcherPage:
         entry=entry,
         cell=book.name_cell(name),
         card=card,
+        taught=tuple(_taught(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
         judged=None if judged is None else _judged_table(judged, "judged", "Rejection, all suites"),
         costs=tuple(_costs_of(book, name)),
     )
+
+
+def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
+    """What the runner taught a contestant, and where it was asked so: regions, for tasks are hundreds."""
+    for one in entry.get("learned") or ():
+        verb = "Learnt" if one["file"] else "Could not learn"
+        regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
+        yield (
+            f"{verb} from {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; asked so in "
+            f"{counted(len(one['asked']), 'task')} on {', '.join(regions)}."
+        )
 
 
 def _cannot(book: Book, name: str, card: Mapping[str, Any]) -> Iterator[str]:
@@ -368,7 +381,7 @@ def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
     """
     found: dict[str, list[Mapping[str, Any]]] = {}
     for task in about.get("tasks", ()):
-        found.setdefault(_REGION.split(str(task["region"]))[0], []).append(task)
+        found.setdefault(base_of(str(task["region"])), []).append(task)
     return dict(sorted(found.items()))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.report.contrasts import Contrast, Finding, contrast_frame
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame
 from sasgeo_bench.report.siteboard import Book, contrasts_of, group_table, places_of, sections_of
-from sasgeo_bench.report.sitepages import places_on_map, regions_of
+from sasgeo_bench.report.sitepages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.report.siteplots import draw_places, draw_rates
 from sasgeo_bench.report.sitesource import SiteSource, Spot
 from sasgeo_bench.report.sitetable import file_stem, page_names, ties_of
@@ -134,7 +134,7 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
         ({}, "decided", "graph is better than raster"),
         (
             {"verdict": "raster is better, by less than would matter"},
-            "decided",
+            "decided, small",
             "raster is better than graph, by less than would matter",
         ),
         (
@@ -161,9 +161,14 @@ def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, 
 
 
 def test_what_is_decided_stands_first():
-    verdicts = ("not decided: 2 blocks, at least 6 are needed", "null: no difference shown", "graph is better")
+    verdicts = (
+        "not decided: 2 blocks, at least 6 are needed",
+        "null: no difference shown",
+        "graph is better, by less than would matter",
+        "graph is better",
+    )
     findings = [replace(FINDING, name=f"c{at}", verdict=verdict) for at, verdict in enumerate(verdicts)]
-    assert [told.name for told in contrasts_of(source(findings=findings))] == ["c2", "c1", "c0"]
+    assert [told.name for told in contrasts_of(source(findings=findings))] == ["c3", "c2", "c1", "c0"]
 
 
 def test_places_of_a_contrast_are_counted_where_the_scored_rows_are_those_that_were_tested():
@@ -219,9 +224,19 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
     (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame(rows)))
     assert told.unstressed.startswith("Without the stress, where they should not differ: ")
     assert "(n = 80, 9 blocks). What it gains there is not owed" in told.unstressed
+    assert told.outcome == "cause open"
     (silent,) = contrasts_of(source(findings=[FINDING]))
     assert silent.unstressed == ""
     none = replace(rows[0], finding=replace(FINDING, lo=-0.1))
     (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame([none])))
     assert "no gain shown" in told.unstressed
     assert "not owed" not in told.unstressed
+    assert told.outcome == "decided"
+
+
+def test_what_a_matcher_was_taught_is_told_by_region_for_tasks_are_hundreds():
+    learned = {"file": "a.json", "trained_on": ["porto"], "pairs": 24}
+    learned["asked"] = ["alias/vaduz+alias", "clean/vaduz", "real-age/eschen@2015-07-27"]
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"learned": [learned]}})
+    (page,) = matchers_of(given, Book.of(given))
+    assert page.taught == ("Learnt from 24 queries of porto; asked so in 3 tasks on eschen, vaduz.",)

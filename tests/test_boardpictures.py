@@ -2,6 +2,7 @@
 """Pictures of a board and of single queries: small, the same each time, and of what they say they are of."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -197,6 +198,7 @@ def test_inspect_counts_the_failures_of_a_run_and_draws_any_of_its_queries(root,
     code, text, err = program("inspect", run)
     assert code == 0, err
     assert "absent accepted" in text
+    assert re.search(r"failures in \d+ queries, \d+ of them under stress", text)
     assert not (tmp_path / "out").exists()
     query = taskdir.read_ids(root / "tasks" / "alias" / "town-grid+alias")[2]
     code, text, err = program("inspect", run, "--query", query[:10], "--out", tmp_path / "mine")

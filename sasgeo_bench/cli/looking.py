@@ -14,6 +14,7 @@ from sasgeo_bench.panels import panels
 from sasgeo_bench.query import base_of
 from sasgeo_bench.region import Manifest
 from sasgeo_bench.report.cases import count_cases, sample_cases
+from sasgeo_bench.report.strata import STRESS
 from sasgeo_bench.runcases import RunCases, is_run, picture_of, read_run_cases
 from sasgeo_bench.split import make_split
 from sasgeo_bench.store.caseplot import case_pixels
@@ -127,7 +128,9 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
     for name, count in counts.items():
         listed = some.loc[some["failure"] == name, "query_id"]
         table.add_row(name, str(count), ", ".join(query_id[:SHOWN_LETTERS] for query_id in listed))
-    typer.echo(f"{cases.entry.name}: {len(found)} failures in {counted(len(cases.scores), 'query', 'queries')}")
+    stressed, total = int((cases.scores["role"] == STRESS).sum()), len(cases.scores)
+    only = f", {stressed} of them under stress: boards count these first, and controls apart" if stressed else ""
+    typer.echo(f"{cases.entry.name}: {len(found)} failures in {counted(total, 'query', 'queries')}{only}")
     print_table(table)
 
 

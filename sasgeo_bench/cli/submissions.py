@@ -30,7 +30,10 @@ def submit_command(
     ] = None,
     card: Annotated[Path | None, typer.Option(help="card, a .toml file (--example-card prints one)")] = None,
     board: Annotated[
-        Path | None, typer.Option("--for", help="stored results of the board, as in docs/results/leaderboard")
+        Path | None,
+        typer.Option(
+            "--for", help="stored results of the board, as docs/results/leaderboard; leaderboard --results stores some"
+        ),
     ] = None,
     into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/NAME of the card")] = None,
     example: Annotated[bool, typer.Option("--example-card", help="print a card to begin with, and stop")] = False,

@@ -14,6 +14,7 @@ from sasgeo_bench.boards import Board
 from sasgeo_bench.metrics.calibration import calibration_error
 from sasgeo_bench.report.contrasts import Contrast, by_place, hold_contrasts
 from sasgeo_bench.report.measures import primary_of
+from sasgeo_bench.report.plots import draw_steps
 from sasgeo_bench.report.plottables import (
     BEYOND_M,
     MOST_MATCHERS,
@@ -30,6 +31,7 @@ from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.sasgeo.protection import level_name
+from sasgeo_bench.store.boardplot import Page, page
 from tests.report.test_tables import scores
 
 CONTRASTS = (
@@ -231,6 +233,34 @@ def test_areas_of_a_stanford_figure_are_those_of_the_board(board):
     cells = stanford_cells(told)
     absent = int((~table["is_present"]).sum())  # an error without end
     assert cells.loc[cells["error_m"] == BEYOND_M, "n"].sum() == absent
+
+
+def test_a_figure_writes_each_style_once_and_a_long_label_whole(tmp_path):
+    label = "share of the view that is hidden; in U3 of where trees and shadows hide thin classes, and more words"
+    with page(tmp_path / "one.svg", Page(title="One", note="", below=label)) as charts:
+        charts[0][0].plot([0, 1], [0, 1])
+    text = (tmp_path / "one.svg").read_text(encoding="utf-8")
+    styles = re.findall(r' style="([^"]*)"', text)
+    assert len(styles) == len(set(styles))
+    assert {name for names in re.findall(r' class="([^"]*)"', text) for name in names.split()} == set(
+        re.findall(r"\.(s\d+)\{", text)
+    )
+    lines = [line for line in re.findall(r">([^<>]{4,})</t", text) if line in label]
+    assert len(lines) > 1  # broken, where one line would begin left of the page
+    assert " ".join(lines) == label
+
+
+def test_kinds_of_one_size_stand_beside_each_other(tmp_path):
+    rows = pd.DataFrame({"matcher": "graph", "kind": list("abcde"), "view_cells": 192, "strength": 1.0, "n": 6})
+    rows = rows.assign(suite="occlusion", track="localization", prior_group="r500", strength_unit="m", value=0.5)
+    draw_steps(tmp_path / "a.svg", rows.assign(lo=0.4, hi=0.6), ["graph"])
+    draw_steps(tmp_path / "b.svg", rows.assign(lo=0.4, hi=0.6, view_cells=[96, 192, 192, 192, 192]), ["graph"])
+    wide, tall = ((tmp_path / name).read_text(encoding="utf-8") for name in ("a.svg", "b.svg"))
+    size = re.compile(r'width="([\d.]+)pt" height="([\d.]+)pt"')
+    width, height = map(float, size.search(wide).groups())
+    assert width > height
+    width, height = map(float, size.search(tall).groups())
+    assert width < height
 
 
 def test_a_stanford_figure_is_of_few_matchers_those_of_contrasts_first(board, monkeypatch):

@@ -20,6 +20,7 @@ from sasgeo_bench.report.axes import (
     draw_line,
     dress_share,
     of_which,
+    panels_across,
     those_there,
 )
 from sasgeo_bench.report.contrasts import Contrast, Finding, PlaceDifference
@@ -85,14 +86,21 @@ def _draw_lines(
     column, label = axis
     names = those_there(rows, shown)
     kinds, sizes = (sorted(set(rows[name])) for name in ("kind", "view_cells"))
-    about = Page(title=title, note=note, below=label, rows=len(kinds), columns=len(sizes), keys=names, gap_inches=0.25)
+    grid: list[list[tuple[str, float] | None]] = [[(kind, size) for size in sizes] for kind in kinds]
+    if len(sizes) == 1:  # kinds beside each other, not in a tower
+        _, across = panels_across(len(kinds))
+        flat = [line[0] for line in grid]
+        flat += [None] * (-len(flat) % across)
+        grid = [flat[at : at + across] for at in range(0, len(flat), across)]
+    about = Page(title=title, note=note, below=label, rows=len(grid), columns=len(grid[0]), keys=names, gap_inches=0.25)
     measure = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
     high = max(1.0, float(rows[column].max()))
     with page(path, about) as charts:
-        for line, kind in zip(charts, kinds, strict=True):
-            for chart, size in zip(line, sizes, strict=True):
-                mine = rows[(rows["kind"] == kind) & (rows["view_cells"] == size)]
-                chart.set_title(f"{kind}, view of {size:g} cells", fontsize=8.5, loc="left", pad=4)
+        for line, keys in zip(charts, grid, strict=True):
+            for chart, key in zip(line, keys, strict=True):
+                mine = rows.iloc[:0] if key is None else rows[(rows["kind"] == key[0]) & (rows["view_cells"] == key[1])]
+                if key is not None:
+                    chart.set_title(f"{key[0]}, view of {key[1]:g} cells", fontsize=8.5, loc="left", pad=4)
                 chart.set_xlim(-0.1 * high, 1.1 * high)
                 dress_share(chart)
                 if chart is not line[0]:

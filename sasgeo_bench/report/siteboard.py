@@ -32,17 +32,22 @@ from sasgeo_bench.report.sitetable import (
 )
 from sasgeo_bench.report.sitewords import column, marks_of, prior_words
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
-from sasgeo_bench.report.text import interval_text, number_text
+from sasgeo_bench.report.text import interval_text, number_text, tally_text
 
 OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided")  # in the order of the page
 _LEAST_P: Final = 5e-4  # less would read as nought
+_SOUND: Final = ("ok", "not applicable")  # all else is a miss
 _PRIOR_ALONE: Final = "prior_centre"
 _GROUP: Final = ("suite", "track", "prior_group")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Book:
-    """Figures of a board that take every answer, by whose they are and of which queries; and the pages there are."""
+    """Figures of a board that take every answer, by whose they are and of which queries; and the pages there are.
+
+    `counted` are the kinds of stress that the first figure of a table counts, `lost` who gave no sound answer, and how
+    often; both empty where no scored queries are stored with the board.
+    """
 
     figures: Mapping[tuple[str, ...], Record]
     matchers: Mapping[Key, tuple[str, ...]]
@@ -50,6 +55,8 @@ class Book:
     entries: Mapping[str, Mapping[str, Any]]
     matcher_pages: Mapping[str, str]
     suite_pages: Mapping[str, str]
+    counted: Mapping[Key, tuple[str, ...]]
+    lost: Mapping[Key, str]
 
     @classmethod
     def of(cls, source: SiteSource) -> Self:
@@ -74,6 +81,8 @@ class Book:
             entries=entries,
             matcher_pages=page_names("matcher", names),
             suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
+            counted={key: _counted(rows) for key, rows in _by_group(source.scores)},
+            lost={key: _lost(rows) for key, rows in _by_group(source.scores)},
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -99,6 +108,24 @@ class Book:
         return bool(self.entries.get(matcher, {}).get("set_apart"))
 
 
+def _by_group(scores: pd.DataFrame) -> Iterator[tuple[Key, pd.DataFrame]]:
+    if len(scores):
+        for (suite, track, prior), rows in scores.groupby(list(_GROUP), sort=True):
+            yield (str(suite), str(track), str(prior)), rows
+
+
+def _counted(rows: pd.DataFrame) -> tuple[str, ...]:
+    """Kinds of stress with the place on the map: of these is the first figure, where there is any."""
+    kinds = rows.loc[(rows["role"] == STRESS) & rows["is_present"].astype(bool), "kind"]
+    return tuple(sorted(map(str, kinds.unique())))
+
+
+def _lost(rows: pd.DataFrame) -> str:
+    counts = rows.loc[~rows["status"].isin(_SOUND), ["matcher", "status"]].value_counts(sort=False).sort_index()
+    named = (f"{key[0]} {count} ({key[1]})" for key, count in counts.items() if isinstance(key, tuple))
+    return ", ".join(named)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
     """One suite, track and prior group: its table, and that of contestants that are set apart, if any."""
@@ -108,6 +135,7 @@ class Section:
     prior_group: str
     prior: str
     suite_page: str
+    counted: str
     for_nothing: str
     table: Table
     apart: Table | None = None
@@ -124,13 +152,16 @@ def _section(book: Book, key: Key) -> Section:
     apart = [name for name in names if book.is_apart(name)]
     table = group_table(book, key, [name for name in names if name not in apart])
     unasked = [name for name in book.entries if name not in names]
-    lines = [*table.notes, *([f"Not on this table, for not asked here: {', '.join(unasked)}."] if unasked else [])]
+    lost = book.lost.get(key, "")
+    lines = [*table.notes, *([f"Without a sound answer, which is a miss: {lost}."] if lost else [])]
+    lines += [f"Not on this table, for not asked here: {', '.join(unasked)}."] if unasked else []
     return Section(
         suite=suite,
         track=track,
         prior_group=prior_group,
         prior=prior_words(prior_group),
         suite_page=book.suite_pages[suite],
+        counted=", ".join(book.counted.get(key, ())),
         for_nothing=_for_nothing(book, key),
         table=replace(table, notes=tuple(lines)),
         apart=_apart(book, key, apart) if apart else None,
@@ -215,7 +246,7 @@ def _notes(ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tup
         return ("Nobody has a figure here.",)
     if ranked:
         lines = [f"Tied: {tie.to_text()}." for tie in ties]
-        return tuple(lines or ["No two share a rank."])
+        return tuple(lines or (["No two share a rank."] if ranked > 1 else ["One alone is ranked."]))
     rivals = [name for name in found if not is_unranked(name)]
     if not rivals:
         return ("Only controls answered.",)
@@ -378,8 +409,8 @@ def control_table(controls: pd.DataFrame) -> Table | None:
             Cell(text=str(row["control"])),
             Cell(text=str(row["matcher"])),
             plain_cell(int(row["n"])),
-            Cell(text=f"{row['found']:.3g}", key=float(row["found"])),
-            Cell(text=f"{row['expected']:.3g}", key=float(row["expected"])),
+            Cell(text=tally_text(float(row["found"])), key=float(row["found"])),
+            Cell(text=tally_text(float(row["expected"])), key=float(row["expected"])),
             number_cell(float(row["p"])),
             Cell(text=word),
         )

@@ -156,6 +156,7 @@ class MatcherPage:
     entry: Mapping[str, Any]
     cell: Cell
     card: Mapping[str, Any]
+    trained: str
     taught: tuple[str, ...]
     cannot: tuple[str, ...]
     results: tuple[Table, ...]
@@ -179,12 +180,21 @@ def _matcher(name: str, book: Book, judged: pd.DataFrame | None) -> MatcherPage:
         entry=entry,
         cell=book.name_cell(name),
         card=card,
+        trained=_trained(card.get("trained_on")),
         taught=tuple(_taught(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
         judged=None if judged is None else _judged_table(judged, "judged", "Rejection, all suites"),
         costs=tuple(_costs_of(book, name)),
     )
+
+
+def _trained(said: object) -> str:
+    """What a card says of places that taught its method: "none", some, or some for each half."""
+    if isinstance(said, Mapping):
+        return "; ".join(f"half {half}: {_trained(places)}" for half, places in said.items())
+    places = [] if isinstance(said, str) or not isinstance(said, Sequence) else list(map(str, said))
+    return ", ".join(places) or "no place that its card names"
 
 
 def _taught(entry: Mapping[str, Any]) -> Iterator[str]:

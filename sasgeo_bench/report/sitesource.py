@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import pandas as pd
 
@@ -30,6 +30,11 @@ class Picture:
     alt: str
 
 
+_OF_REJECTOR: Final = {"p_false_": "P(false)", "order_": "order"}
+_VERDICT: Final = "accepted_"
+_LEFT_OUT: Final = (_VERDICT, "told_hpl_")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
     """One query that a matcher failed on, with what is said of it by name."""
@@ -43,6 +48,26 @@ class Case:
     region: str = ""
     kind: str = ""
     said: Mapping[str, str] = field(default_factory=dict)
+
+    def lines(self) -> dict[str, str]:
+        """What is said of it, for a page: a line for each rejector, and no protection levels, which are a dozen.
+
+        Examples
+        --------
+        >>> said = {"error_m": "9", "p_false_own": "0.9", "accepted_own": "no", "told_hpl_gauss_0.01_m": "4"}
+        >>> Case(query_id="q", matcher="m", failure="aged", file="a.webp", alt="", said=said).lines()
+        {'error_m': '9', 'own': 'P(false) 0.9, withheld'}
+        """
+        found: dict[str, str] = {}
+        for name, value in self.said.items():
+            kind = next((kind for kind in _OF_REJECTOR if name.startswith(kind)), "")
+            if kind:
+                rejector = name.removeprefix(kind)
+                verdict = {"yes": ", accepted", "no": ", withheld"}.get(self.said.get(f"{_VERDICT}{rejector}", ""), "")
+                found[rejector] = f"{_OF_REJECTOR[kind]} {value}{verdict}"
+            elif not name.startswith(_LEFT_OUT):
+                found[name] = value
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -174,6 +174,17 @@ def number_text(value: float) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"  # noqa: PLR2004 - a digit less from ten on
 
 
+def tally_text(value: float) -> str:
+    """A count, or what is expected of one, never as a power of ten.
+
+    Examples
+    --------
+    >>> tally_text(3072.0), tally_text(3.0), tally_text(0.13636)
+    ('3072', '3', '0.136')
+    """
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"  # noqa: PLR2004 - three digits either way
+
+
 def rank_text(row: pd.Series | Mapping[str, Any]) -> str:
     """A rank or ranks that cannot be told apart; controls have none, nor has what is set apart."""
     if pd.isna(row["rank_best"]):
@@ -369,7 +380,7 @@ _CONTROLS_NOTE: Final = (
 def control_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     """Verdicts in words."""
     table = verdict_frame(verdicts)
-    words = {name: table[name].map(lambda value: f"{value:.3g}") for name in ("found", "expected")}
+    words = {name: table[name].map(tally_text) for name in ("found", "expected")}
     p, holds = table["p"].map(number_text), table["holds"].map({True: "held", False: "FAILED"})
     return table.assign(**words, p=p, holds=holds).rename(columns={"holds": "verdict"})
 

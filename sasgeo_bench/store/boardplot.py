@@ -5,6 +5,7 @@ import io
 import math
 import re
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,11 +29,13 @@ FAINT: Final = "#dddddd"
 _DPI: Final = 110
 _NUMBERS: Final = re.compile(r' (?:d|x|y|x1|x2|y1|y2|points)="[^"]*"')
 _GROUP_NAMES: Final = re.compile(r' id="[A-Za-z2.]+_\d+"')  # nothing refers to them; what is referred to has a hash
+_STYLE_OF: Final = re.compile(r' style="([^"]*)"')
 _INDENTS: Final = re.compile(r"\n +")
 _DIGITS: Final = re.compile(r"(\.\d\d)\d+")
 _LABEL_POINTS: Final = 8.5
 _LINE_INCHES: Final = 0.155  # of a note
 _KEY_INCHES: Final = 0.2
+_LABEL_LETTERS: Final = 13.0  # of a label of axes, on an inch
 _LETTERS: Final = 15.5  # of a note, on an inch
 _STYLE: Final[dict[Any, Any]] = {
     "svg.fonttype": "none",  # text stays text, so that it can be searched for
@@ -155,9 +158,8 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
             ]
             charts.append([figure.add_axes(_share_of(box, width, height)) for box in boxes])
         middle = about.left_inches + (about.columns * (wide + about.gap_inches) - about.gap_inches) / 2
-        figure.text(
-            middle / width, (bottom - 0.42) / height, about.below, ha="center", va="center", fontsize=_LABEL_POINTS
-        )
+        label = "\n".join(textwrap.wrap(about.below, int(2 * min(middle, width - middle) * _LABEL_LETTERS)))
+        figure.text(middle / width, (bottom - 0.42) / height, label, ha="center", va="center", fontsize=_LABEL_POINTS)
         yield charts
         if path.suffix == ".svg":
             drawn = io.StringIO()
@@ -169,9 +171,24 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
 
 
 def _rounded(svg: str) -> str:
-    """An SVG with hundredths of a point at most, without indents and names of groups: a third of it says no more."""
+    """An SVG with hundredths of a point at most, without indents and names of groups, and each style written once.
+
+    Half of what is drawn with says no more.
+    """
     plain = _INDENTS.sub("\n", _GROUP_NAMES.sub("", svg))
-    return _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), plain)
+    return _classed(_NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), plain))
+
+
+def _classed(svg: str) -> str:
+    """Styles that stand more than once as classes, numbered as they first stand."""
+    counts = Counter(_STYLE_OF.findall(svg))
+    names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
+    rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
+
+    def named(found: re.Match[str]) -> str:
+        return f' class="{names[found[1]]}"' if found[1] in names else found[0]
+
+    return _STYLE_OF.sub(named, svg).replace("</style>", f"{rules}</style>", 1)
 
 
 def _share_of(box: tuple[float, float, float, float], width: float, height: float) -> tuple[float, float, float, float]:

@@ -18,7 +18,7 @@ from sasgeo_bench.report.sitesource import SiteSource, Spot
 from sasgeo_bench.report.sitetable import file_stem, page_names, ties_of
 from sasgeo_bench.report.sitewords import MEANINGS
 from sasgeo_bench.store.ratebookfile import load_ratebook
-from tests.handmade import HOSTILE, MARKUP, about_of, asked, entry_of, many_rows
+from tests.handmade import HOSTILE, MARKUP, about_of, asked, card_of, entry_of, many_rows
 
 FINDING = Finding(
     name="age",
@@ -232,6 +232,40 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
     assert "no gain shown" in told.unstressed
     assert "not owed" not in told.unstressed
     assert told.outcome == "decided"
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("none", "no place that its card names"),
+        ([], "no place that its card names"),
+        (["porto", "monaco"], "porto, monaco"),
+        ({"a": ["munich"], "b": "none"}, "half a: munich; half b: no place that its card names"),
+    ],
+)
+def test_places_that_a_card_names_are_words_and_not_letters(said, words):
+    card = card_of("graph", trained_on=said)
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"card": card}})
+    (page,) = matchers_of(given, Book.of(given))
+    assert page.trained == words
+
+
+def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
+    rows = {"suite": KEY[0], "track": KEY[1], "prior_group": KEY[2], "matcher": "graph", "status": "ok"}
+    rows |= {
+        "role": ["control", "stress", "stress"],
+        "kind": ["control", "S1", "S2"],
+        "is_present": [True, True, False],
+    }
+    scores = pd.DataFrame(rows)
+    scores.loc[2, "status"] = "timeout"
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {}}, scores=scores)
+    (section,) = sections_of(Book.of(given))
+    assert section.counted == "S1"
+    assert section.table.notes == (
+        "One alone is ranked.",
+        "Without a sound answer, which is a miss: graph 1 (timeout).",
+    )
 
 
 def test_what_a_matcher_was_taught_is_told_by_region_for_tasks_are_hundreds():

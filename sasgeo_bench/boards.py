@@ -15,7 +15,7 @@ from sasgeo_bench.apart import set_apart
 from sasgeo_bench.boardtasks import ScoredTask, read_scored_task
 from sasgeo_bench.contestants import Told, read_told
 from sasgeo_bench.entries import Entry, find_entries, leave_out
-from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.judging import Judging, carry_out
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
@@ -36,7 +36,7 @@ from sasgeo_bench.results import Prediction
 from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import taskdir
-from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, write_board
+from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, read_board, write_board
 from sasgeo_bench.validate import submission_faults, validate
 
 Tell = Callable[[str], None]
@@ -202,8 +202,21 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         everyone=tuple(item.entry for item in told),
         apart=apart,
     )
+    _tell_gone(request.board, board.everyone, tell)
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _tell_gone(folder: Path, everyone: Sequence[Entry], tell: Tell) -> None:
+    """Say which rows an older board of that name had and this one has not: their author may look for them."""
+    try:
+        about, _ = read_board(folder)
+        had = [str(entry["name"]) for entry in about["entries"]]
+    except (StoreError, KeyError, TypeError):  # none, or nothing that can be read
+        return
+    gone = sorted(set(had) - {entry.name for entry in everyone})
+    if gone:
+        tell(f"{folder} had rows of {', '.join(gone)}, which this board has not; their answers are where they were")
 
 
 def _judgings(

@@ -109,7 +109,7 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     """
     entries = find_entries([run])
     if len(entries) > 1:
-        names = ", ".join(str(entry.sources[0].parents[1]) for entry in entries[:_NAMED])
+        names = ", ".join(f"{entry.version}: {entry.sources[0].parents[1]}" for entry in entries[:_NAMED])
         message = f"{run} holds runs of {len(entries)} matchers or versions: name the folder of one ({names})"
         raise ConfigError(message)
     (entry,), root = entries, root_of(run, out)

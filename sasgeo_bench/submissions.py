@@ -154,7 +154,8 @@ def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Seque
         if found != {"name": card.name, "version": card.version}:
             message = (
                 f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {found.get('name')!r} "
-                f"{found.get('version')}: make them agree"
+                f"{found.get('version')}: make them agree, or name the folder of the runs that the card is of, as in "
+                f"{predictions / str(about.get('hash', '<hash>'))}"
             )
             raise ConfigError(message)
         if (about.get("suite"), about.get("region")) in named:

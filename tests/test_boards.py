@@ -386,6 +386,16 @@ def test_truths_may_lie_in_a_folder_of_another_name(out, tmp_path):
     assert primary(board_of(out, truth=tmp_path / "secret"), "oracle_pose")["value"] == 1.0
 
 
+def test_rows_that_a_board_has_no_more_are_told(out, tmp_path):
+    submission(out, tmp_path / "mine.parquet")
+    board = out / "boards" / "twice"
+    _, first = told_by(out, out / "runs", tmp_path / "mine.parquet", board=board)
+    _, second = told_by(out, out / "runs", board=board)
+    _, third = told_by(out, out / "runs", board=board)
+    said = f"{board} had rows of mine, which this board has not; their answers are where they were"
+    assert [said in lines for lines in (first, second, third)] == [False, True, False]
+
+
 def test_a_folder_with_other_things_is_not_replaced(out):
     folder = out / "boards" / "mine"
     folder.mkdir(parents=True)

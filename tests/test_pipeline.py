@@ -101,7 +101,7 @@ def test_the_command_ends_with_the_board_and_what_to_do_next(made, program, monk
     code, told, err = program("leaderboard", "small.toml")
     assert code == 0, err
     assert told.splitlines()[-1] == str(Path("out") / "boards" / "small")
-    assert err.splitlines()[-1].startswith("next: leaderboard small.toml --matcher NAME puts one of yours beside these")
+    assert err.splitlines()[-1].startswith("next: sasgeo-bench leaderboard small.toml --matcher NAME adds one of yours")
 
 
 def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):

@@ -108,9 +108,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         typer.Option(help="one more than the file names: a name, or module:Class; may be repeated"),
     ] = None,
     extracts: ExtractFolders = None,
-    region_folders: Annotated[
-        list[Path] | None, typer.Option("--region-files", help="folder with region files of your own")
-    ] = None,
+    region_folders: RegionFolders = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
     results: Results = None,
@@ -142,7 +140,8 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     show_board(board)
     typer.echo(str(board_folder(plan)))
     tell(_how_to_publish(board_folder(plan)))
-    tell(f"next: leaderboard {pipeline} --matcher NAME puts one of yours beside these (new-matcher begins one)")
+    if not matcher:
+        tell(f"next: sasgeo-bench leaderboard {pipeline} --matcher NAME adds one of yours (new-matcher begins one)")
     _check_controls(board)
 
 

@@ -21,7 +21,13 @@ PIPE_WIDTH: Final = 200
 errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
-RegionFolders = Annotated[list[Path] | None, typer.Option("--regions", help="folder with region files of your own")]
+RegionFolders = Annotated[
+    list[Path] | None,
+    typer.Option("--region-files", "--regions", help="folder with region files of your own; may be repeated"),
+]
+OwnRegionFolders = Annotated[  # of commands whose --regions are ids
+    list[Path] | None, typer.Option("--region-files", help="folder with region files of your own; may be repeated")
+]
 ExtractFolders = Annotated[
     list[Path] | None,
     typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import ExtractFolders, Out, print_table, tell
+from sasgeo_bench.cli.console import ExtractFolders, Out, OwnRegionFolders, print_table, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.processes import spread
 from sasgeo_bench.query import PriorGroup
@@ -45,9 +45,7 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
         str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")
     ] = None,
     extracts: ExtractFolders = None,
-    region_folders: Annotated[
-        list[Path] | None, typer.Option("--region-files", help="folder with region files of your own")
-    ] = None,
+    region_folders: OwnRegionFolders = None,
     out: Out = Path("out"),
     up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False,
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False,

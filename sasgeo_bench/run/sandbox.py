@@ -116,8 +116,10 @@ def enter(policy: Policy) -> Isolation:
     _limit(policy)
     version = landlock_version()
     if version > 0:
-        system = SYSTEM if has_proc else (*(path for path in SYSTEM if path != "/proc"), *OWN_PROC)
-        _landlock(policy, (*system, *policy.readable), hidden, version)
+        unseen = hidden if has_proc else [*hidden, "/proc"]
+        rules = [rule for item in (*SYSTEM, *policy.readable) for rule in around(item, unseen)]
+        rules += [] if has_proc else [(path, READ_RIGHTS) for path in OWN_PROC]
+        _landlock(policy, rules, version)
     if spaces:
         _drop_powers()
     return Isolation(
@@ -284,7 +286,7 @@ def _limit(policy: Policy) -> None:
         resource.setrlimit(kind, (least, least))
 
 
-def _landlock(policy: Policy, readable: Sequence[str], hidden: Sequence[str], version: int) -> None:
+def _landlock(policy: Policy, readable: Sequence[tuple[str, int]], version: int) -> None:
     """Refuse every file that is not allowed; there is no way back for this process and its children."""
     rights = _FIRST_RIGHTS
     for since, later in _LATER_RIGHTS.items():
@@ -296,8 +298,7 @@ def _landlock(policy: Policy, readable: Sequence[str], hidden: Sequence[str], ve
     ruleset = _syscall(LANDLOCK_CREATE, ctypes.c_char_p(attributes), ctypes.c_size_t(size), 0)
     if ruleset < 0:
         raise OSError(-ruleset, os.strerror(-ruleset))
-    allowed = [rule for item in readable for rule in around(item, hidden)]
-    allowed += [(path, READ_RIGHTS | 0b10) for path in DEVICES]
+    allowed = [*readable, *((path, READ_RIGHTS | 0b10) for path in DEVICES)]
     allowed += [(path, rights) for path in policy.writable]
     for path, granted in allowed:
         _allow(ruleset, path, granted & rights)

@@ -28,7 +28,7 @@ def reads(path):
 
 for name, value in json.loads(sys.argv[1]).items():
     setattr(sandbox, name, lambda *_, value=value: value)
-readable, hidden, others = sys.argv[2], json.loads(sys.argv[3]), sys.argv[4]
+folder, hidden, others, readable = sys.argv[2], json.loads(sys.argv[3]), sys.argv[4], sys.argv[5]
 policy = sandbox.Policy(
     readable=[readable, *sys.path], writable=[], hidden=hidden, memory_bytes=2**40, file_bytes=2**20, unsearched=""
 )
@@ -45,7 +45,7 @@ if os.readlink("/proc/self/ns/mnt") != outside:
 said["reads"] = [reads(path) for path in (*hidden, *(path + "/answers" for path in hidden))]
 said["sees others"] = reads(f"/proc/{others}/cmdline")
 said["own"] = [reads("/proc/self/statm"), reads("/proc/cpuinfo"), reads("/proc/meminfo"), reads("/proc/stat")]
-said["harmless"] = reads(readable + "/harmless")
+said["harmless"] = reads(folder + "/harmless")
 print(json.dumps(said))
 """
 NO_SPACES = {"_enter_namespaces": 0}
@@ -54,13 +54,14 @@ NO_PROC = {"_mount_proc": False}
 OURS = "a namespace of their own, all end together"
 
 
-def shut_in(tmp_path, lacking):
+def shut_in(tmp_path, lacking, *, readable=""):
     """What a process says that lacks some of the ways to shut it in, takes covers off, and reads what it may not."""
     (tmp_path / "truth").mkdir()
     for name in ("truth/answers", "answers.parquet", "harmless"):
         (tmp_path / name).write_text("x", encoding="utf-8")
     hidden = json.dumps([str(tmp_path / "truth"), str(tmp_path / "answers.parquet")])
     command = [sys.executable, "-c", SCRIPT, json.dumps(lacking), str(tmp_path), hidden, str(os.getpid())]
+    command.append(readable or str(tmp_path))
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - ours
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
@@ -112,6 +113,13 @@ def test_without_both_nothing_is_protected_and_that_is_said(tmp_path):
     assert any(said["reads"])
     assert said["sees others"]
     assert said["processes"] == "not apart; /proc of others can be read, command lines too"
+
+
+@landlock
+def test_whoever_works_in_the_root_of_all_folders_does_not_read_what_others_do_either(tmp_path):
+    said = shut_in(tmp_path, NO_PROC, readable="/")
+    assert not any(said["reads"])
+    assert not said["sees others"]
 
 
 @landlock

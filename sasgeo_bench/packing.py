@@ -15,6 +15,7 @@ from sasgeo_bench.boards import Board, ScoreRequest, Tell, make_board
 from sasgeo_bench.entries import Entry
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
+from sasgeo_bench.plugins import check_registered
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.store.catalog import find_split
 from sasgeo_bench.store.learnedfile import LearnedSaid
@@ -176,7 +177,13 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
 
 
 def request_of(
-    predictions: Sequence[Path], *, board: Path, root: Path, split: str | None = None, folders: Sequence[Path] = ()
+    predictions: Sequence[Path],
+    *,
+    board: Path,
+    root: Path,
+    split: str | None = None,
+    folders: Sequence[Path] = (),
+    rejectors: Sequence[str] = (),
 ) -> ScoreRequest:
     """What is asked of a board, set as the stored results among its predictions were; as ever where there are none.
 
@@ -192,11 +199,15 @@ def request_of(
         Instead of that of the stored results, or of "crossfit" where none are.
     folders : sequence of Path
         With region files of one's own.
+    rejectors : sequence of str
+        Instead of those of the stored results, which may name registered ones only.
 
     Raises
     ------
     ConfigError, StoreError
         As `stored_settings` does, or if there is no such split.
+    MatchError
+        If the stored results name a rejector that no installed package registers.
 
     Examples
     --------
@@ -204,13 +215,15 @@ def request_of(
     'crossfit'
     """
     settings = stored_settings(predictions)
+    if not rejectors:
+        check_registered(settings.rejectors, source=str(stored_among(predictions)))
     name = split or settings.split or (None if stored_among(predictions) else "crossfit")
     return ScoreRequest(
         predictions=predictions,
         root=root,
         split=None if name is None else find_split(name, folders=folders),
         contrasts=settings.contrasts,
-        rejectors=settings.rejectors,
+        rejectors=rejectors or settings.rejectors,
         board=board,
         draws=settings.draws,
         by_region=settings.by_region,

@@ -189,6 +189,35 @@ def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) 
                 _known(name, group, kind)
 
 
+def check_registered(rejectors: Sequence[str], *, source: str) -> None:
+    """Refuse rejectors that data name by module:Class: whoever imports what a file names runs whatever it names.
+
+    Parameters
+    ----------
+    rejectors : sequence of str
+        As the data name them.
+    source : str
+        What the data are called.
+
+    Raises
+    ------
+    MatchError
+        If one is not registered by an installed package; nothing is imported.
+
+    Examples
+    --------
+    >>> check_registered(["margin"], source="stored")
+    """
+    known = list_entry_points(REJECTORS) if rejectors else {}
+    stray = next((name for name in rejectors if name not in known), None)
+    if stray is not None:
+        message = (
+            f"{source} names the rejector {one_line(stray)!r}, and data may name registered ones only (list-rejectors "
+            "shows all): name each that is to judge with --rejector, and code only if you trust it"
+        )
+        raise MatchError(message)
+
+
 def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
     point = _known(name, group, kind)
     try:

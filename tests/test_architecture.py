@@ -106,7 +106,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "lookalike": None,
     "plugins": None,
     "run": (
-        *("sandbox", "wire", "serve", "child", "worker", "oracle"),
+        *("sandbox", "wire", "serve", "child", "beside", "worker", "oracle"),
         *("lesson", "plan", "teach", "schedule", "answers", "cluster", "runner"),
     ),
     "metrics": (

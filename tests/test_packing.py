@@ -10,6 +10,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from sasgeo_bench import packing
 from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import ScoreRequest
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -239,6 +240,32 @@ def test_damaged_results_are_told_in_a_line(kept, tmp_path, name, words, program
     assert code == 2
     assert words in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["mischief:Rejector", "no_such_rejector"])
+def test_stored_results_have_no_code_imported_that_no_package_registers(kept, program, tmp_path, monkeypatch, name):
+    stored = shutil.copytree(kept[2], tmp_path / "stored")
+    said = json.loads((stored / "pack.json").read_text(encoding="utf-8"))
+    said["rejectors"] = ["margin_nms", name]
+    (stored / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+    (tmp_path / "mischief.py").write_text("import pathlib; pathlib.Path('imported').touch()", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code, _, err = program("score", "--predictions", "stored", "--out", "out")
+    assert code == 2
+    (line,) = err.strip().splitlines()
+    assert line == (
+        f"sasgeo-bench: stored names the rejector {name!r}, and data may name registered ones only (list-rejectors "
+        "shows all): name each that is to judge with --rejector, and code only if you trust it"
+    )
+    assert not (tmp_path / "imported").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_named_on_the_command_line_code_judges_stored_results(kept):
+    folder = kept[2]
+    asked = packing.request_of([folder], board=Path("board"), root=Path("out"), rejectors=["mine:Rejector"])
+    assert asked.rejectors == ["mine:Rejector"]
 
 
 def test_a_name_that_leads_out_is_refused(kept, tmp_path):

@@ -82,12 +82,18 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         raise ConfigError(message)
     submitted = submissions_for(board_of(predictions), submissions, tell=tell) if submissions else ()
     root = out if truth is None else truth.resolve().parent
-    usual = request_of(predictions, board=out / "boards" / name, root=root, split=split, folders=region_folders or ())
+    usual = request_of(
+        predictions,
+        board=out / "boards" / name,
+        root=root,
+        split=split,
+        folders=region_folders or (),
+        rejectors=rejector or (),
+    )
     request = replace(
         usual,
         tasks=tasks or (),
         truth=truth,
-        rejectors=rejector or usual.rejectors,
         draws=draws or usual.draws,
         without=without or (),
         submissions=submitted,

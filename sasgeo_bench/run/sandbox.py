@@ -14,7 +14,6 @@ import struct
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, NoReturn
 
 CLONE_NEWNS: Final = 0x00020000
@@ -23,6 +22,8 @@ CLONE_NEWUSER: Final = 0x10000000
 CLONE_NEWPID: Final = 0x20000000
 CLONE_NEWNET: Final = 0x40000000
 MS_REC_PRIVATE: Final = 0x4000 | 0x40000
+MS_BIND: Final = 0x1000
+MS_PROC: Final = 0b1110  # no set-user-id, no devices, nothing executable
 PR_SET_PDEATHSIG: Final = 1
 PR_SET_NO_NEW_PRIVS: Final = 38
 _BY_SIGNAL: Final = 128  # an exit status beyond this says which signal, as shells have it
@@ -31,6 +32,7 @@ LANDLOCK_ADD: Final = 445
 LANDLOCK_RESTRICT: Final = 446
 LANDLOCK_VERSION: Final = 1
 RULE_PATH: Final = 1
+_CAPABILITIES: Final = 0x20080522  # version of the structures that say which powers a process has
 
 # Rights of Landlock by the version that brought them; https://docs.kernel.org/userspace-api/landlock.html
 READ_RIGHTS: Final = 0b1101  # execute, read file, read directory
@@ -42,6 +44,11 @@ _NET_SINCE, _NET_RIGHTS = 4, 0b11  # bind and connect of TCP
 _SCOPE_SINCE, _SCOPES = 6, 0b11  # abstract sockets and signals leave the domain
 
 SYSTEM: Final = ("/usr", "/lib", "/lib64", "/lib32", "/bin", "/sbin", "/etc", "/opt", "/nix", "/proc", "/sys")
+# What Python, psutil and libraries of linear algebra read of a /proc that shows other processes, too.
+OWN_PROC: Final = (
+    *("/proc/self", "/proc/sys", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/filesystems"),
+    *("/proc/version", "/proc/uptime", "/proc/loadavg"),
+)
 DEVICES: Final = ("/dev/null", "/dev/zero", "/dev/random", "/dev/urandom", "/dev/full")
 
 
@@ -56,9 +63,11 @@ class Policy:
     writable : sequence of str
         Folders that it may write.
     hidden : sequence of str
-        Folders it must not see, wherever they lie.
+        Folders and files it must not see, wherever they lie.
     memory_bytes, file_bytes : int
         Address space of each of its processes, and the largest file it may write.
+    unsearched : str
+        Where nobody looked for what is to be hidden, in words.
     """
 
     readable: Sequence[str]
@@ -66,6 +75,7 @@ class Policy:
     hidden: Sequence[str]
     memory_bytes: int
     file_bytes: int
+    unsearched: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,29 +106,45 @@ def enter(policy: Policy) -> Isolation:
         What the system offered.
     """
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    hidden = [os.path.realpath(folder) for folder in policy.hidden if Path(folder).is_dir()]
+    hidden = outermost(policy.hidden)
     spaces = _enter_namespaces()
     covered = [bool(spaces & CLONE_NEWNS) and _cover(folder) for folder in hidden]
     is_hidden = all(covered) and bool(spaces & CLONE_NEWNS)
     if spaces & CLONE_NEWPID:
         _fork_into_namespace()
+    has_proc = bool(spaces & CLONE_NEWPID and spaces & CLONE_NEWNS) and _mount_proc()
     _limit(policy)
     version = landlock_version()
     if version > 0:
-        _landlock(policy, hidden, version)
+        unseen = hidden if has_proc else [*hidden, "/proc"]
+        rules = [rule for item in (*SYSTEM, *policy.readable) for rule in around(item, unseen)]
+        rules += [] if has_proc else [(path, READ_RIGHTS) for path in OWN_PROC]
+        _landlock(policy, rules, version)
+    if spaces:
+        _drop_powers()
     return Isolation(
         files=f"only what is needed (Landlock {version})" if version > 0 else "not limited",
-        truth=_truth_words(is_hidden=is_hidden, version=version),
+        truth=_truth_words(is_hidden=is_hidden, version=version, unsearched=policy.unsearched),
         network=_network_words(spaces, version),
-        processes="a namespace of their own, all end together" if spaces & CLONE_NEWPID else "not apart",
+        processes=_process_words(spaces, has_proc=has_proc, version=version),
     )
 
 
-def _truth_words(*, is_hidden: bool, version: int) -> str:
+def _truth_words(*, is_hidden: bool, version: int, unsearched: str) -> str:
     ways = [
         way for way, used in (("covered by an empty mount", is_hidden), ("refused by Landlock", version > 0)) if used
     ]
-    return ", ".join(ways) or "not protected"
+    if not ways:
+        return "not protected"
+    elsewhere = "" if version > 0 else "copies that lie elsewhere can be read"
+    return "; ".join(filter(None, (", ".join(ways), elsewhere, unsearched)))
+
+
+def _process_words(spaces: int, *, has_proc: bool, version: int) -> str:
+    apart = "a namespace of their own, all end together" if spaces & CLONE_NEWPID else "not apart"
+    if has_proc:
+        return f"{apart}; /proc shows no others"
+    return f"{apart}; /proc of others {'is refused by Landlock' if version > 0 else 'can be read, command lines too'}"
 
 
 def _network_words(spaces: int, version: int) -> str:
@@ -187,9 +213,30 @@ def _write(path: str, text: str) -> bool:
     return True
 
 
-def _cover(folder: str) -> bool:
-    """Put an empty folder over another one, for this process and its children alone."""
-    return int(_libc().mount(b"none", folder.encode(), b"tmpfs", 0, b"size=4k,mode=000")) == 0
+def _cover(path: str) -> bool:
+    """Put an empty folder over another one, or nothing over a file, for this process and its children alone."""
+    if os.path.isdir(path):  # noqa: PTH112 - no pathlib before the door is shut
+        return int(_libc().mount(b"none", os.fsencode(path), b"tmpfs", 0, b"size=4k,mode=000")) == 0
+    return int(_libc().mount(b"/dev/null", os.fsencode(path), None, MS_BIND, None)) == 0
+
+
+def _mount_proc() -> bool:
+    """Put the /proc of our own process namespace over that of the system, whose command lines are other people's.
+
+    The kernel refuses it where parts of the system's /proc are covered, as in most containers.
+    """
+    if _libc().mount(b"proc", b"/proc", b"proc", MS_PROC, None) != 0:
+        return False
+    return os.readlink("/proc/self") == str(os.getpid())  # noqa: PTH115 - no pathlib before the door is shut
+
+
+def _drop_powers() -> None:
+    """Give back what a namespace of users brought: whoever may mount there could take covers off again."""
+    _prctl(PR_SET_NO_NEW_PRIVS, 1)
+    header, none = struct.pack("Ii", _CAPABILITIES, 0), bytes(24)
+    if _libc().capset(header, none) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
 
 
 def _fork_into_namespace() -> None:
@@ -239,7 +286,7 @@ def _limit(policy: Policy) -> None:
         resource.setrlimit(kind, (least, least))
 
 
-def _landlock(policy: Policy, hidden: Sequence[str], version: int) -> None:
+def _landlock(policy: Policy, readable: Sequence[tuple[str, int]], version: int) -> None:
     """Refuse every file that is not allowed; there is no way back for this process and its children."""
     rights = _FIRST_RIGHTS
     for since, later in _LATER_RIGHTS.items():
@@ -251,8 +298,7 @@ def _landlock(policy: Policy, hidden: Sequence[str], version: int) -> None:
     ruleset = _syscall(LANDLOCK_CREATE, ctypes.c_char_p(attributes), ctypes.c_size_t(size), 0)
     if ruleset < 0:
         raise OSError(-ruleset, os.strerror(-ruleset))
-    allowed = [rule for item in (*SYSTEM, *policy.readable) for rule in around(item, hidden)]
-    allowed += [(path, READ_RIGHTS | 0b10) for path in DEVICES]
+    allowed = [*readable, *((path, READ_RIGHTS | 0b10) for path in DEVICES)]
     allowed += [(path, rights) for path in policy.writable]
     for path, granted in allowed:
         _allow(ruleset, path, granted & rights)
@@ -280,10 +326,26 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
         os.close(descriptor)
 
 
+def outermost(paths: Sequence[str]) -> list[str]:
+    """Where paths lead to that exist, without those that lie within another: what is covered has nothing within.
+
+    Examples
+    --------
+    >>> outermost(["/usr/lib", "/usr", "/usr/../usr", "/nowhere"])
+    ['/usr']
+    """
+    found: list[str] = []
+    for path in sorted({os.path.realpath(path) for path in paths}, key=lambda path: path.split("/")):
+        if os.path.exists(path) and not (found and path.startswith(f"{found[-1]}/")):  # noqa: PTH110 - no pathlib yet
+            found.append(path)
+    return found
+
+
 def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
     """A path with the right to read it; where something hidden lies within, all else that lies there now.
 
-    Of a folder that holds something hidden the names can be listed, or nothing in it could be imported.
+    Of a folder that holds something hidden the names can be listed, or nothing in it could be imported. Links in it
+    are passed over: what they lead to is read where it lies, if that is in reach, and nobody looked through it else.
 
     Examples
     --------
@@ -305,4 +367,6 @@ def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
         return
     yield real, LIST_RIGHT
     for name in names:
-        yield from around(f"{real.rstrip('/')}/{name}", hidden)
+        inner = f"{real.rstrip('/')}/{name}"
+        if not os.path.islink(inner):  # noqa: PTH114 - no pathlib before the door is shut
+            yield from around(inner, hidden)

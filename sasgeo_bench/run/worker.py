@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +26,7 @@ from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Truth
 from sasgeo_bench.results import Status, one_line
 from sasgeo_bench.run import wire
+from sasgeo_bench.run.beside import walk_code
 from sasgeo_bench.store.taskrows import pairs_bytes
 
 WATCH_S: Final = 0.05  # how often memory is looked at
@@ -228,11 +229,13 @@ class Worker:
         policy = None
         if self.reach.is_shut_in:
             code = _code()
-            hidden = [*self.reach.hidden, *_answers_beside(code, self.reach.readable)]
+            beside = walk_code(code)
+            hidden = [*map(str, self.reach.hidden), *beside.hidden([*code, *self.reach.readable])]
             policy = {
                 "readable": [str(path) for path in (*code, *self.reach.readable)],
                 "writable": [str(self._scratch)],
-                "hidden": [str(path) for path in dict.fromkeys(hidden)],
+                "hidden": list(dict.fromkeys(hidden)),
+                "unsearched": beside.unsearched,
                 "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
                 "file_bytes": self.limits.file_bytes,
             }
@@ -343,27 +346,6 @@ def _code() -> list[Path]:
     found += [Path(entry) for entry in sys.path if entry]
     found.append(Path(sasgeo_bench.run.child.__file__).parents[2] / "sasgeo_bench")
     return [path for path in dict.fromkeys(found) if path.exists()]
-
-
-def _answers_beside(code: Sequence[Path], readable: Sequence[Path]) -> Iterator[Path]:
-    """Truths, runs, boards and maps that lie where code is read from, or one folder below: those of a checkout's `out`.
-
-    They belong to other tasks than those that are asked; but the same seed draws the same truths.
-    """
-    kept = {path.resolve() for path in readable}
-    for folder in code:
-        for root in (folder, *_folders_in(folder)):
-            if not ((root / "tasks").is_dir() and (root / "truth").is_dir()):
-                continue
-            yield from (root / name for name in ("truth", "runs", "boards"))
-            yield from (path for path in _folders_in(root / "regions") if path.resolve() not in kept)
-
-
-def _folders_in(folder: Path) -> list[Path]:
-    try:
-        return sorted(path for path in folder.iterdir() if path.is_dir())
-    except OSError:
-        return []
 
 
 def _drain(stream: IO[bytes] | None, printed: deque[bytes]) -> None:

@@ -133,6 +133,13 @@ class Raises(Plain):
         raise ValueError(message)
 
 
+class Holds(Plain):
+    """Keeps 64 MiB of a map."""
+
+    def prepare(self, region, learned):
+        self.held = b"x" * 2**26
+
+
 class RaisesInPrepare(Plain):
     def prepare(self, region, learned):
         message = "no index today"
@@ -226,6 +233,37 @@ class ListsFolders(Plain):
                 except OSError:
                     found[f"{name} files"] = 0.0
         return Match(poses=(), scores=(), diagnostics=found)
+
+
+class ReadsAllBeside(Plain):
+    """Counts the files beside its code in which a test has written that they tell answers; links are followed."""
+
+    told = b"this tells" + b" answers"
+
+    def match(self, query, *, top_k):
+        count = 0
+        for path in sys.path[:2]:
+            for folder, _, names in os.walk(path, followlinks=True):
+                for name in names:
+                    try:
+                        count += self.told in (Path(folder) / name).read_bytes()
+                    except OSError:
+                        continue
+        return Match(poses=(), scores=(), diagnostics={"told": float(count)})
+
+
+class ReadsCommandLines(Plain):
+    """Looks for a secret among the command lines of all processes, and reads of itself what libraries read."""
+
+    def match(self, query, *, top_k):
+        secrets = 0
+        for number in range(1, 2**16):
+            try:
+                secrets += b"my-secret-seed" in Path(f"/proc/{number}/cmdline").read_bytes()
+            except OSError:
+                continue
+        own = min(len(Path(f"/proc/{name}").read_bytes()) for name in ("self/statm", "cpuinfo", "meminfo", "stat"))
+        return Match(poses=(), scores=(), diagnostics={"secrets": float(secrets), "own": float(own)})
 
 
 class WritesResults(Plain):

@@ -3,16 +3,20 @@
 
 import os
 import re
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import psutil
 import pytest
 
-from sasgeo_bench.run import sandbox
+from sasgeo_bench.run import beside, sandbox
 from sasgeo_bench.run.worker import Limits, Reach, Worker
 from sasgeo_bench.store import taskdir, taskrows
 
 QUICK = Limits(match_s=2.0, prepare_s=20.0, memory_bytes=800 * 10**6)
+SLOW = replace(QUICK, match_s=30.0)
 HAS_LANDLOCK = sandbox.landlock_version() > 0
 shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlock to refuse files with")
 
@@ -58,7 +62,7 @@ def ask(place, task, name, *, limits=QUICK, times=1, is_shut_in=True):
 )
 def test_whatever_a_matcher_does_becomes_a_status_and_a_line(place, task, name, status, words):
     # Only what hangs has to run into its time; on a busy machine all others may take theirs.
-    (reply,), _ = ask(place, task, name, limits=QUICK if name == "Hangs" else replace(QUICK, match_s=30.0))
+    (reply,), _ = ask(place, task, name, limits=QUICK if name == "Hangs" else SLOW)
     assert reply.status == status, reply.message
     assert re.search(words, reply.message), reply.message
     assert "\n" not in reply.message
@@ -96,6 +100,80 @@ def test_truths_of_other_runs_beside_the_code_are_out_of_reach_too(place, task, 
     assert "read the truth" not in reply.message
     (trusted,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
     assert "read the truth" in trusted.message
+
+
+TELLS = (
+    *("results/base/pack.json", "results/base/predictions/a.parquet", "results/base/more/deep/a.parquet"),
+    *("kept/truths.parquet", "copied/clean/vaduz/truth.parquet", "copied/clean/vaduz/truth.json"),
+    *("data/truth/clean/vaduz/truth-test.parquet", "answered/part-1-2.parquet", ".git/objects/ab/cd"),
+)
+FOLDERS_THAT_TELL = (
+    ("board.json", "leaderboard.parquet", "pictures/cases/one.png"),
+    ("site.json", "index.html", "cases/one.png"),
+    ("release.json", "SHA256SUMS", "truth/clean/vaduz/truth.parquet"),
+    ("region.json", "layers.tif"),
+    ("submission.json", "predictions/a.parquet"),
+)
+
+
+@shut_in
+@pytest.mark.parametrize("depth", ["", "one/two/three/four"])
+def test_whatever_beside_the_code_tells_answers_is_out_of_reach(place, task, tmp_path, monkeypatch, depth):
+    names = (*TELLS, *(f"other{at}/{name}" for at, names in enumerate(FOLDERS_THAT_TELL) for name in names))
+    for name in (*names, "harmless/notes.txt"):
+        (tmp_path / depth / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / depth / name).write_bytes(b"this tells answers")
+    (tmp_path / "link").symlink_to(place / "out" / "truth")
+    (place / "out" / "truth" / "copied").write_bytes(b"this tells answers")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    (reply,), worker = ask(place, task, "ReadsAllBeside")
+    assert reply.match.diagnostics == {"told": 1}, "the harmless one alone"
+    assert "not looked for" not in worker.isolation["truth"]
+    (trusted,), _ = ask(place, task, "ReadsAllBeside", is_shut_in=False)
+    assert trusted.match.diagnostics["told"] > len(names) + 1
+
+
+@shut_in
+def test_a_matcher_that_lies_among_stored_results_runs_and_does_not_read_them(place, task, tmp_path, monkeypatch):
+    shutil.copy(place / "hostile.py", tmp_path / "hostile.py")
+    for name in ("pack.json", "truths.parquet", "predictions/a.parquet"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"this tells answers")
+    monkeypatch.chdir(tmp_path)
+    (reply,), worker = ask(place, task, "ReadsAllBeside")
+    assert reply.message == ""
+    assert reply.match.diagnostics == {"told": 0}
+    assert worker.isolation["truth"] != "not protected"
+
+
+@shut_in
+def test_where_not_all_was_searched_the_run_says_so(place, task, monkeypatch):
+    monkeypatch.setattr(beside, "walk_code", lambda code: beside.walk([*map(str, code)], most_entries=3))
+    monkeypatch.setattr("sasgeo_bench.run.worker.walk_code", beside.walk_code)
+    _, worker = ask(place, task, "Plain")
+    assert "stored results beyond 3 files beside the code were not looked for" in worker.isolation["truth"]
+
+
+@shut_in
+def test_command_lines_of_others_are_out_of_reach(place, task):
+    command = [sys.executable, "-c", "import time; time.sleep(1000)", "my-secret-seed"]
+    with subprocess.Popen(command) as other:  # noqa: S603 - ours
+        try:
+            (reply,), worker = ask(place, task, "ReadsCommandLines", limits=SLOW)
+            (trusted,), _ = ask(place, task, "ReadsCommandLines", limits=SLOW, is_shut_in=False)
+        finally:
+            other.kill()
+    assert reply.match.diagnostics["secrets"] == 0
+    assert reply.match.diagnostics["own"] > 0
+    assert trusted.match.diagnostics["secrets"] == 1
+    assert "can be read" not in worker.isolation["processes"]
+
+
+def test_the_memory_of_a_map_is_that_of_the_matchers_own_process(place, task):
+    region = place / "out" / "regions" / task.name
+    with Worker(spec="hostile:Holds", reach=Reach(readable=[region], hidden=[]), limits=SLOW) as worker:
+        assert worker.prepare(region).grown_bytes > 50 * 2**20
 
 
 def test_without_the_shutting_in_the_truth_would_be_read(place, task):

@@ -384,7 +384,11 @@ def test_a_folder_without_a_board_is_one_line(mistake, tmp_path):
     ("name", "text", "fault"),
     [
         ("board.json", "{", "holds a damaged board"),
-        ("board.json", '{"entries": [1]}', "'entries' is no list of entries with 'name'"),
+        (
+            "board.json",
+            '{"entries": [1]}',
+            "holds a damaged board (entries.0 is 1: Input should be an object)",
+        ),
         ("leaderboard.parquet", "half", "holds a damaged board"),
         ("scores.parquet", "half", "holds a damaged board"),
         ("figures/age.svg.gz", "half", "holds a damaged board"),

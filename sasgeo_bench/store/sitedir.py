@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, PROTECTION, SCORES, read_board
-from sasgeo_bench.store.packfile import is_pack, read_settings
+from sasgeo_bench.store.packdir import is_pack, read_settings
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 
 SITE: Final = "site"

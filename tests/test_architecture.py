@@ -135,6 +135,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissions": None,
     "paperboard": None,
     "pipeline": None,
+    "boardshape": None,
     "publish": None,
     "release": None,
     "scaffold": None,

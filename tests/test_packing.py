@@ -466,7 +466,7 @@ def test_a_full_disk_is_a_short_line(kept, tmp_path, monkeypatch):
 def test_a_board_of_absent_places_alone_has_figures_of_what_is_left(kept):
     board, lines = kept[0], []
     absent = {name: frame.assign(is_present=False) for name, frame in board.scores.items()}
-    figures = figures_extra(replace(board, scores=absent), tell=lines.append).figures
+    figures = figures_extra(replace(board, scores=absent, findings=()), tell=lines.append).figures
     assert "age of the map" in lines[-1]
     assert "strength" not in " ".join(figures)
 

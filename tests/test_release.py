@@ -370,7 +370,7 @@ OF_A_MAP = ("layers.tif", "features.parquet", "nodes.parquet", "edges.parquet")
         ({"licence": ""}, "says no licence or no attribution, and a release must: build the region again"),
         ({"files": {}}, "is damaged (its files lack layers.tif): build the region again"),
         (
-            {"files": dict.fromkeys((*OF_A_MAP, "../stray"), {"sha256": "0" * 64, "bytes": 1})},
+            {"files": {name: {"sha256": "0" * 64, "bytes": 1} for name in (*OF_A_MAP, "../stray")}},
             "is damaged (it names the file '../stray')",
         ),
         ({"licence": "  "}, "says no licence or no attribution"),

@@ -60,6 +60,8 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
     shown = shown_matchers(board.table, contrasts)
     queries = queries_of(board.scores)
     steps = steps_frame(board.table, queries, shown)
+    if steps.empty:  # a table without a row does not know its types, by which it is held against others
+        steps = steps.astype({name: queries[name].dtype for name in ("strength", "view_cells")})
     ages = ages_frame(steps, queries, board.measured)
     # An age is no other strength: where maps have ages, those are the axis.
     others = steps[~steps["suite"].isin(set(ages["suite"]))]

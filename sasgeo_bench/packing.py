@@ -13,19 +13,19 @@ from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, Tell, make_board
 from sasgeo_bench.entries import Entry
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.plugins import check_registered
 from sasgeo_bench.report.contrasts import Contrast
+from sasgeo_bench.results import one_line
 from sasgeo_bench.store.catalog import find_split
 from sasgeo_bench.store.learnedfile import LearnedSaid
+from sasgeo_bench.store.packdir import check_results, is_pack, read_settings
 from sasgeo_bench.store.packfile import (
     MOST_BYTES,
     Packed,
     StoredRun,
     TaskFolders,
-    is_pack,
-    read_settings,
     unpack,
     unpack_tasks,
     write_pack,
@@ -159,21 +159,17 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
     if not stored:
         return Settings()
     said = read_settings(stored[0])
-    try:
-        return Settings(
-            split=said["split"],
-            rejectors=said["rejectors"],
-            contrasts=tuple(
-                Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])})
-                for item in said["contrasts"]
-            ),
-            draws=int(said["draws"]),
-            by_region=said["by_region"],
-            pipeline=said["pipeline"],
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        message = f"{stored[0]} does not say how it was scored ({error!r}): fetch it again"
-        raise StoreError(message) from error
+    return Settings(
+        split=said["split"],
+        rejectors=said["rejectors"],
+        contrasts=tuple(
+            Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])})
+            for item in said["contrasts"]
+        ),
+        draws=said["draws"],
+        by_region=said["by_region"],
+        pipeline=said["pipeline"],
+    )
 
 
 def request_of(
@@ -252,6 +248,7 @@ def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True, resu
     """
     if results is not None:
         _check_whole(request)
+        check_results(results / request.board.name, request.board)
     kept = stored_among(request.predictions)
     with laid_out(request) as laid:
         figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
@@ -318,13 +315,27 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
         found = unpack(stored, Path(folder))
         others = [path for path in request.predictions if path != stored]
-        yield replace(
-            request,
-            predictions=[*found.runs, *others],
-            tasks=found.tasks,
-            root=found.root,
-            truth=found.root / "truth",
-        )
+        with _told_of(stored, found.root):
+            yield replace(
+                request,
+                predictions=[*found.runs, *others],
+                tasks=found.tasks,
+                root=found.root,
+                truth=found.root / "truth",
+            )
+
+
+@contextmanager
+def _told_of(stored: Path, root: Path) -> Iterator[None]:
+    """Tell what is wrong with a folder that will be gone of the stored results that were laid out there."""
+    try:
+        yield
+    except SasgeoError as error:
+        if str(root) not in str(error):
+            raise
+        fault = one_line(str(error).replace(f"{root}/", ""))
+        message = f"{stored} holds no sound stored results ({fault}): fetch them again"
+        raise StoreError(message) from error
 
 
 @contextmanager
@@ -351,7 +362,8 @@ def laid_tasks(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
         tasks: list[Path] = []
         for number, path in enumerate(paths):
             tasks += unpack_tasks(path, Path(folder) / str(number)) if is_pack(path) else [path]
-        yield tuple(tasks)
+        with _told_of(next(filter(is_pack, paths), Path()), Path(folder)):
+            yield tuple(tasks)
 
 
 def board_of(paths: Sequence[Path]) -> str:

@@ -28,6 +28,7 @@ from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.split import HALVES, Half
 from sasgeo_bench.store import rundir
+from sasgeo_bench.store.packdir import check_results
 from sasgeo_bench.suites.base import Choice
 from sasgeo_bench.tasks import is_of_region, made_tasks, why_to_draw
 
@@ -305,8 +306,11 @@ def run_pipeline(
     ConfigError
         If no region can carry any of the suites.
     StoreError
-        As `packing.pack_board` does; the board itself is then written.
+        If the board cannot be stored where it should, before anything is done; or as `packing.pack_board` does, when
+        the board itself is written.
     """
+    if results is not None:
+        check_results(results / plan.spec.id, board_folder(plan))
     tasks = [*_draw(plan.requests, tell, jobs=plan.jobs), *_draw_paper(plan, tell)]
     if not tasks:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"

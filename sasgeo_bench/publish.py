@@ -2,12 +2,14 @@
 """A board's folder -> its site: the order of the steps."""
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.boards import Tell
+from sasgeo_bench.boardshape import check_shape
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.report.contrasts import Contrast
@@ -15,6 +17,8 @@ from sasgeo_bench.report.site import site_pages
 from sasgeo_bench.report.sitepages import places_on_map, regions_of
 from sasgeo_bench.report.siteplots import draw_places, draw_rates
 from sasgeo_bench.report.sitesource import Case, Download, Picture, Pictures, SiteFigure, SiteSource, Spot
+from sasgeo_bench.results import one_line
+from sasgeo_bench.store.boardfile import LEADERBOARD
 from sasgeo_bench.store.catalog import (
     find_pipeline_file,
     find_split_file,
@@ -23,10 +27,10 @@ from sasgeo_bench.store.catalog import (
     read_region_file,
     read_split_file,
 )
+from sasgeo_bench.store.fileset import SITE, led_to
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.store.sitedir import (
     MOST_BYTES,
-    SITE,
     BoardFiles,
     Drawn,
     Written,
@@ -62,23 +66,45 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
     StoreError
         If there is no sound board, or the site cannot be written; an older site is then as it was.
     """
-    target = board / SITE if into is None else into
-    if target.resolve() == board.resolve() or (target.parent.resolve() == board.resolve() and target.name != SITE):
+    if into is None and (board / SITE).is_symlink():
+        message = f"{board / SITE} is a link: name where it leads with --into"
+        raise StoreError(message)
+    target = board / SITE if into is None else led_to(into)
+    place, whole = target.parent.resolve() / target.name, board.resolve()
+    if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
         message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         raise StoreError(message)
     with held(board, target, tell=tell):
         files = read_board_files(board)
-        source, drawn = _source(files, tell)
+        with _sound(board):
+            for name, table in {LEADERBOARD: files.board, **files.tables}.items():
+                check_shape(name, table)
+            source, drawn = _source(files, tell)
+            pages = site_pages(source)
         written = write_site(
             target,
             files,
-            pages=site_pages(source),
+            pages=pages,
             drawn=drawn,
             about={"board": source.name, "made_by": files.about.get("made_by")},
         )
     if written.site_bytes > MOST_BYTES:
         tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB, pictures apart: slow to open from afar")
     return written
+
+
+@contextmanager
+def _sound(board: Path) -> Iterator[None]:
+    """Tell what is wrong with a board that anybody may have made: its tables, or values that no page can show."""
+    try:
+        yield
+    except StoreError as error:
+        message = str(error) if str(board) in str(error) else f"{board} holds a damaged board: {error}"
+        raise StoreError(message) from error
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        text = one_line(repr(error))
+        message = f"{board} holds a board that no page can be made of ({text}): score it again"
+        raise StoreError(message) from error
 
 
 def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:

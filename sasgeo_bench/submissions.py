@@ -21,7 +21,7 @@ from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.catalog import find_split
-from sasgeo_bench.store.packfile import is_pack, read_settings
+from sasgeo_bench.store.packdir import is_pack, read_settings
 from sasgeo_bench.store.submissiondir import list_submissions, read_card, read_submission, write_submission
 from sasgeo_bench.submissionfile import SCHEMA_VERSION, Card, Submission, TaskSaid
 from sasgeo_bench.validate import Violation, submission_faults, validate

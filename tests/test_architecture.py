@@ -70,7 +70,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissionfile": None,
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
-        *("boardfile", "packfile", "sitedir", "pluginfiles"),
+        *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
         *(
             "preview",
             "picture",
@@ -135,6 +135,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissions": None,
     "paperboard": None,
     "pipeline": None,
+    "boardshape": None,
     "publish": None,
     "release": None,
     "scaffold": None,

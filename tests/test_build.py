@@ -196,7 +196,15 @@ def test_a_manifest_of_another_schema_is_refused_and_built_again(tmp_path):
     assert manifest.schema_version == 1
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": 1}'])
+def test_a_manifest_without_a_file_of_a_region_is_refused(tmp_path):
+    plan, _ = built(tmp_path, small())
+    path = plan.folder / "region.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"files": {}}))
+    with pytest.raises(StoreError, match=r"is damaged \(its files lack layers.tif\): build the region again"):
+        read_manifest(plan.folder)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": 1}', "[" * 100_000])
 def test_a_damaged_manifest_is_told_in_one_line(content, tmp_path):
     (tmp_path / "region.json").write_text(content)
     with pytest.raises(StoreError, match="build the region again") as caught:

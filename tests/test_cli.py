@@ -165,3 +165,11 @@ def test_ctrl_c_leaves_nothing_half_written(tmp_path):
     left = [path for path in (tmp_path / "out/regions").iterdir() if not path.name.endswith(".lock")]
     assert all((path / "region.json").is_file() for path in left)
     assert not any(path.name.startswith(".") for path in left)
+
+
+def test_a_message_without_end_is_cut_in_its_middle(program):
+    code, _, err = program("score", "--predictions", "p", "--name", "a" * 5000)
+    assert code == 2
+    assert len(err) < 2100
+    assert " ... " in err
+    assert err.startswith("sasgeo-bench: --name must hold letters")

@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench import packing
+from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import ScoreRequest
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -19,8 +21,11 @@ from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.query import base_of
 from sasgeo_bench.report.contrasts import Contrast
-from sasgeo_bench.store import packfile
-from sasgeo_bench.store.packfile import read_settings
+from sasgeo_bench.store import fileset, packfile
+from sasgeo_bench.store.boardfile import read_pictures
+from sasgeo_bench.store.packdir import read_settings
+from sasgeo_bench.store.packfile import unpack, unpack_tasks
+from sasgeo_bench.store.regiondir import sha256_of
 from sasgeo_bench.tomlfile import parse_toml
 
 PIPELINE = """
@@ -230,7 +235,7 @@ def test_a_folder_of_something_else_is_not_replaced(kept, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("pack.json", "holds no sound stored results"), ("truths.parquet", "holds no sound stored results")],
+    [("pack.json", "holds no sound stored results"), ("truths.parquet", "truths.parquet differs")],
 )
 def test_damaged_results_are_told_in_a_line(kept, tmp_path, name, words, program):
     board, plan, _, _ = kept
@@ -268,6 +273,231 @@ def test_named_on_the_command_line_code_judges_stored_results(kept):
     assert asked.rejectors == ["mine:Rejector"]
 
 
+def hash_again(folder, **changes):
+    """Make what pack.json says true of whatever lies there now."""
+    said = json.loads((folder / "pack.json").read_text(encoding="utf-8")) | changes
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "pack.json"]
+    said["files"] = {path.relative_to(folder).as_posix(): sha256_of(path) for path in paths}
+    (folder / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+
+
+@pytest.fixture
+def own(kept, tmp_path):
+    return Path(shutil.copytree(kept[2], tmp_path / "own"))
+
+
+def test_every_file_of_stored_results_has_its_hash(kept):
+    said = json.loads((kept[2] / "pack.json").read_text(encoding="utf-8"))
+    there = {path.relative_to(kept[2]).as_posix(): path for path in kept[2].rglob("*") if path.is_file()}
+    assert said["files"].keys() == there.keys() - {"pack.json"}
+    assert all(sha256_of(there[name]) == digest for name, digest in said["files"].items())
+
+
+@pytest.mark.parametrize("name", ["board.json", "figures", "learned", "predictions"])
+def test_a_file_that_differs_is_missing_or_is_more_is_named(own, mistake, name):
+    file = next(path for path in [own / name, *sorted((own / name).rglob("*"))] if path.is_file())
+    shown, data = file.relative_to(own).as_posix(), file.read_bytes()
+    fetch = "pack.json says ({} {}): fetch the results again"
+    file.write_bytes(data + b" ")
+    assert fetch.format(shown, "differs") in mistake("score", "--predictions", own)
+    file.unlink()
+    assert fetch.format(shown, "is missing") in mistake("score", "--predictions", own)
+    file.write_bytes(data)
+    file.with_name("more").touch()
+    more = file.with_name("more").relative_to(own).as_posix()
+    with pytest.raises(StoreError, match=f"{more} is not in its list"):
+        unpack_tasks(own, own.parent)
+    file.with_name("more").unlink()
+    assert read_settings(own)["split"] == "crossfit"
+
+
+def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replaced(kept, own, tmp_path):
+    said = json.loads((own / "pack.json").read_text(encoding="utf-8")) | {"schema_version": 1}
+    del said["files"]
+    (own / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+    assert read_settings(own)["files"] is None
+    assert len(unpack(own, tmp_path / "into").runs) == len(pq.read_table(own / "runs.parquet"))
+    pack_board(kept[0], request_of(kept[1]), own)
+    assert json.loads((own / "pack.json").read_text(encoding="utf-8"))["schema_version"] == 2
+    (own / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+    (own / "NOTES.txt").touch()
+    with pytest.raises(StoreError, match=r"1 file \(NOTES.txt\) that would be lost"):
+        pack_board(kept[0], request_of(kept[1]), own)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ('{"split": 5}', "split is 5"),
+        ('{"rejectors": 5}', "rejectors is 5"),
+        ('{"rejectors": null}', "rejectors is None"),
+        ('{"rejectors": [5]}', "rejectors.0 is 5"),
+        ('{"draws": 1e400}', "draws is inf"),
+        ('{"draws": 1000000000}', "draws is 1000000000"),
+        ('{"by_region": 5}', "by_region is 5"),
+        ('{"pipeline": 5}', "is 5"),
+        ('{"pipeline": null}', "is None"),
+        ('{"pipeline": "x"}', "is 'x'"),
+        ('{"pipeline": {"id": "../../x", "sha256": ""}}', "'../../x'"),
+        ('{"contrasts": [5]}', "contrasts.0 is 5"),
+        ('{"contrasts": [{"name": "a", "first": "b", "second": 5, "suites": []}]}', "contrasts.0.second is 5"),
+        ('{"contestants": {}}', "contestants is {}"),
+        ('{"files": null}', "lists no files"),
+        ('{"files": {"a": 5}}', "files.a is 5"),
+        ('{"schema_version": 3}', "has schema version 3"),
+        ("[" * 200_000, "recursion"),
+    ],
+)
+def test_settings_of_another_type_are_one_line(own, mistake, text, fault):
+    if text.startswith("{"):
+        said = json.loads((own / "pack.json").read_text(encoding="utf-8")) | json.loads(text)
+        text = json.dumps(said).replace("Infinity", "1e400")
+    (own / "pack.json").write_text(text, encoding="utf-8")
+    line = mistake("score", "--predictions", own)
+    assert fault in line
+    assert str(own) in line
+    assert len(line) < 600
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("runs", "rows", -3),
+        ("runs", "rows", 1),
+        ("runs", "about", "{}"),
+        ("tasks", "task_json", "{}"),
+        ("tasks", "task_json", "[" * 100_000),
+        ("tasks", "truth_json", "{}"),
+        ("truths", "candidate", 10**6),
+        ("truths", "pair_id", None),
+        ("truths", "block", None),
+        ("truths", "role", "x"),
+        ("truths", "strength", float("nan")),
+        ("truths", "easting_m", float("nan")),
+        ("truths", "easting_m", None),
+        ("truths", "query_id", "other"),
+        ("truths", "task", 99),
+        ("truths", "measured", [("age_years", None)]),
+        ("queries", "view_bytes", None),
+        ("queries", "view_bytes", -1),
+        ("queries", "prior_group", "x"),
+        ("queries", "candidates", [{"easting_m": float("inf"), "northing_m": 0.0, "yaw_deg": 0.0, "scale": 1.0}]),
+        ("predictions/random-*", "status", "x"),
+        ("predictions/random-*", "query_id", "other"),
+        ("predictions/random-*", "confidence", 7.0),
+        ("predictions/random-*", "latency_s", -1.0),
+        ("predictions/random-*", "candidates", [{"easting_m": 0.0, "northing_m": 0.0, "yaw_deg": 0.0, "scale": 0.0}]),
+    ],
+)
+def test_rows_that_nobody_scores_are_one_line_that_names_the_results(own, mistake, table, column, value):
+    (path,) = own.glob(f"{table}.parquet")
+    found = pq.read_table(path)
+    rows = found.to_pylist()
+    rows[0][column] = value
+    pq.write_table(pa.Table.from_pylist(rows, schema=found.schema), path)
+    hash_again(own)
+    line = mistake("score", "--predictions", own)
+    assert f"{own} holds no sound stored results (" in line
+    assert "fetch them again" in line
+    assert "sasgeo-bench-" not in line
+    assert len(line) < 600
+
+
+def test_a_table_of_other_columns_is_one_line(own, mistake):
+    pq.write_table(pq.read_table(own / "truths.parquet").drop_columns(["kind"]), own / "truths.parquet")
+    hash_again(own)
+    assert "truths.parquet holds no column 'kind'" in mistake("score", "--predictions", own)
+
+
+def test_a_link_in_stored_results_is_refused_and_a_site_is_not(own, mistake, tmp_path):
+    (own / "site").mkdir()
+    (own / "site" / "index.html").touch()
+    assert read_settings(own)
+    (tmp_path / "secret").write_text("secret", encoding="utf-8")
+    (own / "leaderboard.md").unlink()
+    (own / "leaderboard.md").symlink_to(tmp_path / "secret")
+    hash_again(own)
+    assert "leaderboard.md is a link, or no file" in mistake("score", "--predictions", own)
+    with pytest.raises(StoreError, match="is a link, or no file"):
+        read_pictures_of_a_link(own, tmp_path)
+
+
+def read_pictures_of_a_link(own, tmp_path):
+    (own / "pictures" / "more.png").symlink_to(tmp_path / "secret")
+    return read_pictures(own)
+
+
+def test_where_results_go_is_looked_at_before_anything_is_scored(own, mistake, tmp_path):
+    def refused(folder, *more):
+        line = mistake("score", "--predictions", own, "--name", "mine", "--results", folder, *more)
+        assert not (tmp_path / "out").exists() or not any((tmp_path / "out").rglob("board.json"))
+        return line
+
+    for name in ("thesis/mine", "file"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "thesis" / "mine" / "chapter.txt").touch()
+    (tmp_path / "file" / "mine").touch()
+    assert "holds something else than stored results" in refused(tmp_path / "thesis")
+    assert "holds something else than stored results" in refused(tmp_path / "file")
+    assert "is a file: name another folder" in refused(tmp_path / "file" / "mine")
+    assert "would lie in the board" in refused(tmp_path / "out" / "boards" / "mine")
+    assert "would lie in the board" in refused(own / "figures")
+    assert "would take the place of the board" in refused(tmp_path / "out" / "boards")
+    assert "would take the place of the board" in refused(tmp_path, "--out", tmp_path / "mine")
+    assert "--results names no folder" in refused("")
+    shutil.copytree(own, tmp_path / "there" / "mine")
+    (tmp_path / "there" / "mine" / ".git").mkdir()
+    (tmp_path / "there" / "mine" / ".git" / "HEAD").touch()
+    (tmp_path / "there" / "mine" / "NOTES.txt").touch()
+    assert "2 files (.git/HEAD, NOTES.txt) that would be lost" in refused(tmp_path / "there")
+
+
+def test_what_cannot_be_written_is_told_before_anything_is_scored(own, mistake, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(fileset.tempfile, "TemporaryDirectory", refuse)
+    line = mistake("score", "--predictions", own, "--results", tmp_path / "results")
+    assert "cannot be written (Read-only file system): check your rights, or name another folder" in line
+
+
+def test_a_pipeline_looks_where_results_go_before_it_draws(kept, tmp_path):
+    plan = replace(kept[1], out=tmp_path / "out")
+    (tmp_path / "kept").touch()
+    with pytest.raises(StoreError, match="holds something else than stored results"):
+        run_pipeline(plan, tell=lambda _: None, results=tmp_path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_are_stored_where_a_link_leads(kept, own, tmp_path):
+    (tmp_path / "kept").symlink_to(own)
+    pack_board(kept[0], request_of(kept[1]), tmp_path / "kept")
+    assert (tmp_path / "kept").is_symlink()
+    assert read_settings(own)["split"] == "crossfit"
+    (tmp_path / "one").symlink_to(tmp_path / "two")
+    (tmp_path / "two").symlink_to(tmp_path / "one")
+    with pytest.raises(StoreError, match="leads in a circle"):
+        pack_board(kept[0], request_of(kept[1]), tmp_path / "one")
+
+
+def test_a_full_disk_is_a_short_line(kept, tmp_path, monkeypatch):
+    def fill(source, target, **_):
+        raise shutil.Error([(f"{source}/{at}", f"{target}/{at}", "No space left on device") for at in range(100)])
+
+    monkeypatch.setattr(packfile.shutil, "copytree", fill)
+    with pytest.raises(StoreError, match=r"cannot be written \(No space left on device\)") as caught:
+        pack_board(kept[0], request_of(kept[1]), tmp_path / "kept")
+    assert len(str(caught.value)) < 400
+
+
+def test_a_board_of_absent_places_alone_has_figures_of_what_is_left(kept):
+    board, lines = kept[0], []
+    absent = {name: frame.assign(is_present=False) for name, frame in board.scores.items()}
+    figures = figures_extra(replace(board, scores=absent, findings=()), tell=lines.append).figures
+    assert "age of the map" in lines[-1]
+    assert "strength" not in " ".join(figures)
+
+
 def test_a_name_that_leads_out_is_refused(kept, tmp_path):
     board, plan, _, _ = kept
     pack_board(board, request_of(plan), tmp_path / "kept")
@@ -275,6 +505,7 @@ def test_a_name_that_leads_out_is_refused(kept, tmp_path):
     rows = table.to_pylist()
     rows[0]["task_json"] = json.dumps(json.loads(rows[0]["task_json"]) | {"region": "../../out"})
     pq.write_table(table.from_pylist(rows, schema=table.schema), tmp_path / "kept" / "tasks.parquet")
+    hash_again(tmp_path / "kept")
     with (
         pytest.raises(StoreError, match="is no name of a folder"),
         laid_out(ScoreRequest(predictions=[tmp_path / "kept"], root=tmp_path, board=tmp_path / "board")),

@@ -384,7 +384,11 @@ def test_a_folder_without_a_board_is_one_line(mistake, tmp_path):
     ("name", "text", "fault"),
     [
         ("board.json", "{", "holds a damaged board"),
-        ("board.json", '{"entries": [1]}', "'entries' is no list of entries with 'name'"),
+        (
+            "board.json",
+            '{"entries": [1]}',
+            "holds a damaged board (entries.0 is 1: Input should be an object)",
+        ),
         ("leaderboard.parquet", "half", "holds a damaged board"),
         ("scores.parquet", "half", "holds a damaged board"),
         ("figures/age.svg.gz", "half", "holds a damaged board"),
@@ -392,6 +396,18 @@ def test_a_folder_without_a_board_is_one_line(mistake, tmp_path):
         ("pictures/pictures.json", '{"regions": [{"file": "../board.json"}]}', "which is no picture"),
         ("pictures/pictures.json", '{"cases": [{"file": "lost.png"}]}', "names 'lost.png', which is no picture"),
         ("pictures/pictures.json", '{"cases": [{"alt": "no file"}]}', "pictures.json is damaged"),
+        ("pictures/pictures.json", "[" * 200_000, "pictures.json is damaged"),
+        ("pictures/pictures.json", '{"cases": [{"file": "a.png", "said": 5}]}', "cases.0.said is 5"),
+        ("board.json", "[" * 200_000, "holds a damaged board (Invalid JSON: recursion limit"),
+        ("board.json", '{"pipeline": 5}', "pipeline is 5"),
+        ("board.json", '{"libraries": []}', "libraries is []"),
+        ("board.json", '{"rejectors": [1]}', "rejectors.0 is 1"),
+        ("board.json", '{"remarks": "one"}', "remarks is 'one'"),
+        ("board.json", '{"entries": [{"name": null}]}', "entries.0.name is None"),
+        ("board.json", '{"entries": [{"name": "a", "card": []}]}', "entries.0.card is []"),
+        ("board.json", '{"entries": [{"name": "a", "learned": [{}]}]}', "entries.0.learned.0.file"),
+        ("board.json", '{"tasks": [{"region": 1}]}', "tasks.0.region is 1"),
+        ("board.json", '{"contrasts": [{}]}', "contrasts.0.name"),
     ],
 )
 def test_damaged_files_of_a_board_are_one_line_and_nothing_is_written(own, mistake, name, text, fault):
@@ -400,9 +416,139 @@ def test_damaged_files_of_a_board_are_one_line_and_nothing_is_written(own, mista
     assert not (own / "site").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "column", "value"),
+    [
+        ("leaderboard", "n", None),
+        ("leaderboard", "n", "many"),
+        ("leaderboard", "matcher", None),
+        ("leaderboard", "value", "half"),
+        ("leaderboard", "is_applicable", "yes"),
+        ("contrasts", "verdict", 5.0),
+        ("contrasts", "difference", "half"),
+        ("controls", "holds", "yes"),
+        ("scores", "suite", 5),
+    ],
+)
+def test_a_column_of_another_type_is_one_line(own, mistake, name, column, value):
+    path = own / f"{name}.parquet"
+    table = pd.read_parquet(path)
+    table.assign(**{column: [value] * len(table)}).to_parquet(path)
+    assert f"{name}.parquet: {column} holds something else than it should" in mistake("publish", "--board", own)
+    table.drop(columns=column).to_parquet(path)
+    assert f"{name}.parquet has no column '{column}'" in mistake("publish", "--board", own)
+    assert not (own / "site").exists()
+
+
+@pytest.mark.parametrize("data", [gzip.compress(b"a" * 100_000)[:60], b"half", gzip.compress(bytes(60_000_000))])
+def test_a_packed_file_that_is_cut_off_or_holds_too_much_is_one_line(own, mistake, data):
+    (own / "leaderboard.csv").unlink()
+    (own / "leaderboard.csv.gz").write_bytes(data)
+    assert "holds a damaged board (leaderboard.csv.gz" in mistake("publish", "--board", own)
+    damaged = bytearray(gzip.compress(bytes(range(256)) * 40))
+    damaged[40:60] = bytes(20)
+    (own / "leaderboard.csv.gz").write_bytes(damaged)
+    assert "holds a damaged board (leaderboard.csv.gz" in mistake("publish", "--board", own)
+
+
+def test_a_link_in_a_board_is_refused_whatever_it_leads_to(own, mistake, tmp_path):
+    (tmp_path / "secret.svg").write_text("<svg/>", encoding="utf-8")
+    for name in ("leaderboard.md", "figures/a.svg", "pictures/a.png", "more"):
+        path = own / name
+        kept = path.read_bytes() if path.is_file() else None
+        path.unlink(missing_ok=True)
+        path.symlink_to(tmp_path / "secret.svg")
+        assert f"{path} is a link, or no file" in mistake("publish", "--board", own)
+        path.unlink()
+        if kept is not None:
+            path.write_bytes(kept)
+    (own / "site").symlink_to(tmp_path)
+    assert "site is a link: name where it leads with --into" in mistake("publish", "--board", own)
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        "<script>alert(1)</script>",
+        '<path d="M 0 0" onload="alert(1)"/>',
+        '<path d="M 0 0" OnClick="alert(1)"/>',
+        '<a href="javascript:alert(1)"><path d=""/></a>',
+        '<use href="java&#115;cript:alert(1)"/>',
+        '<image href="https://elsewhere.org/a.png"/>',
+        '<image xmlns:x="http://www.w3.org/1999/xlink" x:href="//elsewhere.org/a.png"/>',
+        '<image href="data:image/svg+xml;base64,PHN2Zy8+"/>',
+        "<style>@import 'https://elsewhere.org/a.css';</style>",
+        '<path style="fill: url(https://elsewhere.org/a)"/>',
+        "<foreignObject/>",
+        '<b:script xmlns:b="http://www.w3.org/1999/xhtml">alert(1)</b:script>',
+        "<set/>",
+    ],
+)
+def test_a_figure_that_acts_or_fetches_is_refused_by_its_name(own, mistake, inside):
+    (own / "figures" / "bad.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{inside}</svg>', "utf-8")
+    line = mistake("publish", "--board", own)
+    assert f"{own / 'figures' / 'bad.svg'} holds " in line
+    assert "as no figure of a board does: score it again, or remove the file" in line
+    assert not (own / "site").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ('<!DOCTYPE svg [<!ENTITY a "b">]><svg xmlns="http://www.w3.org/2000/svg"/>', "bad.svg holds a declaration"),
+        ('<?xml version="1.0" encoding="utf-7"?><svg xmlns="http://www.w3.org/2000/svg"/>', "holds a declaration"),
+        ("<svg", "bad.svg: it is no XML"),
+        ("<svg/>", "bad.svg holds an element 'svg'"),
+    ],
+)
+def test_a_figure_that_is_no_plain_svg_is_refused(own, mistake, text, fault):
+    (own / "figures" / "bad.svg").write_text(text, encoding="utf-8")
+    assert fault in mistake("publish", "--board", own)
+
+
+def test_files_of_ones_own_in_an_older_site_are_never_lost(own, mistake, tmp_path):
+    target = tmp_path / "public"
+    publish(own, target, tell=quiet)
+    said = json.loads((target / "site.json").read_text(encoding="utf-8"))
+    assert {*said["files"], "site.json"} == contents(target).keys()
+    publish(own, target, tell=quiet)
+    (target / ".git").mkdir()
+    (target / ".git" / "HEAD").touch()
+    (target / "CNAME").touch()
+    lost = "2 files (.git/HEAD, CNAME) that would be lost, for nothing of it is part of a site: move that away"
+    assert lost in mistake("publish", "--board", own, "--into", target)
+    del said["files"]
+    (target / "site.json").write_text(json.dumps(said), encoding="utf-8")
+    assert lost in mistake("publish", "--board", own, "--into", target)
+    shutil.rmtree(target / ".git")
+    (target / "CNAME").unlink()
+    publish(own, target, tell=quiet)
+    publish(own, tell=quiet)
+    (own / "site" / "CNAME").touch()
+    (own / "figures" / "notes.txt").touch()
+    with pytest.raises(StoreError, match=r"1 file \(figures/notes.txt\) that would be lost"):
+        check_board(own, scorer_version=json.loads((own / "board.json").read_text(encoding="utf-8"))["scorer_version"])
+    (own / "figures" / "notes.txt").unlink()
+    with pytest.raises(StoreError, match=r"1 file \(CNAME\) that would be lost"):
+        check_board(own, scorer_version=json.loads((own / "board.json").read_text(encoding="utf-8"))["scorer_version"])
+
+
+def test_a_site_is_written_where_a_link_leads(own, mistake, tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    publish(own, tmp_path / "link", tell=quiet)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "index.html").is_file()
+    (tmp_path / "one").symlink_to(tmp_path / "one")
+    assert "leads in a circle" in mistake("publish", "--board", own, "--into", tmp_path / "one")
+    assert "is the board itself" in mistake("publish", "--board", own, "--into", own / "figures" / "deep")
+
+
 def test_a_table_that_is_no_leaderboard_is_one_line(own, mistake):
     pd.DataFrame({"matcher": ["mine"]}).to_parquet(own / "leaderboard.parquet")
-    assert "holds a board without the column 'metric'" in mistake("publish", "--board", own)
+    assert "holds a damaged board: leaderboard.parquet has no column 'rejector': score it again" in mistake(
+        "publish", "--board", own
+    )
 
 
 def test_the_command_ends_with_the_path_to_open(program, own):

@@ -361,11 +361,18 @@ def _edit(path: Path, **changes: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
+OF_A_MAP = ("layers.tif", "features.parquet", "nodes.parquet", "edges.parquet")
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
         ({"licence": ""}, "says no licence or no attribution, and a release must: build the region again"),
-        ({"files": {"../stray": {"sha256": "0" * 64, "bytes": 1}}}, "is damaged (it names the file '../stray')"),
+        ({"files": {}}, "is damaged (its files lack layers.tif): build the region again"),
+        (
+            {"files": {name: {"sha256": "0" * 64, "bytes": 1} for name in (*OF_A_MAP, "../stray")}},
+            "is damaged (it names the file '../stray')",
+        ),
         ({"licence": "  "}, "says no licence or no attribution"),
         ({"attribution": ""}, "says no licence or no attribution"),
         ({"licence": "CC-BY-4.0"}, "says licence 'CC-BY-4.0': a release holds data under ODbL-1.0 alone"),

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sasgeo_bench.boards import Board
 from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.packing import board_of, request_of, score_all
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
@@ -21,12 +21,26 @@ from sasgeo_bench.store.catalog import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.submissions import submissions_for
 
 CONTROL_FAILED: Final = 3  # exit status
+
+
+def _folder(text: str) -> Path:
+    """Refuse an empty name, which would be taken for the folder one is in."""
+    if not text:
+        message = "--results names no folder: name one, as in docs/results"
+        raise StoreError(message)
+    return Path(text)
+
+
 Cases = Annotated[
     bool, typer.Option("--cases/--no-cases", help="show queries that went wrong on the board, with their truths")
 ]
 Results = Annotated[
     Path | None,
-    typer.Option(help="folder to store the board in with all it was made of, at most 20 MB: DIR/<name of the board>/"),
+    typer.Option(
+        help="folder to store the board in with all it was made of, at most 20 MB: DIR/<name of the board>/",
+        parser=_folder,
+        metavar="PATH",
+    ),
 ]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 

@@ -13,6 +13,17 @@ import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.results import one_line
+from sasgeo_bench.store.fileset import (
+    FIGURE_FILES,
+    PICTURE_FILES,
+    SITE,
+    SITE_FOLDERS,
+    check_known,
+    check_site,
+    list_files,
+)
+from sasgeo_bench.store.packabout import BoardSaid, parse_said
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 
 LEADERBOARD: Final = "leaderboard"
@@ -24,14 +35,14 @@ PICTURES: Final = "pictures"
 PICTURES_SAID: Final = "pictures.json"
 _AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a spreadsheet
 _VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
-_KNOWN: Final = (
+BOARD_FILES: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
     *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
     *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
-    *(FIGURES, PICTURES, "site", ".site.partial", ".site.replaced"),  # the latter two where publishing was killed
 )
+_TOP: Final = (*BOARD_FILES, FIGURES, PICTURES, *SITE_FOLDERS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,10 +145,12 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
     if folder.exists() and not folder.is_dir():
         message = f"{folder} is a file: move it away, a board goes there"
         raise StoreError(message)
-    other = next((path for path in sorted(folder.glob("*")) if path.name not in _KNOWN), None)
+    other = next((path for path in sorted(folder.glob("*")) if path.name not in _TOP), None)
     if other is not None:
         message = f"{other} is no part of a board and would be lost: move it away, or name another board"
         raise StoreError(message)
+    check_known(folder, BOARD_FILES, "a board", patterns=(*FIGURE_FILES, *PICTURE_FILES), without=SITE_FOLDERS)
+    check_site(folder / SITE)
     versions = map(_version, sorted(folder.glob("*.parquet")))
     found = next((version for version in versions if version != str(scorer_version)), None)
     if found is not None:
@@ -165,13 +178,14 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         If there is none, or a file is damaged.
     """
     try:
-        about = json.loads((folder / BOARD).read_text(encoding="utf-8"))
-        return dict(about), pq.read_table(folder / f"{LEADERBOARD}.parquet").to_pandas()
+        data = (folder / BOARD).read_bytes()
+        parse_said(data, BoardSaid)
+        return dict(json.loads(data)), pq.read_table(folder / f"{LEADERBOARD}.parquet").to_pandas()
     except FileNotFoundError as error:
         message = f"{folder} holds no board: score some runs first"
         raise StoreError(message) from error
-    except (OSError, ValueError, TypeError, pa.ArrowException) as error:
-        message = f"{folder} holds a damaged board ({' '.join(str(error).split())[:120]}): score again"
+    except (OSError, ValueError, TypeError, KeyError, MemoryError, pa.ArrowException) as error:
+        message = f"{folder} holds a damaged board ({one_line(str(error))}): score it again"
         raise StoreError(message) from error
 
 
@@ -190,8 +204,9 @@ def read_pictures(folder: Path) -> dict[str, bytes]:
     """
     place = folder / PICTURES
     try:
-        paths = sorted(path for path in place.rglob("*") if path.is_file())
-        return {path.relative_to(place).as_posix(): path.read_bytes() for path in paths}
+        return {name: (place / name).read_bytes() for name in list_files(place)}
+    except SasgeoError:
+        raise
     except OSError as error:
         message = f"{place} cannot be read ({error.strerror or error}): remove it, or fetch it again"
         raise StoreError(message) from error

@@ -10,7 +10,6 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,28 +18,34 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sasgeo_bench.errors import MatchError, SasgeoError, StoreError
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.store import learnedfile, rundir, taskdir
-from sasgeo_bench.store.boardfile import FIGURES, LEADERBOARD, PICTURES
+from sasgeo_bench.store.boardfile import FIGURES, PICTURES
+from sasgeo_bench.store.fileset import SITE_FOLDERS, hashes_of, led_to, list_files
 from sasgeo_bench.store.learnedfile import LearnedSaid
+from sasgeo_bench.store.packdir import (
+    CSV,
+    LEARNED,
+    PACK,
+    PREDICTIONS,
+    SCHEMA_VERSION,
+    TABLES,
+    check_replaced,
+    read_settings,
+    sound,
+)
+from sasgeo_bench.store.packrows import RUNS_SCHEMA, TASK, TASK_SCHEMA, check_predictions, check_tables
 from sasgeo_bench.store.regiondir import MANIFEST, fresh_folder, locked
 from sasgeo_bench.store.runrows import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.store.taskrows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under
 
-PACK: Final = "pack.json"
 MOST_BYTES: Final = 20_000_000
-SCHEMA_VERSION: Final = 1
-_PREDICTIONS: Final = "predictions"
-_LEARNED: Final = "learned"
-_TABLES: Final = ("runs", "tasks", "queries", "truths")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of what becomes a folder: never a way out
 _LEVEL: Final = 19
 _PAGE_BYTES: Final = 2**24  # what is alike is told once in a page: few pages, small files
-_CSV: Final = f"{LEADERBOARD}.csv"
-_TASK: Final = "task"  # column: number of the row in tasks.parquet
 _TEXTS: Final = ("query_id", "track", "suite", "part", "region", "prior_group", "status", "message")
 _AND: Final = "; "
 _NO_PICTURES: Final = "pictures of regions, suites and cases"
@@ -116,11 +121,13 @@ def write_pack(
         If it would be larger all the same, the folder holds something else, or a file cannot be read or written; what
         was there before is as it was.
     """
-    _check_replaced(folder)
+    check_replaced(folder)
+    folder = led_to(folder)
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
-            shutil.copytree(board, scratch, dirs_exist_ok=True)
-            _squeeze(scratch / _CSV)
+            list_files(board, without=SITE_FOLDERS)  # a link would be followed to what it leads to
+            shutil.copytree(board, scratch, dirs_exist_ok=True, ignore=shutil.ignore_patterns(*SITE_FOLDERS))
+            _squeeze(scratch / CSV)
             _write_tasks(scratch, tasks)
             _write_runs(scratch, runs)
             said, dropped = {**settings, "contestants": list(runs)}, lacks
@@ -137,18 +144,26 @@ def write_pack(
             if _bytes_of(scratch) > most_bytes:  # they are drawn again where results are scored
                 for figure in sorted((scratch / FIGURES).glob("*.svg")):
                     _squeeze(figure)
+                _write_settings(scratch, said, dropped)
             total = _bytes_of(scratch)
             _check_size(folder, total, found, most_bytes)
     except SasgeoError:
         raise
     except OSError as error:
         message = (
-            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights; results "
+            f"{folder} cannot be written ({_reason(error)}): check the free space and your rights; results "
             "that were there are as they were"
         )
         raise StoreError(message) from error
     count = sum(len(run.predictions) for listed in runs.values() for run in listed)
     return Packed(total_bytes=total, prediction_bytes=found, predictions=count, dropped=dropped)
+
+
+def _reason(error: OSError) -> str:
+    """Why something could not be written; of a folder that was copied the first file's reason is told for all."""
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list) and error.args[0]:
+        return one_line(str(error.args[0][0][-1]))
+    return one_line(str(error.strerror or error))
 
 
 def _with(dropped: str, more: str) -> str:
@@ -163,14 +178,9 @@ def _write_settings(folder: Path, said: Mapping[str, Any], dropped: str) -> None
         "dropped": dropped,
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
+        "files": hashes_of(folder, [name for name in list_files(folder) if name != PACK]),
     }
     (folder / PACK).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _check_replaced(folder: Path) -> None:
-    if folder.exists() and not is_pack(folder) and (not folder.is_dir() or any(folder.iterdir())):
-        message = f"{folder} holds something else than stored results, which would be lost: name another folder"
-        raise StoreError(message)
 
 
 def _check_size(folder: Path, total: int, predictions: int, most: int) -> None:
@@ -226,14 +236,13 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
         truths.append(_numbered(pq.read_table(item.truth / taskdir.TRUTH, columns=TRUTH_SCHEMA.names), number))
-    schema = pa.schema([(name, pa.string()) for name in ("task_json", "truth_json", "region_json")])
-    _write_table(pa.Table.from_pylist(said, schema=schema), folder / "tasks.parquet")
+    _write_table(pa.Table.from_pylist(said, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
     _write_table(pa.concat_tables(truths), folder / "truths.parquet")
 
 
 def _numbered(table: pa.Table, number: int) -> pa.Table:
-    return table.append_column(_TASK, pa.array(np.full(len(table), number), pa.int32()))
+    return table.append_column(TASK, pa.array(np.full(len(table), number), pa.int32()))
 
 
 def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
@@ -244,11 +253,10 @@ def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
             about = json.dumps(dict(run.about), ensure_ascii=False)
             rows.append({"contestant": name, "rows": len(run.predictions), "about": about})
             if run.learned is not None and run.learned.is_file():
-                place = folder / _LEARNED / _file_of(run.about)
+                place = folder / LEARNED / _file_of(run.about)
                 place.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(run.learned, place / run.learned.name)
-    schema = pa.schema([("contestant", pa.string()), ("rows", pa.int64()), ("about", pa.string())])
-    _write_table(pa.Table.from_pylist(rows, schema=schema), folder / "runs.parquet")
+    _write_table(pa.Table.from_pylist(rows, schema=RUNS_SCHEMA), folder / "runs.parquet")
 
 
 def _file_of(about: Mapping[str, Any]) -> str:
@@ -258,7 +266,7 @@ def _file_of(about: Mapping[str, Any]) -> str:
 
 def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
     """A file for each contestant, its runs one after the other; how many bytes they are."""
-    place = folder / _PREDICTIONS
+    place = folder / PREDICTIONS
     place.mkdir(exist_ok=True)
     for listed in runs.values():
         rows = [item for run in listed for item in run.predictions]
@@ -300,45 +308,6 @@ class Unpacked:
     runs: tuple[Path, ...]
 
 
-def is_pack(folder: Path) -> bool:
-    """Whether a folder holds stored results.
-
-    Examples
-    --------
-    >>> is_pack(Path("nowhere"))
-    False
-    """
-    return (folder / PACK).is_file()
-
-
-def read_settings(folder: Path) -> dict[str, Any]:
-    """How stored results were scored.
-
-    Raises
-    ------
-    StoreError
-        If there are none, or they are damaged or of another schema.
-    """
-    with _sound(folder):
-        content = json.loads((folder / PACK).read_text(encoding="utf-8"))
-        if content["schema_version"] != SCHEMA_VERSION:
-            message = f"{folder} has schema version {content['schema_version']!r}, this version reads {SCHEMA_VERSION}"
-            raise StoreError(message)
-        return dict(content)
-
-
-@contextmanager
-def _sound(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except StoreError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, MatchError) as error:
-        text = " ".join(repr(error).split())[:200]
-        message = f"{folder} holds no sound stored results ({text}): fetch them again"
-        raise StoreError(message) from error
-
-
 def unpack(folder: Path, into: Path) -> Unpacked:
     """Lay stored results out as tasks/, truth/, regions/ and runs/, as they are scored.
 
@@ -354,8 +323,10 @@ def unpack(folder: Path, into: Path) -> Unpacked:
     StoreError
         If the results are damaged.
     """
-    with _sound(folder):
-        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in _TABLES}
+    with sound(folder):
+        read_settings(folder)
+        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in TABLES}
+        check_tables(tables)
         tasks = tuple(_lay_tasks(tables, into))
         asked = dict(zip(*(tables["queries"][name].to_pylist() for name in ("query_id", ASKED)), strict=True))
         return Unpacked(root=into, tasks=tasks, runs=tuple(_lay_runs(folder, tables["runs"], asked, into)))
@@ -381,9 +352,10 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
     StoreError
         If the results are damaged.
     """
-    with _sound(folder):
+    with sound(folder):
         read_settings(folder)
-        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in _TABLES if name != "runs"}
+        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in TABLES if name != "runs"}
+        check_tables(tables)
         return tuple(_lay_tasks(tables, into))
 
 
@@ -408,8 +380,8 @@ def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
 
 def _parts_of(table: pa.Table) -> dict[int, pa.Table]:
     """Rows of each task, which lie together."""
-    numbers, starts, counts = np.unique(table[_TASK].to_numpy(), return_index=True, return_counts=True)
-    plain = table.drop_columns([_TASK])
+    numbers, starts, counts = np.unique(table[TASK].to_numpy(), return_index=True, return_counts=True)
+    plain = table.drop_columns([TASK])
     return {
         int(number): plain.slice(start, count) for number, start, count in zip(numbers, starts, counts, strict=True)
     }
@@ -428,9 +400,13 @@ def _lay_runs(folder: Path, runs: pa.Table, asked: Mapping[str, str], into: Path
         by_name.setdefault(row["contestant"], []).append({**row, "about": json.loads(row["about"])})
     for listed in by_name.values():
         stem = _folder_name(_file_of(listed[0]["about"]))
-        table, start = pq.read_table(folder / _PREDICTIONS / f"{stem}.parquet"), 0
-        if (folder / _LEARNED / stem).is_dir():
-            shutil.copytree(folder / _LEARNED / stem, into / "runs" / stem / learnedfile.FOLDER)
+        table, start = pq.read_table(folder / PREDICTIONS / f"{stem}.parquet"), 0
+        check_predictions(stem, table)
+        if sum(row["rows"] for row in listed) != len(table):
+            message = f"runs.parquet does not tell the {len(table)} answers of {stem}"
+            raise ValueError(message)
+        if (folder / LEARNED / stem).is_dir():
+            shutil.copytree(folder / LEARNED / stem, into / "runs" / stem / learnedfile.FOLDER)
         for row in listed:
             about, count = row["about"], row["rows"]
             place = into / "runs" / stem / _folder_name(about["suite"]) / _folder_name(about["region"])

@@ -100,14 +100,19 @@ def read_manifest(folder: Path) -> Manifest:
                 f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: build the region again"
             )
             raise StoreError(message)
-        return Manifest.model_validate(content)
-    except (json.JSONDecodeError, UnicodeDecodeError, ValidationError) as error:
+        manifest = Manifest.model_validate(content)
+    except (json.JSONDecodeError, UnicodeDecodeError, ValidationError, RecursionError) as error:
         text = " ".join(str(error).split())[:200]
         message = f"{path} is damaged ({text}): build the region again"
         raise StoreError(message) from error
     except PermissionError as error:
         message = f"{path} cannot be read: give yourself the right to"
         raise StoreError(message) from error
+    lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
+    if lost:
+        message = f"{path} is damaged (its files lack {lost[0]}): build the region again"
+        raise StoreError(message)
+    return manifest
 
 
 def read_region(folder: Path) -> Region:

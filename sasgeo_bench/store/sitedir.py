@@ -5,6 +5,7 @@ import gzip
 import html
 import json
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,12 +18,15 @@ import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.results import one_line
 from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, PROTECTION, SCORES, read_board
-from sasgeo_bench.store.packfile import is_pack, read_settings
+from sasgeo_bench.store.fileset import IMAGES, SITE_FOLDERS, check_site, list_files
+from sasgeo_bench.store.fileset import SITE_SAYS as MANIFEST
+from sasgeo_bench.store.packabout import PicturesSaid, parse_said
+from sasgeo_bench.store.packdir import is_pack, read_settings
 from sasgeo_bench.store.regiondir import fresh_folder, locked
+from sasgeo_bench.store.svgfile import svg_fault
 
-SITE: Final = "site"
-MANIFEST: Final = "site.json"  # without it a folder is no site, and is not replaced
 PICTURES: Final = "pictures"
 FILES: Final = "files"
 MOST_BYTES: Final = 5_000_000  # of a site, pictures of regions and cases apart; more is said
@@ -43,7 +47,8 @@ _OFFERED: Final = {  # what is offered for download, and what it is
 }
 _LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
 _LEFT_OUT_BYTES: Final = 1_500_000  # what is more, packed, stays with the board
-_IMAGES: Final = (".webp", ".png", ".jpg", ".jpeg")
+_MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz: what holds more is no text of ours
+_MOST_POINTS: Final = 100_000.0  # of a figure, either way
 _TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
 _SIZE: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
 _HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
@@ -69,7 +74,8 @@ class Drawn:
         ('A & B', 90.0, 45.0)
         """
         title, *sizes = (pattern.search(text) for pattern in (_TITLE, _SIZE, _HEIGHT))
-        width, height = (float(found[1]) if found else 480.0 for found in sizes)
+        said = (float(found[1]) if found else 0.0 for found in sizes)
+        width, height = (size if 0 < size < _MOST_POINTS else 480.0 for size in said)
         shown = html.unescape(title[1]).strip() if title else name
         return cls(text=text, title=" ".join(shown.split()), width=width, height=height)
 
@@ -99,15 +105,12 @@ def read_board_files(folder: Path) -> BoardFiles:
     Raises
     ------
     StoreError
-        If there is no board, or a file of it is damaged.
+        If there is no board, or a file of it is damaged, a link, or a figure that does more than draw.
     """
+    with _sound(folder):
+        list_files(folder, without=SITE_FOLDERS)
     about, board = read_board(folder)
     with _sound(folder):
-        missing = {"matcher", "rejector", "suite", "track", "prior_group", "stratum", "metric"} - set(board.columns)
-        if missing:
-            message = f"{folder} holds a board without the column {min(missing)!r}: score again"
-            raise StoreError(message)
-        _check_about(folder, about)
         return BoardFiles(
             folder=folder,
             about=about,
@@ -120,24 +123,18 @@ def read_board_files(folder: Path) -> BoardFiles:
         )
 
 
-def _check_about(folder: Path, about: Mapping[str, Any]) -> None:
-    """Refuse a `board.json` whose lists are none: pages go through them."""
-    for name, needed in (("entries", "name"), ("tasks", "region")):
-        listed = about.get(name, [])
-        if not isinstance(listed, list) or not all(isinstance(item, dict) and needed in item for item in listed):
-            message = f"{folder / BOARD} is damaged ({name!r} is no list of entries with {needed!r}): score again"
-            raise StoreError(message)
-
-
 @contextmanager
 def _sound(folder: Path) -> Iterator[None]:
     try:
         yield
     except SasgeoError:
         raise
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, pa.ArrowException) as error:
-        text = " ".join(str(error).split())[:160]
-        message = f"{folder} holds a damaged board ({text}): score again, or fetch the results again"
+    except (
+        *(OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, pa.ArrowException),
+        *(zlib.error, RecursionError, MemoryError),
+    ) as error:
+        text = one_line(str(error))
+        message = f"{folder} holds a damaged board ({text}): score it again, or fetch the results again"
         raise StoreError(message) from error
 
 
@@ -150,13 +147,41 @@ def _plain_or_packed(path: Path) -> bytes | None:
     packed = path.with_name(f"{path.name}.gz")
     if path.is_file():
         return path.read_bytes()
-    return gzip.decompress(packed.read_bytes()) if packed.is_file() else None
+    return _unpacked(packed) if packed.is_file() else None
+
+
+def _unpacked(path: Path) -> bytes:
+    """Text of a .gz, as much as anything of ours holds."""
+    try:
+        with gzip.open(path) as source:
+            data = source.read(_MOST_UNPACKED + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        message = f"{path.name} cannot be unpacked: {error}"
+        raise ValueError(message) from error
+    if len(data) > _MOST_UNPACKED:
+        message = f"{path.name} unpacks to more than {_MOST_UNPACKED / 1e6:g} MB"
+        raise ValueError(message)
+    return data
 
 
 def _read_figures(folder: Path) -> dict[str, Drawn]:
     names = sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")})
     found = {name: _plain_or_packed(folder / name) for name in names if name.endswith(".svg")}
-    return {name: Drawn.of(data.decode(), name.removesuffix(".svg")) for name, data in found.items() if data}
+    return {name: _figure_of(folder / name, data) for name, data in found.items() if data}
+
+
+def _figure_of(path: Path, data: bytes) -> Drawn:
+    """A figure that draws and does nothing else: a page leads to it."""
+    try:
+        text = data.decode()
+        fault = svg_fault(text)
+    except ValueError as error:
+        message = f"{path.name}: {error}"
+        raise ValueError(message) from error
+    if fault is not None:
+        message = f"{path} holds {fault}, as no figure of a board does: score it again, or remove the file"
+        raise StoreError(message)
+    return Drawn.of(text, path.stem)
 
 
 def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
@@ -176,14 +201,16 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
     if not said.is_file():
         return {}
     try:
-        content = json.loads(said.read_text(encoding="utf-8"))
+        data = said.read_bytes()
+        parse_said(data, PicturesSaid)
+        content = json.loads(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
         for item in (one for listed in found.values() for one in listed):
             _check_picture(folder, str(item["file"]))
     except SasgeoError:
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        text = " ".join(repr(error).split())[:120]
+        text = one_line(str(error))
         message = f"{said} is damaged ({text}): make the pictures again, or move the folder away"
         raise StoreError(message) from error
     return found
@@ -193,7 +220,7 @@ def _check_picture(folder: Path, name: str) -> None:
     """Refuse a picture that is none, is missing, or lies elsewhere."""
     path = folder / name
     is_inside = path.resolve().is_relative_to(folder.resolve()) and not Path(name).is_absolute()
-    if not is_inside or path.suffix.lower() not in _IMAGES or not path.is_file():
+    if not is_inside or path.suffix.lower() not in IMAGES or not path.is_file():
         message = (
             f"{folder / PICTURES}.json names {name!r}, which is no picture in {folder}: "
             "make the pictures again, or move the folder away"
@@ -249,7 +276,7 @@ def check_target(target: Path) -> None:
     Raises
     ------
     StoreError
-        If it is a file, or holds something and is no site.
+        If it is a file, or holds something and is no site, or one with files of somebody else.
     """
     if target.exists() and not target.is_dir():
         message = f"{target} is a file: move it away, or name another folder"
@@ -257,6 +284,7 @@ def check_target(target: Path) -> None:
     if target.is_dir() and any(target.iterdir()) and not (target / MANIFEST).is_file():
         message = f"{target} holds something else than a site, which would be lost: name another folder"
         raise StoreError(message)
+    check_site(target)
 
 
 def write_site(
@@ -293,9 +321,9 @@ def write_site(
     files: dict[str, bytes] = {name: text.encode() for name, text in pages.items()}
     files |= {f"{FIGURES}/{name}": text.encode() for name, text in figures.items()}
     files |= {f"{FILES}/{name}": data for name, (data, _) in board.downloads.items()}
-    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
-    files[MANIFEST] = (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
     pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
+    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION, "files": sorted({*files, *pictures})}
+    files[MANIFEST] = (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
     try:
         with fresh_folder(target) as scratch:
             for name, data in files.items():

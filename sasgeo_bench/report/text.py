@@ -60,7 +60,9 @@ def _tables_of(board: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     means = board[(board["rejector"] == "") & (board["suite"] != ALL_SUITES)]
     for (suite, track, prior_group), part in means.groupby(["suite", "track", "prior_group"], sort=True):
         primary = primary_of(str(track)).name
-        yield f"{suite}, {track}, prior group {prior_group}{_for_nothing(part, primary)}", _suite_table(part, primary)
+        if (part["metric"] == primary).any():  # a suite of absent places alone has no place to be right at
+            title = f"{suite}, {track}, prior group {prior_group}{_for_nothing(part, primary)}"
+            yield title, _suite_table(part, primary)
     judged = board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
     for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True):
         yield f"Rejection, {track}, prior group {prior_group}, all suites", _judged_table(part)

@@ -12,6 +12,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.region import LICENCE, Manifest
 from sasgeo_bench.request import Tell
+from sasgeo_bench.results import one_line
 from sasgeo_bench.split import SplitFile
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.catalog import find_region_file, find_split_file, read_split_file
@@ -139,7 +140,7 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
         tasks=tasks,
         with_truth=request.with_truth,
         published=_published(request.published, maps),
-        url=request.url,
+        url=_address(request.url),
         made_by=f"sasgeo-bench {version('sasgeo-bench')}",
     )
 
@@ -261,6 +262,13 @@ def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
             f"warning: truths of {counted(guessable, 'task')} are kept back, but their seed is so small that anyone "
             "can find it and draw them again: make the queries with a --seed of 20 random digits or more"
         )
+
+
+def _address(url: str | None) -> str | None:
+    if url is not None and not url.startswith(("https://", "http://")):
+        message = f"--url is {one_line(url)[:80]!r}: the address of a release begins with https:// or http://"
+        raise ConfigError(message)
+    return url
 
 
 def _published(published: str | None, maps: Sequence[ReleaseMap]) -> str:

@@ -388,6 +388,10 @@ def test_a_region_that_is_not_fit_is_refused(changes, told, own, mistake):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        (
+            ("--regions", RIVERSIDE, "--url", "javascript:alert(1)"),
+            "--url is 'javascript:alert(1)': the address of a release begins with https:// or http://",
+        ),
         (("--regions", "town-rivreside"), "there is no region 'town-rivreside', did you mean 'town-riverside'?"),
         (("--regions", "vaduz"), "holds no map of vaduz: sasgeo-bench build-region vaduz"),
         (("--regions", f"{RIVERSIDE}@2014-01-01"), "--regions takes ids as in 'vaduz'"),

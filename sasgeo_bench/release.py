@@ -115,12 +115,14 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     Raises
     ------
     ConfigError
-        If a region, suite or split is unknown, there are no tasks, or the extra packages are missing.
+        If a region, suite or split is unknown, the address is none, there are no tasks, or the extra packages are
+        missing.
     StoreError
         If a region is not built, says no licence, or its layers are no valid COG; if a task is of another map, another
         split, or lacks its truths; or if the folder holds something else.
     """
     check_installed()
+    _check_address(request.url)
     _check_folder(request.into, request.out)
     split = read_split_file(find_split_file(request.split))
     regions = tuple(dict.fromkeys(request.regions))
@@ -140,7 +142,7 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
         tasks=tasks,
         with_truth=request.with_truth,
         published=_published(request.published, maps),
-        url=_address(request.url),
+        url=request.url,
         made_by=f"sasgeo-bench {version('sasgeo-bench')}",
     )
 
@@ -264,11 +266,10 @@ def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
         )
 
 
-def _address(url: str | None) -> str | None:
+def _check_address(url: str | None) -> None:
     if url is not None and not url.startswith(("https://", "http://")):
         message = f"--url is {one_line(url)[:80]!r}: the address of a release begins with https:// or http://"
         raise ConfigError(message)
-    return url
 
 
 def _published(published: str | None, maps: Sequence[ReleaseMap]) -> str:

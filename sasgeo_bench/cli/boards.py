@@ -42,6 +42,16 @@ Results = Annotated[
         metavar="PATH",
     ),
 ]
+Rejectors = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="name from list-rejectors, or module:Class; may be repeated; default: none, or those of stored results"
+    ),
+]
+Submissions = Annotated[
+    list[Path] | None,
+    typer.Option(help="a submission, or a folder of them, beside stored results; those for their board are scored"),
+]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
@@ -64,16 +74,8 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
             help="id of a shipped split, or a file of your own (*.toml); default: crossfit, or that of stored results"
         ),
     ] = None,
-    rejector: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="name from list-rejectors, or module:Class; may be repeated; default: none, or those of stored results"
-        ),
-    ] = None,
-    submissions: Annotated[
-        list[Path] | None,
-        typer.Option(help="a submission, or a folder of them, beside stored results; those for their board are scored"),
-    ] = None,
+    rejector: Rejectors = None,
+    submissions: Submissions = None,
     region_folders: RegionFolders = None,
     without: Annotated[
         list[str] | None, typer.Option(help="region whose queries are left out, on each of its maps; may be repeated")
@@ -88,12 +90,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     out: Out = Path("out"),
 ) -> None:
     """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
-    if not BOARD_NAME.fullmatch(name):
-        message = f"--name must hold letters, digits, hyphens and underscores, 100 at most, got {name!r}"
-        raise ConfigError(message)
-    if truth is not None and not truth.is_dir():
-        message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
-        raise ConfigError(message)
+    _check_names(name, truth)
     submitted = submissions_for(board_of(predictions), submissions, tell=tell) if submissions else ()
     root = out if truth is None else truth.resolve().parent
     usual = request_of(
@@ -118,6 +115,15 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     typer.echo(str(request.board))
     tell(_how_to_publish(request.board))
     _check_controls(board)
+
+
+def _check_names(name: str, truth: Path | None) -> None:
+    if not BOARD_NAME.fullmatch(name):
+        message = f"--name must hold letters, digits, hyphens and underscores, 100 at most, got {name!r}"
+        raise ConfigError(message)
+    if truth is not None and not truth.is_dir():
+        message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
+        raise ConfigError(message)
 
 
 def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its users need

@@ -11,7 +11,7 @@ import typer
 
 from sasgeo_bench.cli.console import Bars, Out, tell
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.run.plan import RunRequest, plan_run
+from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.split import Split
@@ -78,6 +78,11 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     if dry_run:
         typer.echo(plan.to_text())
         return
+    _carry_out(plan)
+
+
+def _carry_out(plan: RunPlan) -> None:
+    """Run, and say what came of it."""
     for line in plan.lesson_lines() if plan.lesson is None else ():
         tell(f"{plan.card.name}: {line}")
     if sys.stderr.isatty():

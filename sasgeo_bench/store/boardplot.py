@@ -184,11 +184,8 @@ def _classed(svg: str) -> str:
     counts = Counter(_STYLE_OF.findall(svg))
     names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
     rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
-
-    def named(found: re.Match[str]) -> str:
-        return f' class="{names[found[1]]}"' if found[1] in names else found[0]
-
-    return _STYLE_OF.sub(named, svg).replace("</style>", f"{rules}</style>", 1)
+    short = _STYLE_OF.sub(lambda found: f' class="{names[found[1]]}"' if found[1] in names else found[0], svg)
+    return short.replace("</style>", f"{rules}</style>", 1)
 
 
 def _share_of(box: tuple[float, float, float, float], width: float, height: float) -> tuple[float, float, float, float]:

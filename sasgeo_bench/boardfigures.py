@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.boards import Board, Tell
+from sasgeo_bench.boards import Board
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.report.contrasts import Contrast, by_place
 from sasgeo_bench.report.plots import (
     draw_ages,

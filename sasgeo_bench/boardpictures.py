@@ -12,10 +12,11 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.boards import Board, Tell
+from sasgeo_bench.boards import Board
 from sasgeo_bench.casepanels import Case, read_picture, said_of
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.panels import panels
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import CONTROLS, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.report.cases import MOST_CASES, OPERATING, find_cases, operating_rejector, sample_cases

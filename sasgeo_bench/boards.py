@@ -18,6 +18,7 @@ from sasgeo_bench.entries import Entry, find_entries, leave_out
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.judging import Judging, carry_out
 from sasgeo_bench.metrics.draws import DRAWS
+from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.rejector import RejectorCard
@@ -29,7 +30,7 @@ from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
-from sasgeo_bench.report.steps import queries_of, steps_frame
+from sasgeo_bench.report.steps import GROUP, queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
@@ -39,9 +40,9 @@ from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, read_board, write_board
 from sasgeo_bench.validate import submission_faults, validate
 
-Tell = Callable[[str], None]
-
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+INTERVALS: Final = "intervals of suites"  # what progress is shown of
+JUDGED: Final = "rejectors"
 _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
 
 
@@ -128,7 +129,7 @@ class Board:
     apart: Mapping[str, str] = field(default_factory=dict)
 
 
-def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
+def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
     """Score everything and write the board.
 
     Parameters
@@ -137,6 +138,8 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         What is asked for.
     tell : callable
         Gets a line now and then.
+    progress : Progress, optional
+        Shows how far the intervals and the rejectors are; lines by `tell` unless given.
 
     Returns
     -------
@@ -151,6 +154,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     ConfigError
         If there is nothing to score, or rejectors are asked for without a split.
     """
+    progress = progress or Lines(tell)
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
     entries = leave_out(find_entries(request.predictions, request.submissions), request.without)
@@ -168,7 +172,7 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     entries = tuple(item.entry for item in told if item.entry.name in scores)
     _check_some(scores)
     apart = _apart(entries, scores, request.split, tell)
-    rows = list(_leaderboards(scores, whole, request.draws, apart))
+    rows = list(_leaderboards(scores, whole, request.draws, apart, progress))
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
     areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
@@ -176,8 +180,10 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         frame = scores[entry.name]
         rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
         tell(f"{entry.name}: {_in_words(frame)}")
+    progress.begin(JUDGED, len(entries))
     for judged in carry_out(_judgings(entries, scores, predictions, rules, request.split), jobs=request.jobs):
         rows += judged.rows
+        progress.advance(JUDGED, 1)
         all_judged |= {(judged.matcher, name): said for name, said in judged.said.items()}
         for line in judged.lines:
             tell(line)
@@ -203,6 +209,8 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         apart=apart,
     )
     _tell_gone(request.board, board.everyone, tell)
+    if request.extras:
+        tell("drawing figures and pictures")
     _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
     return board
 
@@ -308,14 +316,22 @@ def _asked_whole(told: Sequence[Told], tasks: Sequence[ScoredTask], tell: Tell) 
 
 
 def _leaderboards(
-    scores: Mapping[str, pd.DataFrame], whole: Mapping[str, Collection[str]], draws: int, apart: Collection[str]
+    scores: Mapping[str, pd.DataFrame],
+    whole: Mapping[str, Collection[str]],
+    draws: int,
+    apart: Collection[str],
+    progress: Progress,
 ) -> Iterator[pd.DataFrame]:
     """Figures of suites by those who were asked all of them: in most cases one table of everything."""
     asked_by: dict[tuple[str, ...], set[str]] = {}
+    progress.begin(
+        INTERVALS, len({key for frame in scores.values() for key in frame[[*GROUP]].itertuples(index=False)})
+    )
     for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
         asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
     for names, suites in asked_by.items():
-        yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws, apart=apart)
+        mine = {name: _ranked(scores[name], suites) for name in names}
+        yield leaderboard(mine, draws=draws, apart=apart, done=lambda: progress.advance(INTERVALS, 1))
 
 
 def _check_files(entries: Sequence[Entry], folders: Sequence[Path], split: Split | None) -> None:

@@ -25,6 +25,7 @@ from sasgeo_bench.features import fingerprint
 from sasgeo_bench.graph import MapGraph, build_graph
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.layers import burn_layers, make_paint
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.region import (
     ATTRIBUTION,
     DATA_VERSION,
@@ -42,8 +43,6 @@ from sasgeo_bench.store.preview import write_preview
 from sasgeo_bench.taxonomy import Taxonomy, load_taxonomy
 
 PREVIEW_CELLS: Final = 2048
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

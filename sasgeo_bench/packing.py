@@ -11,11 +11,12 @@ from typing import Any
 
 from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
-from sasgeo_bench.boards import Board, ScoreRequest, Tell, make_board
+from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.entries import Entry
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.plugins import check_registered
+from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store.catalog import find_split
@@ -227,7 +228,14 @@ def request_of(
     )
 
 
-def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True, results: Path | None = None) -> Board:
+def score_all(
+    request: ScoreRequest,
+    *,
+    tell: Tell,
+    progress: Progress | None = None,
+    has_cases: bool = True,
+    results: Path | None = None,
+) -> Board:
     """Score what is asked for, stored results laid out, and write the board with its figures and pictures.
 
     Parameters
@@ -236,6 +244,8 @@ def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True, resu
         Without extras.
     tell : callable
         Gets a line now and then.
+    progress : Progress, optional
+        As of `make_board`.
     has_cases : bool
         Whether queries that went wrong are shown, with their truths.
     results : Path, optional
@@ -260,7 +270,7 @@ def score_all(request: ScoreRequest, *, tell: Tell, has_cases: bool = True, resu
             kept=kept,
             has_cases=has_cases,
         )
-        board = make_board(replace(laid, extras=(figures, pictures)), tell=tell)
+        board = make_board(replace(laid, extras=(figures, pictures)), tell=tell, progress=progress)
         if results is not None:
             lacks = "" if kept is None else str(read_settings(kept)["dropped"])
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())

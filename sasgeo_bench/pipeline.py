@@ -2,7 +2,7 @@
 """A pipeline file -> queries, runs and a board; what is up to date is not done again."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,13 +18,14 @@ from sasgeo_bench.paper.task import region_name
 from sasgeo_bench.paperboard import paper_extra
 from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.plugins import check_names
+from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.rows import YARDSTICK, is_unranked
 from sasgeo_bench.request import Request, Wanted, plan_requests
 from sasgeo_bench.requests import carry_out
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
-from sasgeo_bench.run.runner import Progress, run
+from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.split import HALVES, Half
 from sasgeo_bench.store import rundir
@@ -39,8 +40,6 @@ CONTROL_SITES: Final = 8
 CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
 REFERENCE: Final = "fft_vote"  # on the controls of every board
 MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is counted
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,7 +336,7 @@ def run_pipeline(
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
         jobs=plan.jobs,
     )
-    board = make_board(request, tell=tell)
+    board = make_board(request, tell=tell, progress=progress)
     if results is not None:
         tell(pack_board(board, request, results / plan.spec.id).to_text())
     return board

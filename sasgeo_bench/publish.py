@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.boards import Tell
 from sasgeo_bench.boardshape import check_shape
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.site import site_pages
 from sasgeo_bench.report.sitepages import places_on_map, regions_of

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.region import LICENCE, Manifest
-from sasgeo_bench.request import Tell
 from sasgeo_bench.results import one_line
 from sasgeo_bench.split import SplitFile
 from sasgeo_bench.store import regiondir, taskdir

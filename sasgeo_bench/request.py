@@ -2,7 +2,7 @@
 """What a user asks for -> one request for each region and suite; all that can be refused before anything is read."""
 
 import datetime as dt
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from sasgeo_bench.build import plan_build
 from sasgeo_bench.errors import ConfigError, ExtractError
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.regionfile import RegionFile
 from sasgeo_bench.split import Split, make_split
@@ -24,8 +25,6 @@ from sasgeo_bench.store.catalog import (
 from sasgeo_bench.suites.all_suites import find_suite
 from sasgeo_bench.suites.base import EVERYTHING, Choice
 from sasgeo_bench.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.boardpictures import words_of
-from sasgeo_bench.boards import Tell
 from sasgeo_bench.boardtasks import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.casepanels import Case, read_picture
 from sasgeo_bench.entries import Entry, find_entries
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import Truth
 from sasgeo_bench.report.cases import find_cases, operating_rejector
 from sasgeo_bench.report.controls import is_control

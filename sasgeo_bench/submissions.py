@@ -9,10 +9,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.boards import Board, Tell
+from sasgeo_bench.boards import Board
 from sasgeo_bench.boardtasks import AskedTask
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.packing import board_of, laid_tasks, request_of, score_all, stored_settings
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.report.rows import is_unranked, name_alone

@@ -22,10 +22,11 @@ from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.region import Region
 from sasgeo_bench.regionfile import RegionFile
-from sasgeo_bench.request import Request, Tell, aged_dates, check_apart, check_count, check_roots
+from sasgeo_bench.request import Request, aged_dates, check_apart, check_count, check_roots
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.ratebookfile import load_ratebook
 from sasgeo_bench.suites.all_suites import find_suite

@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 HOUSE: dict[str, tuple[str, ...] | None] = {
     "errors": None,
     "processes": None,
+    "progress": None,
     "tomlfile": None,
     "angles": None,
     "pose": None,

@@ -122,6 +122,22 @@ def submission(out, path, *, keep=lambda _: True, change=lambda row, query: row)
     return len(rows)
 
 
+def test_progress_counts_every_group_of_queries_and_every_entry(out):
+    begun, done = {}, {}
+
+    class Counts:
+        def begin(self, label, total):
+            begun[label], done[label] = total, 0
+
+        def advance(self, label, count):
+            done[label] += count
+
+    request = ScoreRequest(predictions=[out / "runs"], root=out, board=out / "boards" / "mine", draws=200)
+    board = make_board(request, tell=lambda _: None, progress=Counts())
+    groups = board.scores["oracle_pose"][["suite", "track", "prior_group"]].drop_duplicates()
+    assert begun == done == {boards.INTERVALS: len(groups), boards.JUDGED: 1}
+
+
 def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, out / "runs", tmp_path / "mine.parquet")

@@ -2,7 +2,6 @@
 """Commands that score predictions and publish what came of them."""
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,7 +10,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boards import Board
-from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
+from sasgeo_bench.cli.console import ExtractFolders, Out, RegionFolders, print_table, shown_progress, tell
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.packing import board_of, request_of, score_all
@@ -110,7 +109,8 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         submissions=submitted,
         jobs=jobs,
     )
-    board = score_all(request, tell=tell, has_cases=cases, results=results)
+    with shown_progress() as progress:
+        board = score_all(request, tell=tell, progress=progress, has_cases=cases, results=results)
     show_board(board)
     typer.echo(str(request.board))
     tell(_how_to_publish(request.board))
@@ -158,11 +158,8 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     if dry_run:
         typer.echo(plan.to_text())
         return
-    if sys.stderr.isatty():
-        with Bars() as bars:
-            board = run_pipeline(plan, tell=tell, progress=bars, results=results, has_cases=cases)
-    else:
-        board = run_pipeline(plan, tell=tell, results=results, has_cases=cases)
+    with shown_progress() as progress:
+        board = run_pipeline(plan, tell=tell, progress=progress, results=results, has_cases=cases)
     show_board(board)
     typer.echo(str(board_folder(plan)))
     tell(_how_to_publish(board_folder(plan)))

@@ -3,6 +3,8 @@
 
 import datetime as dt
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Final, Self
@@ -68,7 +70,7 @@ def tell(line: str) -> None:
 
 
 class Bars:
-    """Progress as a bar for each matcher; for a terminal."""
+    """Progress as a bar for each piece of work, for a terminal."""
 
     def __init__(self) -> None:
         columns = (
@@ -102,6 +104,16 @@ class Bars:
         self._bars.advance(task, count)
         speed = self._bars.tasks[self._bars.task_ids.index(task)].speed
         self._bars.update(task, rate="" if speed is None else f"{speed:.1f}/s")
+
+
+@contextmanager
+def shown_progress() -> Iterator[Bars | None]:
+    """Yield bars on a terminal, None elsewhere: lines do there."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    with Bars() as bars:
+        yield bars
 
 
 def print_table(table: Table) -> None:

@@ -2,14 +2,13 @@
 """Commands that run matchers and check their predictions."""
 
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import Bars, Out, tell
+from sasgeo_bench.cli.console import Out, shown_progress, tell
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import run
@@ -85,11 +84,8 @@ def _carry_out(plan: RunPlan) -> None:
     """Run, and say what came of it."""
     for line in plan.lesson_lines() if plan.lesson is None else ():
         tell(f"{plan.card.name}: {line}")
-    if sys.stderr.isatty():
-        with Bars() as bars:
-            report = run(plan, tell=tell, progress=bars)
-    else:
-        report = run(plan, tell=tell)
+    with shown_progress() as progress:
+        report = run(plan, tell=tell, progress=progress)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
     tell(f"{plan.card.name} {plan.card.version}: {counts}")
     for status, message in sorted(report.messages.items()):

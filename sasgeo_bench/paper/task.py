@@ -4,7 +4,6 @@
 import datetime as dt
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -32,6 +31,7 @@ from sasgeo_bench.paper.trials import (
 from sasgeo_bench.paper.windows import MARGIN_M, WINDOW_CELLS, WINDOW_M, Windows
 from sasgeo_bench.pipelinefile import PAPER_SUITE
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.region import DATA_VERSION, SCHEMA_VERSION, Region
 from sasgeo_bench.regionfile import RegionFile
@@ -50,8 +50,6 @@ GROUP: Final = PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15)
 DATE: Final = dt.date(2026, 1, 1)
 STRENGTH_UNIT: Final = "map-change probability"
 DATA: Final = "procedural regions, no OSM data in them"  # what pictures and tables say of where they come from
-
-Tell = Callable[[str], None]
 
 
 def make_paper_task(*, seed: int, out: Path, trials: int = TRIALS, tell: Tell) -> Path:

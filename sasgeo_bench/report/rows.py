@@ -143,18 +143,25 @@ class Told:
         )
 
 
-def side_by_side(make: Callable[[Item], Iterable[Row]], items: Iterable[Item]) -> list[Row]:
+def side_by_side(
+    make: Callable[[Item], Iterable[Row]], items: Iterable[Item], done: Callable[[], None] = lambda: None
+) -> list[Row]:
     """All rows of some items in their order, made by a few threads.
 
     Most of the time of a board goes into draws and their sums, which leave the interpreter to other threads meanwhile.
+    `done` is called in this thread after each item.
 
     Examples
     --------
     >>> side_by_side(lambda item: [], [1, 2])
     []
     """
+    rows: list[Row] = []
     with ThreadPoolExecutor(max_workers=min(_THREADS, os.cpu_count() or 1)) as pool:
-        return [row for rows in pool.map(lambda item: list(make(item)), items) for row in rows]
+        for found in pool.map(lambda item: list(make(item)), items):
+            rows += found
+            done()
+    return rows
 
 
 def name_alone(matcher: str) -> str:

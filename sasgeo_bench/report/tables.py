@@ -28,7 +28,13 @@ GROUP: Final = ("suite", "track", "prior_group")
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
-def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS, apart: Collection[str] = ()) -> pd.DataFrame:
+def leaderboard(
+    scored: Mapping[str, pd.DataFrame],
+    *,
+    draws: int = DRAWS,
+    apart: Collection[str] = (),
+    done: Callable[[], None] = lambda: None,
+) -> pd.DataFrame:
     """Figures of every matcher on every suite, track, prior group and stratum.
 
     Parameters
@@ -39,6 +45,8 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS, apart
         Of the bootstrap.
     apart : collection of str
         Matchers that have figures and no rank, and are nobody's rivals; controls are so in any case.
+    done : callable
+        Called after each suite, track and prior group.
 
     Returns
     -------
@@ -52,7 +60,7 @@ def leaderboard(scored: Mapping[str, pd.DataFrame], *, draws: int = DRAWS, apart
     """
     groups = _groups(_aligned(scored))
     beside = frozenset({*apart, *filter(is_unranked, scored)})
-    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws, beside), groups))
+    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws, beside), groups, done))
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:

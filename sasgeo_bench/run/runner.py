@@ -2,14 +2,14 @@
 """A matcher over tasks: whatever happens, a row for every query, and a run that goes on where it was cut off."""
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from sasgeo_bench.errors import StoreError, counted
+from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.run.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.run.cluster import answer_on, connected
@@ -18,53 +18,8 @@ from sasgeo_bench.run.teach import taught
 from sasgeo_bench.store import rundir, runrows, taskdir
 from sasgeo_bench.store.regiondir import locked
 
-TOLD_S: Final = 10.0
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
 _COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earlier runs took, as run.json says it
-
-Tell = Callable[[str], None]
-
-
-class Progress(Protocol):
-    """Whoever shows how far a run is; is called by one thread at a time."""
-
-    def begin(self, label: str, total: int) -> None:
-        """Begin something of so many queries: all that one matcher is asked."""
-        ...
-
-    def advance(self, label: str, count: int) -> None:
-        """Take note that so many more have a row."""
-        ...
-
-
-class Lines:
-    """Progress as a line every ten seconds.
-
-    Examples
-    --------
-    >>> Lines(print, every_s=0.0).begin("fft_vote", 2)
-    """
-
-    def __init__(self, tell: Tell, *, every_s: float = TOLD_S) -> None:
-        self._tell, self._every_s = tell, every_s
-        self._begun: dict[str, tuple[float, int]] = {}
-        self._done: dict[str, int] = {}
-        self._told = time.monotonic()
-
-    def begin(self, label: str, total: int) -> None:
-        """Begin to count."""
-        self._begun[label], self._done[label] = (time.monotonic(), total), 0
-
-    def advance(self, label: str, count: int) -> None:
-        """Say how far it is, how fast, and how long it will take, if the last line is old enough."""
-        now, (begun, total) = time.monotonic(), self._begun[label]
-        self._done[label] += count
-        if now - self._told < self._every_s:
-            return
-        self._told = now
-        done = self._done[label]
-        rate = done / max(now - begun, 1e-9)
-        self._tell(f"{label}: {done} of {total}, {rate:.1f} a second, {(total - done) / rate:.0f} s left")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a matcher learns before it is asked: once for a lesson, in a process of its own, kept as a text."""
 
-from collections.abc import Callable
-
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.results import one_line
 from sasgeo_bench.run.lesson import Lesson, read_pairs
 from sasgeo_bench.run.plan import Learned, RunPlan, reach_of, with_learned
 from sasgeo_bench.run.worker import Reply, Worker
 from sasgeo_bench.store.learnedfile import read_learned, write_learned
 from sasgeo_bench.store.regiondir import locked
-
-Tell = Callable[[str], None]
 
 
 def taught(plan: RunPlan, *, tell: Tell) -> RunPlan:

@@ -9,9 +9,10 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.matcher import check_match
+from sasgeo_bench.progress import Lines
 from sasgeo_bench.run.oracle import right_answer
 from sasgeo_bench.run.plan import RunRequest, plan_run
-from sasgeo_bench.run.runner import Lines, run
+from sasgeo_bench.run.runner import run
 from sasgeo_bench.store import rundir, taskdir
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 
+from sasgeo_bench.progress import Lines
 from sasgeo_bench.run import answers, runner, sandbox
 from sasgeo_bench.run.plan import RunRequest, by_map, plan_run
 from sasgeo_bench.run.runner import run
@@ -96,7 +97,7 @@ def test_a_crash_costs_one_row_of_one_task(pair, tmp_path):
 
 
 def test_a_run_that_breaks_off_in_its_second_task_goes_on_there(pair, tmp_path):
-    class Breaks(runner.Lines):
+    class Breaks(Lines):
         count = 0
 
         def advance(self, label, count):

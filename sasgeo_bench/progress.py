@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a long piece of work is: as a line now and then, or as whatever a terminal shows."""
+
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+EVERY_S: Final = 10.0
+
+Tell = Callable[[str], None]
+
+
+class Progress(Protocol):
+    """Shows how far a piece of work is; called by one thread at a time."""
+
+    def begin(self, label: str, total: int) -> None:
+        """Begin a piece of work with so many items."""
+        ...
+
+    def advance(self, label: str, count: int) -> None:
+        """Count so many more items as done."""
+        ...
+
+
+class Lines:
+    """Progress as a line every ten seconds.
+
+    Examples
+    --------
+    >>> lines = Lines(lambda line: print(line.split(",")[0]), every_s=0.0)
+    >>> lines.begin("rejectors", 16)
+    >>> lines.advance("rejectors", 4)
+    rejectors: 4 of 16
+    """
+
+    def __init__(self, tell: Tell, *, every_s: float = EVERY_S) -> None:
+        self._tell, self._every_s = tell, every_s
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._done: dict[str, int] = {}
+        self._told = time.monotonic()
+
+    def begin(self, label: str, total: int) -> None:
+        """Begin to count."""
+        self._begun[label], self._done[label] = (time.monotonic(), total), 0
+
+    def advance(self, label: str, count: int) -> None:
+        """Print how far it is, how fast, and how long it will take, if the last line is old enough."""
+        now, (begun, total) = time.monotonic(), self._begun[label]
+        self._done[label] += count
+        if now - self._told < self._every_s:
+            return
+        self._told = now
+        done = self._done[label]
+        rate = done / max(now - begun, 1e-9)
+        self._tell(f"{label}: {done} of {total}, {rate:.1f} a second, {(total - done) / rate:.0f} s left")

@@ -14,7 +14,7 @@ import rasterio
 import shapely
 
 from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.extract.locate import extract_folders, find_extract
+from sasgeo_bench.extract.locate import Extract, answers, extract_folders, find_extract
 from sasgeo_bench.store.catalog import list_region_files, read_region_file
 
 _LIBRARIES: Final = ("osmium", "shapely", "geopandas", "rasterio", "numpy", "pandas", "pyarrow")
@@ -44,8 +44,9 @@ def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
 
 
 def _missing(folders: Sequence[Path]) -> Iterator[tuple[str, str]]:
-    """Which extracts of the shipped regions are not on this machine."""
-    wanted, missing = set(), {}
+    """Extracts of the shipped regions that are not on this machine, by what can be done about it."""
+    wanted: set[str] = set()
+    missing: dict[str, list[str]] = {}
     for path in list_region_files().values():
         for extract in read_region_file(path).extract:
             if extract.town is not None or extract.file in wanted:
@@ -54,7 +55,16 @@ def _missing(folders: Sequence[Path]) -> Iterator[tuple[str, str]]:
             try:
                 find_extract(extract.model_copy(update={"urls": ()}), folders=folders)
             except ExtractError:
-                missing[extract.file] = "can be downloaded" if extract.urls else "must be put into one of the folders"
-    yield "extracts found", f"{len(wanted) - len(missing)} of {len(wanted)} that the shipped regions name"
-    for file, mend in sorted(missing.items()):
-        yield "missing", f"{file}: {mend}"
+                missing.setdefault(_mend(extract), []).append(extract.file)
+    found = len(wanted) - sum(map(len, missing.values()))
+    yield "extracts found", f"{found} of {len(wanted)} that the shipped regions name"
+    for mend, files in sorted(missing.items()):
+        yield "missing", f"{mend}: {', '.join(sorted(files))}"
+
+
+def _mend(extract: Extract) -> str:
+    if not extract.urls:
+        return "no address is known, put them into one of the folders"
+    if not any(map(answers, extract.urls)):
+        return "the server does not answer now, put them into one of the folders or try again later"
+    return "the server answers, build-region downloads them"

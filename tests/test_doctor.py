@@ -3,6 +3,7 @@
 
 import pytest
 
+from sasgeo_bench import doctor
 from sasgeo_bench.doctor import examine
 
 
@@ -14,12 +15,17 @@ def nowhere(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_without_extracts_every_one_is_listed_as_missing(nowhere):
+@pytest.mark.parametrize(
+    ("is_reachable", "mend"), [(True, "the server answers, build-region"), (False, "the server does not answer now")]
+)
+def test_missing_extracts_are_listed_by_what_was_found_to_help(nowhere, monkeypatch, is_reachable, mend):
+    monkeypatch.setattr(doctor, "answers", lambda _: is_reachable)
     found = list(examine((), out=nowhere / "out"))
-    missing = [finding for name, finding in found if name == "missing"]
-    assert any(finding.startswith("liechtenstein-2025-09-19.osm.pbf: can be downloaded") for finding in missing)
+    (missing,) = [finding for name, finding in found if name == "missing"]
+    assert missing.startswith(mend)
+    assert "liechtenstein-2025-09-19.osm.pbf" in missing
     count, total = dict(found)["extracts found"].split(" that")[0].split(" of ")
-    assert (int(count), int(total)) == (0, len(missing))
+    assert (int(count), int(total)) == (0, missing.count(".osm.") + missing.count(".osh."))
     assert list(nowhere.iterdir()) == []
 
 

@@ -6,9 +6,13 @@ import hashlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Event, Thread
 from typing import Annotated, Final, Literal, Self
+from urllib.parse import urlsplit
 
 import pooch
 from pydantic import Field, StringConstraints, field_validator, model_validator
@@ -17,6 +21,8 @@ from sasgeo_bench.errors import ExtractError
 from sasgeo_bench.tomlfile import Document
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
+_SILENT_S: Final = 30.0  # between two parts of a download
+ANSWER_S: Final = 3.0  # a server that is silent for longer is taken for unreachable
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Morphology = Literal["grid", "old_town", "suburb", "industrial", "riverside", "agricultural"]
@@ -159,19 +165,57 @@ def _check_hash(path: Path, extract: Extract, source: str) -> None:
 
 def _download(extract: Extract, url: str) -> Path:
     """Download into the cache; the file gets its name only when its hash is one of those accepted."""
-    cache = cache_folder()
+    if not answers(url):
+        message = f"{url} cannot be reached"
+        raise ExtractError(message)
+    folder = cache_folder()
+    load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty())
+    pooch.get_logger().setLevel("WARNING")  # else it prints where its temporary file lies
     try:
-        cache.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=cache, prefix=".download-") as scratch:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder, prefix=".download-") as scratch:
             # pooch checks one hash, and several may be accepted here: so it is told none, and we check.
-            got = Path(
-                pooch.retrieve(url, known_hash=None, fname=extract.file, path=scratch, progressbar=sys.stderr.isatty())
-            )
+            got = Path(pooch.retrieve(url, known_hash=None, fname=extract.file, path=scratch, downloader=load))
             _check_hash(got, extract, url)
-            return got.replace(cache / extract.file)
+            return got.replace(folder / extract.file)
     except ExtractError:
         raise
-    except (OSError, ValueError) as error:  # requests' errors are OSErrors; an unknown protocol is a ValueError
-        text = " ".join(str(error).split())[:120]
-        message = f"{url} could not be downloaded: {text}"
+    except OSError as error:  # requests' errors are OSErrors, too
+        message = f"{url} could not be downloaded: {_why(error)}"
         raise ExtractError(message) from error
+
+
+def _why(error: OSError) -> str:
+    """Reason of a failed download, in our words: those of the libraries name their own insides."""
+    response = getattr(error, "response", None)
+    if response is not None:
+        return f"the server answered with status {response.status_code}"
+    return error.strerror or "the connection broke off"
+
+
+def answers(url: str) -> bool:
+    """Whether the server of an address answers at all, within `ANSWER_S`; asked once for each server.
+
+    Examples
+    --------
+    >>> answers("http://127.0.0.1:1/town.osm.pbf")
+    False
+    """
+    parts = urlsplit(url)
+    return parts.scheme in {"http", "https"} and _server_answers(f"{parts.scheme}://{parts.netloc}")
+
+
+@cache
+def _server_answers(server: str) -> bool:
+    found = Event()
+
+    def ask() -> None:
+        with suppress(OSError, ValueError):
+            pooch.HTTPDownloader(timeout=ANSWER_S)(server, None, None, check_only=True)
+            found.set()
+
+    # In a thread: the look-up of a name takes as long as the system likes, whatever limit is set on the connection.
+    thread = Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(ANSWER_S)
+    return found.is_set()

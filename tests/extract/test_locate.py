@@ -6,6 +6,7 @@ import hashlib
 import http.server
 import threading
 
+import pooch
 import pytest
 
 from sasgeo_bench.errors import ExtractError
@@ -21,6 +22,7 @@ def cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     monkeypatch.setattr(locate, "cache_folder", lambda: folder)
     monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)
+    locate._server_answers.cache_clear()
     return folder
 
 
@@ -108,9 +110,31 @@ def test_the_second_address_is_tried_where_the_first_fails(server, cache):
 
 
 def test_an_address_that_answers_with_an_error_is_told(server, cache):
-    with pytest.raises(ExtractError, match="could not be downloaded"):
+    with pytest.raises(ExtractError, match="could not be downloaded: the server answered with status 404"):
         find_extract(wanted(urls=(server + ".missing",)))
     assert list(cache.iterdir()) == []
+
+
+def test_offline_the_line_holds_no_words_of_a_library(cache):
+    with pytest.raises(ExtractError, match=r"127\.0\.0\.1:1/a\.osm\.pbf cannot be reached") as caught:
+        find_extract(wanted(urls=("http://127.0.0.1:1/a.osm.pbf",)))
+    assert "Pool" not in str(caught.value)
+    assert not cache.exists()
+
+
+def test_a_name_whose_look_up_never_ends_is_given_up(monkeypatch):
+    ends = threading.Event()
+    monkeypatch.setattr(locate, "ANSWER_S", 0.05)
+    monkeypatch.setattr(pooch, "HTTPDownloader", lambda **_: lambda *_, **__: ends.wait())
+    try:
+        assert not locate.answers("https://somewhere.invalid/a.osm.pbf")
+    finally:
+        ends.set()
+
+
+def test_an_address_of_another_kind_is_not_asked():
+    with pytest.raises(ExtractError, match="cannot be reached"):
+        find_extract(wanted(urls=("gopher://127.0.0.1/a.osm.pbf",)))
 
 
 def test_a_town_has_no_file_to_find():

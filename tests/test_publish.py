@@ -43,7 +43,7 @@ def put_and_die(path, data):
 sitedir._put = put_and_die
 publish.publish(Path(sys.argv[1]), tell=print)
 """
-VOID = {"meta", "link", "img", "br", "rect"}
+VOID = {"meta", "link", "img", "br", "rect", "wbr"}
 
 
 class Reader(HTMLParser):

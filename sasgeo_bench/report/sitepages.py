@@ -44,6 +44,7 @@ _COSTS: Final = (
     *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
 )
 _AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
+MOST_COLUMNS: Final = 8  # matchers beside each other: as many as a screen of 1280 px holds
 KINDS: Final = {  # of figures, by how their names begin, in the order they are shown
     "contrast": "Registered contrasts, place by place",
     "stress": "Success under stress",
@@ -94,7 +95,7 @@ class SuitePage:
     name: str
     page: str
     card: SuiteCard | None
-    tables: tuple[tuple[Table, Table], ...]
+    tables: tuple[Table, ...]
     figures: tuple[SiteFigure, ...]
     pictures: tuple[Picture, ...]
     regions: tuple[str, ...]
@@ -114,17 +115,26 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
         name=name,
         page=page,
         card=None if suite is None else suite.card,
-        tables=tuple((group_table(book, key, book.matchers[key]), _strata_table(book, key)) for key in keys),
+        tables=tuple(
+            table for key in keys for table in (group_table(book, key, book.matchers[key]), *_strata_tables(book, key))
+        ),
         figures=tuple(item for item in source.figures if item.file.startswith(starts)),
         pictures=tuple(item for item in source.pictures.suites if item.of == name),
         regions=tuple(sorted({base_of(region) for region in tasks})),
     )
 
 
-def _strata_table(book: Book, key: Key) -> Table:
-    """The primary figure of each part of a suite, a matcher a column."""
+def _strata_tables(book: Book, key: Key) -> Iterator[Table]:
+    """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
+    names = book.matchers[key]
+    for first in range(0, len(names), MOST_COLUMNS):
+        yield _strata_table(book, key, names[first : first + MOST_COLUMNS], number=first // MOST_COLUMNS + 1)
+
+
+def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) -> Table:
     suite, track, prior_group = key
-    primary, names = primary_of(track).name, book.matchers[key]
+    primary = primary_of(track).name
+    more = "" if number == 1 else f", table {number}"
     rows = []
     for stratum in book.strata[key]:
         found = {name: book.pick(key, name, primary, stratum) for name in names}
@@ -136,8 +146,8 @@ def _strata_table(book: Book, key: Key) -> Table:
     meaning = column(primary).meaning
     columns = [column(primary, title=name) for name in names]
     return Table(
-        name=file_stem("strata", suite, track, prior_group),
-        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}",
+        name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
+        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
         columns=(column("part", is_number=False), column("n"), *columns),
         rows=tuple(rows),
         notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),

@@ -27,7 +27,9 @@ ONLY_SEEN: Final = "#c2185b"
 ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
 _COLUMNS: Final = ("view", "map at the true place", "view against map", "hardest decoy")
-_CELL_INCHES: Final = 2.1
+_CELL_INCHES: Final = 2.4
+_WORDS_INCHES: Final = 3.0  # the column of words, in letters that stay readable where the sheet is shown smaller
+_LETTERS: Final = 36  # in a line of it
 _DPI: Final = 100
 
 
@@ -87,21 +89,21 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     """A contact sheet as a figure; see `write_sheet`."""
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     columns = (*_COLUMNS, "perceived vectors") if has_vectors else _COLUMNS
-    width, height = 2.6 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
+    width, height = _WORDS_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
     figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     legend = (
         "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"
     )
-    figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=8, color="#444444")
+    figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=9.5, color="#444444")
     _draw_legend(figure, width, height)
     for at, panel in enumerate(panels):
         bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
-        text = "\n".join(line for part in _words(panel) for line in wrap(part, 30))
-        figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=7.5)
+        text = "\n".join(line for part in _words(panel) for line in wrap(part, _LETTERS))
+        figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=10)
         pictures = (*_pictures(panel), None)[: len(columns)]
         for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):
-            left = 2.5 + _CELL_INCHES * place
+            left = _WORDS_INCHES + _CELL_INCHES * place
             box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
             chart = figure.add_axes(box)
             chart.set_xticks([])
@@ -113,7 +115,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
             else:
                 chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=9, transform=chart.transAxes)
             if at == 0:
-                chart.set_title(name, fontsize=9, pad=3)
+                chart.set_title(name, fontsize=10, pad=3)
     figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
     return figure
 
@@ -123,9 +125,9 @@ def _draw_legend(figure: Figure, width: float, height: float) -> None:
     left = 0.15
     for item in load_taxonomy().classes:
         name = item.name.replace("_", " ")
-        figure.text(left / width, 1 - 0.66 / height, "\u25a0", va="top", fontsize=9, color=item.colour)
-        figure.text((left + 0.13) / width, 1 - 0.67 / height, name, va="top", fontsize=7, color="#444444")
-        left += 0.26 + 0.062 * len(name)
+        figure.text(left / width, 1 - 0.66 / height, "\u25a0", va="top", fontsize=11, color=item.colour)
+        figure.text((left + 0.15) / width, 1 - 0.67 / height, name, va="top", fontsize=8.5, color="#444444")
+        left += 0.28 + 0.075 * len(name)
 
 
 def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:

@@ -216,8 +216,8 @@ def test_what_makes_no_sense_is_refused_before_anything_is_written(task, tmp_pat
 
 def test_rows_of_an_older_program_are_taken_for_the_task_that_its_run_json_names_and_for_no_other(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, limit=2))
-    (part,) = rundir.parts_of(folder)
-    pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
+    for part in rundir.parts_of(folder):  # how many there are depends on how fast the machine is
+        pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
     assert plan_run(request_of(task, tmp_path, limit=2)).parts[0].left == ()
     about = rundir.read_run(folder)
     rundir.write_run(folder, about | {"queries_sha256": "0" * 64})

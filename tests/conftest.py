@@ -6,6 +6,7 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.tasks import make_tasks
 from sasgeo_bench.testing import TinyPlace, tiny_place
+from tests.threaded import threaded
 
 # No test depends on how busy the machine is; CI draws the same examples each time, a person's runs go on searching.
 settings.register_profile(
@@ -52,15 +54,28 @@ def real_extracts() -> Path:
 
 
 @pytest.fixture(scope="session")
-def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def towns(tmp_path_factory: pytest.TempPathFactory, lay_towns: Callable[..., Path]) -> Path:
     """Root of what is built, with two embedded towns in it; copy it before you write there."""
 
-    def build(out: Path) -> None:
-        for name in ("town-riverside", "town-grid"):
-            plan = plan_build(read_region_file(find_region_file(name)), out=out)
-            build_region(plan, tell=lambda _: None, with_preview=False)
+    return _made_once(tmp_path_factory, "towns", lambda out: lay_towns(out, "town-riverside", "town-grid"))
 
-    return _made_once(tmp_path_factory, "towns", build)
+
+@pytest.fixture(scope="session")
+def lay_towns(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Lay embedded towns, each built once for all tests, into a root of one's own; without previews."""
+
+    def lay(out: Path, *names: str) -> Path:
+        for name in names:
+            built = _made_once(tmp_path_factory, name, partial(_build, name=name))
+            shutil.copytree(built / "regions" / name, out / "regions" / name)
+        return out
+
+    return lay
+
+
+def _build(out: Path, name: str) -> None:
+    plan = plan_build(read_region_file(find_region_file(name)), out=out)
+    build_region(plan, tell=lambda _: None, with_preview=False)
 
 
 def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
@@ -163,7 +178,14 @@ def _extracts_folder() -> Path | None:
     return None
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
+def in_threads() -> Iterator[None]:
+    """Matchers are served by threads: for tests that are not about processes."""
+    with threaded():
+        yield
+
+
+@pytest.fixture(scope="module")
 def few_controls() -> Iterator[None]:
     """Pipelines draw their controls at one site of one town: what these find is tested beside their suite."""
     with pytest.MonkeyPatch.context() as patch:

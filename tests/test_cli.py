@@ -2,10 +2,8 @@
 """The program as a user meets it: exit codes, one line for a mistake, results on stdout."""
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,29 +11,6 @@ import pytest
 from sasgeo_bench.store.catalog import shipped_dir
 
 PROGRAM = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()"]
-
-
-def run(*words: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    root = str(Path(__file__).parents[1])
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("SASGEO")}
-    return subprocess.run(  # noqa: S603 - our own program
-        [*PROGRAM, *words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=clean | {"PYTHONPATH": root, "XDG_CACHE_HOME": str(cwd.parent / "cache")} | environment,
-    )
-
-
-def mistake(*words: str, cwd: Path, **environment: str) -> str:
-    """The one line that a user's mistake gets."""
-    result = run(*words, cwd=cwd, **environment)
-    assert result.returncode == 2, result.stderr
-    assert result.stdout == ""
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, result.stderr
-    return lines[0]
 
 
 def small_town(folder: Path, **changes: str) -> Path:
@@ -48,49 +23,63 @@ def small_town(folder: Path, **changes: str) -> Path:
     return path
 
 
-def test_a_region_is_built_inspected_and_verified(tmp_path):
+def test_a_process_ends_with_the_exit_code_and_keeps_results_and_messages_apart(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    ended = [
+        subprocess.run([*PROGRAM, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+        for words in (["list-regions"], ["build-region", "vadus"])
+    ]
+    assert [item.returncode for item in ended] == [0, 2]
+    assert "vaduz" in ended[0].stdout
+    assert ended[1].stdout == ""
+    assert "did you mean 'vaduz'" in ended[1].stderr
+    assert len(ended[1].stderr.splitlines()) == 1
+
+
+def test_a_region_is_built_inspected_and_verified(program, tmp_path):
     own = small_town(tmp_path, **{'id = "town-suburb"': 'id = "own"'})
-    result = run("build-region", str(own), cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "own: built out/regions/own" in result.stderr
-    again = run("build-region", str(own), cwd=tmp_path)
-    assert "own: up to date, nothing to do" in again.stderr
-    shown = run("inspect", "own", cwd=tmp_path)
-    assert "(c) OpenStreetMap contributors, ODbL" in shown.stdout
-    assert "building" in shown.stdout
-    assert run("verify", "out/regions/own", cwd=tmp_path).returncode == 0
+    code, _, err = program("build-region", own)
+    assert code == 0, err
+    assert "own: built out/regions/own" in err
+    assert "own: up to date, nothing to do" in program("build-region", own)[2]
+    shown = program("inspect", "own")[1]
+    assert "(c) OpenStreetMap contributors, ODbL" in shown
+    assert "building" in shown
+    assert program("verify", "out/regions/own")[0] == 0
     (tmp_path / "out/regions/own/preview.png").write_bytes(b"?")
-    broken = run("verify", "out/regions/own", cwd=tmp_path)
-    assert broken.returncode == 2
-    assert "preview.png" in broken.stdout
+    code, out, _ = program("verify", "out/regions/own")
+    assert code == 2
+    assert "preview.png" in out
 
 
-def test_a_dry_run_tells_and_writes_nothing(tmp_path):
+def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
     own = small_town(tmp_path)
-    result = run("build-region", str(own), "--dry-run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    code, out, err = program("build-region", own, "--dry-run")
+    assert code == 0, err
     for word in ("reads", "grid", "200 x 300", "writes", "before compression"):
-        assert word in result.stdout
+        assert word in out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["own.toml"]
 
 
-def test_several_regions_are_built_at_once(tmp_path):
-    names = ("town-suburb", "town-agricultural")
-    result = run("build-region", *names, "--jobs", "2", "--out", "o", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+def test_several_regions_are_built_at_once(program, tmp_path):
+    (tmp_path / "mine").mkdir()
+    for name in (names := ("one", "two")):
+        small_town(tmp_path, **{'id = "town-suburb"': f'id = "{name}"'}).rename(tmp_path / "mine" / f"{name}.toml")
+    code, _, err = program("build-region", *names, "--regions", "mine", "--jobs", "2", "--out", "o")
+    assert code == 0, err
     for name in names:
         assert (tmp_path / "o/regions" / name / "region.json").is_file()
 
 
-def test_lists_and_findings_go_to_stdout(tmp_path):
-    listed = run("list-regions", cwd=tmp_path)
-    assert listed.returncode == 0, listed.stderr
-    assert "vaduz" in listed.stdout
-    assert "2013-08-03 .. 2025-09-19 (9)" in listed.stdout
-    healthy = run("doctor", cwd=tmp_path)
-    assert healthy.returncode == 0, healthy.stderr
-    assert "GDAL, GEOS, PROJ" in healthy.stdout
-    assert "liechtenstein-2025-09-19.osm.pbf" in healthy.stdout
+def test_lists_and_findings_go_to_stdout(program):
+    code, listed, err = program("list-regions")
+    assert code == 0, err
+    assert "vaduz" in listed
+    assert "2013-08-03 .. 2025-09-19 (9)" in listed
+    code, healthy, err = program("doctor")
+    assert code == 0, err
+    assert "GDAL, GEOS, PROJ" in healthy
+    assert "liechtenstein-2025-09-19.osm.pbf" in healthy
 
 
 @pytest.mark.parametrize(
@@ -105,8 +94,8 @@ def test_lists_and_findings_go_to_stdout(tmp_path):
         (("verify", "nowhere"), "holds no region.json"),
     ],
 )
-def test_a_mistake_gets_one_line_and_exit_2(words, told, tmp_path):
-    assert told in mistake(*words, cwd=tmp_path)
+def test_a_mistake_gets_one_line_and_exit_2(mistake, words, told):
+    assert told in mistake(*words)
 
 
 @pytest.mark.parametrize(
@@ -119,49 +108,54 @@ def test_a_mistake_gets_one_line_and_exit_2(words, told, tmp_path):
         ("center_lonlat = [11.65, 48.65]", "center_lonlat = [11.65, 88.65]", "84"),
     ],
 )
-def test_a_wrong_region_file_gets_one_line_and_exit_2(old, new, told, tmp_path):
+def test_a_wrong_region_file_gets_one_line_and_exit_2(mistake, old, new, told, tmp_path):
     path = small_town(tmp_path)
     path.write_text(path.read_text().replace(old, new))
-    assert told in mistake("build-region", str(path), cwd=tmp_path)
+    assert told in mistake("build-region", path)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_extract_names_the_file_its_hash_and_where_to_put_it(tmp_path):
+def test_a_missing_extract_names_the_file_its_hash_and_where_to_put_it(mistake, tmp_path):
     text = (shipped_dir("regions") / "monaco.toml").read_text()
     own = tmp_path / "own.toml"
     own.write_text("\n".join(line for line in text.splitlines() if not line.startswith("urls")))
-    told = mistake("build-region", str(own), "--extracts", "mine", cwd=tmp_path)
+    told = mistake("build-region", own, "--extracts", "mine")
     for word in ("monaco-2025-02-15.osm.pbf", "72dc9a65600864fa", "mine", "--extracts"):
         assert word in told
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_the_right_to_write_is_told(tmp_path):
+def test_a_folder_without_the_right_to_write_is_told(mistake, tmp_path):
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
-    assert "cannot be written" in mistake("build-region", "town-grid", "--out", "locked", cwd=tmp_path)
+    assert "cannot be written" in mistake("build-region", "town-grid", "--out", "locked")
 
 
-# What is started in the background of a shell does not hear Ctrl-C, nor does what it starts.
-HEEDS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+# Interrupts itself 0.05 s of its own processor time after it tells of a graph, so that no load moves the moment; and
+# heeds Ctrl-C, which what is started in the background of a shell does not.
+INTERRUPTED = """
+import signal, sys
+from sasgeo_bench import cli
+
+def tell(text):
+    if "features into a graph" in text:
+        signal.setitimer(signal.ITIMER_PROF, 0.05)
+    return write(text)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
+write, sys.stderr.write = sys.stderr.write, tell
+cli.main()
+"""
 
 
 def test_ctrl_c_leaves_nothing_half_written(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    program = [*PROGRAM[:2], HEEDS_CTRL_C + PROGRAM[2]]
-    words = [*program, "build-region", "town-riverside", "town-old-town", "town-suburb", "town-grid"]
-    with subprocess.Popen(  # noqa: S603 - our own program
-        words, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        for line in process.stderr:
-            if "features into a graph" in line:
-                break
-        time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        rest = process.stderr.read()
-    assert process.returncode == 130
-    assert "interrupted" in rest
-    assert "Traceback" not in rest
+    command = [sys.executable, "-c", INTERRUPTED, "build-region", "town-suburb", "town-grid"]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert ended.returncode == 130, ended.stderr
+    assert "interrupted" in ended.stderr
+    assert "Traceback" not in ended.stderr
     left = [path for path in (tmp_path / "out/regions").iterdir() if not path.name.endswith(".lock")]
     assert all((path / "region.json").is_file() for path in left)
     assert not any(path.name.startswith(".") for path in left)

@@ -27,6 +27,7 @@ from sasgeo_bench.store.packdir import read_settings
 from sasgeo_bench.store.packfile import unpack, unpack_tasks
 from sasgeo_bench.store.regiondir import sha256_of
 from sasgeo_bench.tomlfile import parse_toml
+from tests.threaded import threaded
 
 PIPELINE = """
 id = "kept"
@@ -55,10 +56,11 @@ TABLES = ("leaderboard", "scores", "contrasts", "falsifiers", "controls")
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory, few_controls):  # noqa: ARG001
+def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     """A board of a pipeline with its stored results, and what was told."""
     out, lines = tmp_path_factory.mktemp("packing"), []
-    with pytest.MonkeyPatch.context() as patch:
+    lay_towns(out / "out", "town-suburb", "town-agricultural")
+    with pytest.MonkeyPatch.context() as patch, threaded():
         patch.syspath_prepend(str(Path(__file__).parent / "run"))
         plan = plan_pipeline(parse_toml(PIPELINE, PipelineFile, source="kept.toml"), out=out / "out", tell=lines.append)
         board = run_pipeline(plan, tell=lines.append, results=out / "results")

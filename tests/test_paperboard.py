@@ -11,6 +11,9 @@ from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.tomlfile import parse_toml
+from tests.threaded import threaded
+
+pytestmark = pytest.mark.usefixtures("in_threads")
 
 TEXT = """
 id = "few"
@@ -37,15 +40,16 @@ def planned(out, text=TEXT):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, few_controls):  # noqa: ARG001
+def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     """Two seeds, then a board of the first alone from the same trials and answers."""
-    out = tmp_path_factory.mktemp("paperboard") / "out"
-    plan = planned(out)
-    before = plan.to_text()
-    board = run_pipeline(plan, tell=lambda _: None)
-    lines = []
-    one = planned(out, TEXT.replace('id = "few"', 'id = "one"').replace("[42, 43]", "[42]"))
-    run_pipeline(one, tell=lines.append)
+    out = lay_towns(tmp_path_factory.mktemp("paperboard") / "out", "town-suburb")
+    with threaded():
+        plan = planned(out)
+        before = plan.to_text()
+        board = run_pipeline(plan, tell=lambda _: None)
+        lines = []
+        one = planned(out, TEXT.replace('id = "few"', 'id = "one"').replace("[42, 43]", "[42]"))
+        run_pipeline(one, tell=lines.append)
     return plan, board, one, lines, before
 
 

@@ -16,6 +16,9 @@ from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.catalog import find_pipeline_file, list_pipeline_files, read_pipeline_file
 from sasgeo_bench.tasks import ensure_tasks, made_tasks
 from sasgeo_bench.tomlfile import parse_toml
+from tests.threaded import threaded
+
+pytestmark = pytest.mark.usefixtures("in_threads")
 
 TEXT = """
 id = "small"
@@ -52,8 +55,8 @@ def small(**changes):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, few_controls):  # noqa: ARG001
-    out = tmp_path_factory.mktemp("pipeline") / "out"
+def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
+    out = lay_towns(tmp_path_factory.mktemp("pipeline") / "out", "town-suburb")
     plan = plan_pipeline(small(), out=out, tell=lambda _: None)
     told = plan.to_text().splitlines()
     assert told[1:3] == [
@@ -64,7 +67,8 @@ def made(tmp_path_factory, few_controls):  # noqa: ARG001
     assert "  run: 4 matchers, 0 answered, 0 to ask" in told
     assert "    fft_vote (controls alone): 0 answered, 0 to ask, and what is drawn; 0 answered there before" in told
     lines = []
-    return plan, run_pipeline(plan, tell=lines.append), lines
+    with threaded():
+        return plan, run_pipeline(plan, tell=lines.append), lines
 
 
 def test_a_pipeline_ends_with_a_board(made):
@@ -301,7 +305,8 @@ oracles = ["learners:Oracle"]
 
 
 @pytest.mark.usefixtures("few_controls")
-def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(tmp_path, monkeypatch):
+def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(tmp_path, monkeypatch, lay_towns):
+    lay_towns(tmp_path, "town-suburb", "town-agricultural")
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "run"))
     plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
     board = run_pipeline(plan, tell=lambda _: None)

@@ -2,21 +2,16 @@
 """The conformance kit finds the one fault of each faulty matcher, in its own row, and none in a good one."""
 
 import shutil
-import socket
 import tempfile
-import threading
 from dataclasses import replace
 from math import hypot
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from sasgeo_bench import testing
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.run import sandbox
-from sasgeo_bench.run.serve import Server
-from sasgeo_bench.run.worker import Worker
 from sasgeo_bench.store.regiondir import read_region
 from sasgeo_bench.testing import check_matcher, tiny_place
 
@@ -40,26 +35,6 @@ LEARNT = ("learns, the same text twice", "answers without training")  # rows of 
 shut_in = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kernel has no Landlock to refuse files with")
 
 
-class Threaded(Worker):
-    """A worker whose matcher is served by a thread: a process for each of two dozen matchers would take too long."""
-
-    def _started(self) -> socket.socket:
-        if self._channel is None:
-            self._channel, theirs = socket.socketpair()
-            self._process = SimpleNamespace(poll=lambda: None)
-            threading.Thread(target=Server(theirs, spec=self.spec).run, daemon=True).start()
-        return self._channel
-
-    def _watch(self) -> None:
-        """A thread has no memory of its own."""
-
-    def end(self) -> None:
-        """Close the channel, which ends the thread."""
-        if self._channel is not None:
-            self._channel.close()
-        self._process, self._channel = None, None
-
-
 @pytest.fixture
 def own_place(tiny, tmp_path, monkeypatch):
     """A place of one's own, beside the faulty matchers that look for it there."""
@@ -69,10 +44,9 @@ def own_place(tiny, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def table(tiny, monkeypatch):
+def table(tiny, monkeypatch, in_threads):  # noqa: ARG001
     """Rows of a faulty matcher by their names, without a process."""
     monkeypatch.syspath_prepend(str(FAULTY.parent))
-    monkeypatch.setattr(testing, "Worker", Threaded)
     return lambda name, **options: by_name(check_matcher(f"faulty:{name}", **{"place": tiny, **options}))
 
 

@@ -24,6 +24,7 @@ from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.validate import set_aside, validate
 
 CLEAN = Path("clean") / "town-riverside"
+PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
 HAS_LANDLOCK = sandbox.landlock_version() > 0
 
 
@@ -42,7 +43,7 @@ def request_of(tasks, tmp_path):
             spec=f"learners:{name}",
             tasks=(tasks / "tasks" / CLEAN,),
             out=tmp_path,
-            limits=Limits(match_s=5.0),
+            limits=PATIENT,
             limit=2,
             train=(train,),
         )
@@ -114,12 +115,12 @@ def test_what_was_learnt_is_used_again_and_learnt_anew_from_something_else(reque
     ("name", "status", "words"),
     [
         ("RaisesInLearn", "crash", "while learning: ValueError: nothing to see"),
-        ("HangsInLearn", "timeout", "while learning: no answer within 3 s"),
+        ("HangsInLearn", "timeout", "while learning: no answer within 1 s"),
         ("LearnsBytes", "invalid", "while learning: learn() returned bytes, expected a text"),
     ],
 )
 def test_whoever_fails_to_learn_loses_its_rows_and_nothing_else(request_of, name, status, words):
-    limits = Limits(match_s=5.0, learn_s=3.0 if name == "HangsInLearn" else 60.0)
+    limits = replace(PATIENT, learn_s=1.0) if name == "HangsInLearn" else PATIENT
     request = request_of(name, limits=limits)
     _, report, folder = carry_out(request)
     assert report.counts == {status: 2}
@@ -147,7 +148,7 @@ def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
 
 
 def test_time_to_learn_changes_no_run_of_those_that_do_not(request_of):
-    limits = [Limits(match_s=5.0, learn_s=seconds) for seconds in (100.0, 200.0)]
+    limits = [Limits(learn_s=seconds) for seconds in (100.0, 200.0)]
     one, other = (plan_run(request_of(spec="hostile:Plain", limits=item)).hash for item in limits)
     assert one == other
 

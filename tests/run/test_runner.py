@@ -21,9 +21,30 @@ from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.validate import validate
 
+PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
+# A run that gets a signal as soon as three rows are written: it comes in the middle, however busy the machine is.
+# What is started in the background of a shell does not heed Ctrl-C, nor does what it starts: this one does.
+SIGNALLED = """
+import os, signal
+from sasgeo_bench.cli import main
+from sasgeo_bench.run import answers
+from sasgeo_bench.store import rundir
+
+def write_once(*words, **named):
+    rundir.write_part = write
+    write(*words, **named)
+    os.kill(os.getpid(), {number})
+
+answers.PART_ROWS = 3
+write, rundir.write_part = rundir.write_part, write_once
+signal.signal(signal.SIGINT, signal.default_int_handler)
+main()
+"""
+UNDISTURBED = "from sasgeo_bench.cli import main; main()"
+
 
 def request_of(task, out, name="Plain", **changes):
-    request = RunRequest(spec=f"hostile:{name}", tasks=(task,), out=out, limits=Limits(match_s=5.0))
+    request = RunRequest(spec=f"hostile:{name}", tasks=(task,), out=out, limits=PATIENT)
     return replace(request, **changes)
 
 
@@ -66,6 +87,7 @@ def test_two_processes_give_what_one_does(task, undisturbed, tmp_path):
     assert table(folder) == table(undisturbed[1])
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_two_shards_merged_give_what_one_run_does(task, undisturbed, tmp_path):
     folders = [run_all(request_of(task, tmp_path / str(index), shard=(index, 2)))[1] for index in (1, 2)]
     assert all(len(table(folder)) < len(table(undisturbed[1])) for folder in folders)
@@ -76,6 +98,7 @@ def test_two_shards_merged_give_what_one_run_does(task, undisturbed, tmp_path):
     assert table(merged[0]) == table(undisturbed[1])
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
     first, folder = run_all(request_of(task, tmp_path, limit=3))
     assert first.counts == {"ok": 3}
@@ -85,6 +108,7 @@ def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
     assert len(table(folder)) == 5
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
     plans = [plan_run(request_of(task, tmp_path, limit=count)) for count in (2, 2, 3)]
     reports = [run(plan, tell=lambda _: None) for plan in plans]
@@ -92,6 +116,7 @@ def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
     assert sum(len(rundir.read_part(part)) for part in rundir.parts_of(plans[0].parts[0].folder)) == 3
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, name="Raises", limit=2))
     assert {item.status for item in table(folder)} == {"crash"}
@@ -106,31 +131,34 @@ def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     assert not [fault for fault in validate(folder, [task]) if "again" in fault.found]
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.slow)])
+def command_of(program, task, out, *words):
+    command = [sys.executable, "-c", program, "run", "--matcher", "hostile:Slow", "--tasks", str(task)]
+    return [*command, "--out", str(out), "--match-s", "600", *words]
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_killed_at_random_moments_a_run_ends_with_the_same_rows(place, task, undisturbed, tmp_path, kills):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
-    command = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()", "run", "--matcher", "hostile:Slow"]
-    command += ["--tasks", str(task), "--out", str(tmp_path), "--match-s", "5", "--jobs", "2"]
+    killed = command_of(SIGNALLED.format(number=int(signal.SIGKILL)), task, tmp_path, "--jobs", "2")
+    command = command_of(UNDISTURBED, task, tmp_path, "--jobs", "2")
+    process = subprocess.run(killed, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    every, asked = len(taskdir.read_ids(task)), taskdir.read_asked(task)
+    assert 0 < len(rundir.ids_done(folder, asked)) < every
     chance = random.Random(7)  # noqa: S311 - moments, no secrets
-    every, cut_off = len(taskdir.read_ids(task)), 0
-    for number in range(kills):
+    for _ in range(kills - 1):
         (folder / "run.json").unlink(missing_ok=True)
         process = subprocess.Popen(command, cwd=place, env=env_with(place), stderr=subprocess.DEVNULL)  # noqa: S603
         while process.poll() is None and not (folder / "run.json").is_file():
             time.sleep(0.05)
-        while number == 0 and process.poll() is None and not rundir.parts_of(folder):
-            time.sleep(0.01)  # the first time certainly in the middle
-        time.sleep(0 if number == 0 else chance.uniform(0.5, 4.0))
+        time.sleep(chance.uniform(0.0, 2.0))
         process.kill()
         process.wait()
-        done = len(rundir.ids_done(folder, taskdir.read_asked(task)))
-        cut_off += 0 < done < every
-        if done == every:
+        if len(rundir.ids_done(folder, asked)) == every:
             for part in rundir.parts_of(folder):
                 part.unlink()  # done already: begin anew, so that there is something to kill
     finished = subprocess.run(command, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
     assert finished.returncode == 0, finished.stderr
-    assert cut_off > 0
     assert table(folder) == table(undisturbed[1])
 
 
@@ -141,24 +169,10 @@ def env_with(place):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task, undisturbed, tmp_path, jobs):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
-    # What is started in the background of a shell does not hear Ctrl-C, nor does what it starts.
-    heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    program = heeds + "from sasgeo_bench.cli import main; main()"
-    command = [sys.executable, "-c", program, "run", "--matcher", "hostile:Slow"]
-    command += ["--tasks", str(task), "--out", str(tmp_path), "--match-s", "5", "--jobs", str(jobs)]
-    process = subprocess.Popen(  # noqa: S603 - our own program
-        command,
-        cwd=place,
-        env=env_with(place),
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while process.poll() is None and not rundir.parts_of(folder):
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate()
-    assert process.returncode == 130
-    assert "interrupted; what was finished is kept" in told.splitlines()[-1]
+    command = command_of(SIGNALLED.format(number=int(signal.SIGINT)), task, tmp_path, "--jobs", str(jobs))
+    process = subprocess.run(command, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
+    assert process.returncode == 130, process.stderr
+    assert "interrupted; what was finished is kept" in process.stderr.splitlines()[-1]
     assert 0 < len(rundir.ids_done(folder, taskdir.read_asked(task))) < len(taskdir.read_ids(task))
     run_all(request_of(task, tmp_path, name="Slow"))
     assert table(folder) == table(undisturbed[1])
@@ -175,6 +189,7 @@ def test_a_run_without_isolation_is_another_run_and_says_what_it_lacked(task, tm
     assert same != shut_in
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypatch):
     _, folder = run_all(request_of(task, tmp_path, limit=2))
     before = table(folder)
@@ -190,12 +205,14 @@ def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypa
     assert not [path for path in folder.iterdir() if path.name.endswith(".partial")]
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path):
     report, folder = run_all(request_of(task, tmp_path, name="WantsImages", limit=3))
     assert report.counts == {"not applicable": 3}
     assert {item.message for item in table(folder)} == {"no image"}
 
 
+@pytest.mark.usefixtures("in_threads")
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
@@ -214,10 +231,11 @@ def test_what_makes_no_sense_is_refused_before_anything_is_written(task, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_rows_of_an_older_program_are_taken_for_the_task_that_its_run_json_names_and_for_no_other(task, tmp_path):
     _, folder = run_all(request_of(task, tmp_path, limit=2))
-    (part,) = rundir.parts_of(folder)
-    pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
+    for part in rundir.parts_of(folder):  # how many there are depends on how fast the machine is
+        pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
     assert plan_run(request_of(task, tmp_path, limit=2)).parts[0].left == ()
     about = rundir.read_run(folder)
     rundir.write_run(folder, about | {"queries_sha256": "0" * 64})

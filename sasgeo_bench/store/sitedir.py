@@ -14,16 +14,16 @@ from typing import Any, Final
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import one_line
-from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, PROTECTION, SCORES, read_board
+from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
 from sasgeo_bench.store.fileset import IMAGES, SITE_FOLDERS, check_site, list_files
 from sasgeo_bench.store.fileset import SITE_SAYS as MANIFEST
 from sasgeo_bench.store.packabout import PicturesSaid, parse_said
 from sasgeo_bench.store.packdir import is_pack, read_settings
+from sasgeo_bench.store.parquetfile import read_frame
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 from sasgeo_bench.store.svgfile import svg_fault
 
@@ -139,7 +139,7 @@ def _sound(folder: Path) -> Iterator[None]:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    return pq.read_table(path).to_pandas() if path.is_file() else pd.DataFrame()
+    return read_frame(path, mend=MEND) if path.is_file() else pd.DataFrame()
 
 
 def _plain_or_packed(path: Path) -> bytes | None:

@@ -22,6 +22,7 @@ from sasgeo_bench.store.fileset import (
     check_site,
     list_files,
 )
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.packabout import BoardSaid, parse_said
 from sasgeo_bench.store.parquetfile import read_frame, read_schema, write_frame
 from sasgeo_bench.store.regiondir import fresh_folder, locked
@@ -178,7 +179,7 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     try:
         data = (folder / BOARD).read_bytes()
         parse_said(data, BoardSaid)
-        return dict(json.loads(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
+        return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
     except StoreError:
         raise
     except FileNotFoundError as error:

@@ -24,6 +24,7 @@ from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.store import learnedfile, rundir, taskdir
 from sasgeo_bench.store.boardfile import FIGURES, PICTURES
 from sasgeo_bench.store.fileset import SITE_FOLDERS, hashes_of, led_to, list_files
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.packdir import (
     CSV,
@@ -363,7 +364,7 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
     parts = {name: _parts_of(tables[name]) for name in ("queries", "truths")}
     for number, row in enumerate(tables["tasks"].to_pylist()):
-        about = json.loads(row["task_json"])
+        about = parse_json(row["task_json"])
         suite, region = (_folder_name(about[name]) for name in ("suite", "region"))
         task, truth = (into / kind / suite / region for kind in ("tasks", "truth"))
         for place in (task, truth):
@@ -398,7 +399,7 @@ def _folder_name(name: str) -> str:
 def _lay_runs(folder: Path, runs: pa.Table, asked: Mapping[str, str], into: Path) -> Iterator[Path]:
     by_name: dict[str, list[dict[str, Any]]] = {}
     for row in runs.to_pylist():
-        by_name.setdefault(row["contestant"], []).append({**row, "about": json.loads(row["about"])})
+        by_name.setdefault(row["contestant"], []).append({**row, "about": parse_json(row["about"])})
     for listed in by_name.values():
         stem = _folder_name(_file_of(listed[0]["about"]))
         table, start = read_table(folder / PREDICTIONS / f"{stem}.parquet", mend=_MEND), 0

@@ -14,15 +14,17 @@ import geopandas as gpd
 import pandas as pd
 import shapely
 from filelock import FileLock, Timeout
-from pydantic import ValidationError
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ConfigError, GridError, StoreError
 from sasgeo_bench.features import check_features
 from sasgeo_bench.graph import MapGraph
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, FileRecord, Manifest, Region
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.layerfile import read_layers
 from sasgeo_bench.store.parquetfile import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
+from sasgeo_bench.tomlfile import check_document
 
 Table = TypeVar("Table", bound=pd.DataFrame)
 
@@ -96,21 +98,16 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         message = f"{folder} holds no {MANIFEST}: build the region first"
         raise StoreError(message)
+    content = read_json(path, mend=_MEND)
+    found = content.get("schema_version") if isinstance(content, dict) else None
+    if found != SCHEMA_VERSION:
+        message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: {_MEND}"
+        raise StoreError(message)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        found = content.get("schema_version") if isinstance(content, dict) else None
-        if found != SCHEMA_VERSION:
-            message = (
-                f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: build the region again"
-            )
-            raise StoreError(message)
-        manifest = Manifest.model_validate(content)
-    except (json.JSONDecodeError, UnicodeDecodeError, ValidationError, RecursionError) as error:
-        text = " ".join(str(error).split())[:200]
-        message = f"{path} is damaged ({text}): build the region again"
-        raise StoreError(message) from error
-    except PermissionError as error:
-        message = f"{path} cannot be read: give yourself the right to"
+        manifest = check_document(content, Manifest, source=MANIFEST)
+        _ = manifest.grid, shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
+    except (ConfigError, GridError, CRSError, shapely.errors.ShapelyError) as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
     lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
     if lost:

@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from sasgeo_bench.errors import MatchError, PoseError, StoreError
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.parquetfile import read_schema, read_table, write_table
 from sasgeo_bench.store.runrows import (
@@ -466,11 +467,9 @@ def read_run(folder: Path) -> dict[str, Any] | None:
     path = folder / RUN
     if not path.is_file():
         return None
-    damaged = StoreError(f"{path} is damaged: remove it and run again, the parts beside it are kept")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise damaged from error
+    mend = "remove it and run again, the parts beside it are kept"
+    content = read_json(path, mend=mend)
     if not isinstance(content, dict):
-        raise damaged
+        message = f"{path} is damaged (it says {str(content)[:40]!r}): {mend}"
+        raise StoreError(message)
     return content

@@ -21,6 +21,7 @@ from sasgeo_bench.results import one_line
 from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
 from sasgeo_bench.store.fileset import IMAGES, SITE_FOLDERS, check_site, list_files
 from sasgeo_bench.store.fileset import SITE_SAYS as MANIFEST
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.packabout import PicturesSaid, parse_said
 from sasgeo_bench.store.packdir import is_pack, read_settings
 from sasgeo_bench.store.parquetfile import read_frame
@@ -203,7 +204,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
     try:
         data = said.read_bytes()
         parse_said(data, PicturesSaid)
-        content = json.loads(data)
+        content = parse_json(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
         for item in (one for listed in found.values() for one in listed):
             _check_picture(folder, str(item["file"]))

@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.results import MOST_MESSAGE, Prediction
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.parquetfile import open_table, write_table
 from sasgeo_bench.store.regiondir import file_record, fresh_folder, locked
 from sasgeo_bench.store.runrows import RUN_SCHEMA, prediction_row
@@ -221,12 +222,7 @@ def _is_plain(entry: os.DirEntry[str]) -> bool:
 
 
 def _read_said(path: Path) -> Submission:
-    text = _text_of(path, _MOST_SAID_BYTES, f"the {SAID} of a submission")
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        message = f"{path} is no JSON ({' '.join(str(error).split())[:120]}): submit again"
-        raise StoreError(message) from error
+    content = read_json(path, mend="submit again", most_bytes=_MOST_SAID_BYTES)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         message = f"{path} has schema version {version!r}, this version reads {SCHEMA_VERSION}: submit again"

@@ -3,20 +3,21 @@
 
 import hashlib
 import json
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import Field
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.evidence import CELLS_PER_BYTE
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.parquetfile import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.store.regiondir import file_record, sha256_of
 from sasgeo_bench.store.taskrows import (
@@ -34,17 +35,68 @@ from sasgeo_bench.store.taskrows import (
     truth_of,
     truth_row,
 )
+from sasgeo_bench.tomlfile import Document, check_document
+
+Count = Annotated[int, Field(ge=0)]
+Folder = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9+@._-]*$")]  # never a way out
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
 SCHEMA_VERSION: Final = 1
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of a suite or a region: one folder, never a way out
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
-_SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
+
+
+class TaskFile(Document):
+    """Hash and size of the queries."""
+
+    sha256: str
+    bytes: Count
+
+
+class TaskFiles(Document):
+    """Files of a task, of which there is one."""
+
+    queries: Annotated[TaskFile, Field(alias=QUERIES)]
+
+
+class TaskSaid(Document):
+    """What `task.json` says; an unknown key is an error, for a later schema says so by its version.
+
+    Examples
+    --------
+    >>> TaskSaid.model_fields["suite"].is_required()
+    True
+    """
+
+    schema_version: int
+    task_version: int
+    suite: Folder
+    suite_version: Count | None = None
+    title: str
+    what: str | None = None
+    separates: str | None = None
+    falsifier: str | None = None
+    strength_unit: str | None = None
+    region: Folder
+    map_date: str | None = None
+    map_fingerprint: str
+    map_inputs_sha256: str | None = None
+    split: str | None = None
+    split_sha256: str | None = None
+    sites: Count | None = None
+    views_cells: list[Count] | None = None
+    epsg: int | None = None
+    made_by: str | None = None
+    counts: dict[str, Count]
+    prior_groups: list[str] | None = None
+    candidates_sha256: str | None = None
+    files: TaskFiles
+    licence: str | None = None
+    attribution: str | None = None
 
 
 def write_task(
@@ -148,35 +200,19 @@ def read_task(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         message = f"{folder} holds no {TASK}: make the queries first"
         raise StoreError(message)
+    content = read_json(path, mend=_MEND)
+    said = content if isinstance(content, dict) else {}
+    for name, known in (("schema_version", SCHEMA_VERSION), ("task_version", TASK_VERSION)):
+        if name in said and said[name] != known:
+            noun = name.replace("_", " ")
+            message = f"{path} has {noun} {said[name]!r}, this version reads {known}: {_MEND}"
+            raise StoreError(message)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        found = content["schema_version"]
-        missing = [name for name in _SAID if name not in content] or [QUERIES][QUERIES in content["files"] :]
-        names = [str(content[name]) for name in ("suite", "region") if not missing]
-        if not missing and not isinstance(content["files"][QUERIES]["sha256"], str):
-            missing = [QUERIES]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        text = " ".join(repr(error).split())[:200]
-        message = f"{path} is damaged ({text}): make the queries again"
+        check_document(content, TaskSaid, source=TASK)
+    except ConfigError as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
-    if any(not _NAME.fullmatch(name) for name in names):
-        message = f"{path} is damaged (suite and region are {names}): make the queries again"
-        raise StoreError(message)
-    if found != SCHEMA_VERSION:
-        message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: make the queries again"
-        raise StoreError(message)
-    version = content.get("task_version")
-    if not missing and version != TASK_VERSION:
-        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
-        raise StoreError(message)
-    if missing:
-        message = f"{path} is damaged (it does not say {', '.join(missing)}): make the queries again"
-        raise StoreError(message)
-    version = content.get("task_version")
-    if version != TASK_VERSION:
-        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
-        raise StoreError(message)
-    return dict(content)
+    return said
 
 
 def check_queries(folder: Path) -> None:
@@ -287,9 +323,10 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
 def read_hidden(truth_folder: Path) -> dict[str, Any]:
     """What `truth.json` says; nothing where it cannot be read."""
     try:
-        return dict(json.loads((truth_folder / TRUTH_OF).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError):
+        said = read_json(truth_folder / TRUTH_OF, mend=_MEND)
+    except StoreError:
         return {}
+    return said if isinstance(said, dict) else {}
 
 
 def map_of(manifest: Manifest) -> dict[str, str]:

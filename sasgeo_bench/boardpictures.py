@@ -26,6 +26,7 @@ from sasgeo_bench.results import one_line
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.boardfile import PICTURES, PICTURES_SAID, Extra, read_pictures
 from sasgeo_bench.store.caseplot import case_pixels
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.layerfile import read_overview
 from sasgeo_bench.store.picture import WEBP, fitted, pixels_of, thumbnail
 from sasgeo_bench.store.sheet import sheet_figure
@@ -125,9 +126,9 @@ def _kept(folder: Path, tell: Tell, *, has_cases: bool) -> Extra:
     if has_cases:
         return Extra(pictures=files)
     try:
-        said = json.loads(files[PICTURES_SAID])
+        said = parse_json(files[PICTURES_SAID])
         said["cases"] = []
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         message = f"{folder / PICTURES / PICTURES_SAID} is damaged: remove the folder, or fetch it again"
         raise StoreError(message) from error
     left = {name: data for name, data in files.items() if not name.startswith("cases/") and name != PICTURES_SAID}

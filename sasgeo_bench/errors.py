@@ -27,14 +27,33 @@ def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
     return f"{counted(len(names), one)} ({', '.join(names[:most])}{more})"
 
 
+def printable(text: str) -> str:
+    """Text on one line, with a question mark for each character that cannot be printed.
+
+    Examples
+    --------
+    >>> printable(f"first{chr(10)}  second{chr(7)}")
+    'first second?'
+    """
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+
+
 class SasgeoError(Exception):
     """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
+
+    Its text is one printable line even where it quotes a file or a library that says several.
 
     Examples
     --------
     >>> issubclass(GridError, (SasgeoError, ValueError))
     True
+    >>> str(StoreError(f"a.json: line 1{chr(10)}line 2"))
+    'a.json: line 1 line 2'
     """
+
+    def __str__(self) -> str:
+        """The text on one line."""
+        return printable(super().__str__())
 
 
 class GridError(SasgeoError, ValueError):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
+from sasgeo_bench.errors import printable
 from sasgeo_bench.pose import Pose
 
 Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
@@ -53,7 +54,7 @@ def one_line(text: str) -> str:
     >>> one_line(chr(10).join(("first", "  second")))
     'first second'
     """
-    line = "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+    line = printable(text)
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 

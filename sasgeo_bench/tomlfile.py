@@ -4,12 +4,13 @@
 import difflib
 import json
 import tomllib
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sasgeo_bench.errors import ConfigError
 
+_MOST_QUOTED: Final = 200  # characters
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -102,7 +103,13 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
     if item["type"] == "list_type" and not isinstance(item["input"], dict):
         return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
     text = item["msg"].removeprefix("Value error, ")
-    return f"{where!r}: {text}, got {item['input']!r}" if where and "got " not in text else text
+    return f"{where!r}: {text}, got {_short(item['input'])}" if where and "got " not in text else text
+
+
+def _short(value: object) -> str:
+    """A value as it is quoted: a table or text may be as long as the file."""
+    text = repr(value)
+    return text if len(text) <= _MOST_QUOTED else f"{text[: _MOST_QUOTED - 3]}..."
 
 
 def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:

@@ -250,7 +250,7 @@ def test_what_is_wrong_with_a_task_is_told_on_one_line(program, out):
     [
         ("{", "is damaged"),
         ('{"schema_version": 0}', "has schema version 0, this version reads 1: make the queries again"),
-        ('{"schema_version": 1}', "is damaged (it does not say suite"),
+        ('{"schema_version": 1}', "is damaged (task.json: 'task_version' is missing; 'suite'"),
     ],
 )
 @pytest.mark.parametrize("command", ["inspect", "verify"])

@@ -334,7 +334,7 @@ def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replace
         ('{"rejectors": 5}', "rejectors is 5"),
         ('{"rejectors": null}', "rejectors is None"),
         ('{"rejectors": [5]}', "rejectors.0 is 5"),
-        ('{"draws": 1e400}', "draws is inf"),
+        ('{"draws": 1e400}', "1e400 is too large a number"),
         ('{"draws": 1000000000}', "draws is 1000000000"),
         ('{"by_region": 5}', "by_region is 5"),
         ('{"pipeline": 5}', "is 5"),
@@ -346,8 +346,10 @@ def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replace
         ('{"contestants": {}}', "contestants is {}"),
         ('{"files": null}', "lists no files"),
         ('{"files": {"a": 5}}', "files.a is 5"),
+        ('{"splitt": "crossfit"}', "splitt is 'crossfit': Extra inputs are not permitted"),
+        ('{"pipeline": {"id": "demo", "sha256": "", "x": 1}}', "pipeline.PipelineSaid.x is 1: Extra inputs"),
         ('{"schema_version": 3}', "has schema version 3"),
-        ("[" * 200_000, "recursion"),
+        ("[" * 200_000, "nested too deep"),
     ],
 )
 def test_settings_of_another_type_are_one_line(own, mistake, text, fault):

@@ -4,13 +4,13 @@
 import datetime as dt
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 import geopandas as gpd
 import numpy as np
@@ -23,7 +23,7 @@ from sasgeo_bench.extract.coverage import CLOSE_M
 from sasgeo_bench.extract.lifecycle import Lifecycle, read_lifecycle
 from sasgeo_bench.extract.read import Reading, project, read_extract
 from sasgeo_bench.extract.scan import Box
-from sasgeo_bench.extract.snapshot import is_history, open_snapshot, read_header
+from sasgeo_bench.extract.snapshot import OBJECTS, elements, is_history, open_snapshot, read_header
 from sasgeo_bench.grid import Grid, utm_epsg
 
 MARGIN_M: Final = CLOSE_M / 2  # so far does an estimated coverage reach beyond the edge that an extract was cut along
@@ -132,8 +132,8 @@ def _own_date(path: Path) -> dt.date:
         except ValueError:
             continue
     with open_snapshot(path) as snapshot:
-        elements: Iterable[Any] = osmium.FileProcessor(str(snapshot.path))
-        newest = max((item.timestamp for item in elements), default=None)
+        every = elements(osmium.FileProcessor(str(snapshot.path), OBJECTS))
+        newest = max((item.timestamp for item in every), default=None)
     if newest is None or newest.year <= 1970:  # noqa: PLR2004 - what osmium says where a file carries no times
         message = f"{path.name} does not say what day it is of: date it with --at, or put YYYY-MM-DD into its name"
         raise ExtractError(message)
@@ -239,7 +239,7 @@ def _frame(path: Path) -> Box:
     if box is not None:
         return box
     with open_snapshot(path, at=dt.date.max if is_history(path) else None) as snapshot:
-        nodes: Iterable[Any] = osmium.FileProcessor(str(snapshot.path), osmium.osm.NODE)
+        nodes = elements(osmium.FileProcessor(str(snapshot.path), osmium.osm.NODE))
         places = np.array([(node.lon, node.lat) for node in nodes if node.location.valid()]).reshape(-1, 2)
     if len(places) == 0:
         message = f"{path.name} holds no node: is it an extract of map data?"

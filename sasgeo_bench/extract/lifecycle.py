@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.extract.read import project
 from sasgeo_bench.extract.scan import Tally, line_wkb
+from sasgeo_bench.extract.snapshot import elements
 
 # The prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix that say "no longer", on the keys of our classes.
 _PREFIXES: Final = ("demolished", "razed", "removed", "was", "abandoned", "destroyed")
@@ -111,8 +112,7 @@ def _tagged(path: Path, wanted: osmium.BaseFilter) -> Iterator[tuple[Any, bool, 
     """Open ways and areas that pass a filter, which runs in C++; a closed way comes as its area alone."""
     processor = osmium.FileProcessor(str(path)).with_locations().with_areas(wanted)
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
-    item: Any  # osmium's own type allows for every kind of element
-    for item in processor.with_filter(kinds).with_filter(wanted):
+    for item in elements(processor.with_filter(kinds).with_filter(wanted)):
         if item.is_area():
             yield item, not item.from_way(), item.orig_id()
         elif not item.is_closed():

@@ -76,7 +76,8 @@ def read_extract(
     Raises
     ------
     ExtractError
-        If the file is missing, damaged or of an unknown format.
+        If the file is missing, damaged or of an unknown format, or an id, date or coordinate in it is no number: what
+        comes after that cannot be read. A node beyond the globe is only taken out of its ways, and counted in `drops`.
     CoverageError
         If the grid lies outside the extract, or no element of any class lies in it.
 

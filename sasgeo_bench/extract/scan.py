@@ -16,6 +16,7 @@ import numpy as np
 import osmium
 import shapely
 
+from sasgeo_bench.extract.snapshot import elements
 from sasgeo_bench.taxonomy import Classification, Label, Taxonomy, classify
 
 LANE_WIDTH_M: Final = 3.25  # between the 2.75 m and 3.75 m lanes of the German RAS-Q 96 cross sections
@@ -34,6 +35,7 @@ _POINTS: Final = tuple(struct.Struct(f"<{2 * count}d") for count in range(40))
 Get = Callable[[str], str | None]
 Box = tuple[float, float, float, float]
 WORLD: Final[Box] = (-180.0, -90.0, 180.0, 90.0)
+_NOWHERE: Final = 2**31 - 1  # what osmium has for the place of a node that is missing
 _FACTORY: Final = osmium.geom.WKBFactory()
 
 
@@ -273,7 +275,7 @@ def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
     lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line"))
     lines.enable_for(osmium.osm.WAY)
-    return iter(processor.with_filter(kinds).with_filter(with_key).with_filter(lines))
+    return elements(processor.with_filter(kinds).with_filter(with_key).with_filter(lines))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -305,9 +307,8 @@ def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally
     wanted.enable_for(osmium.osm.WAY)
     typed.enable_for(osmium.osm.RELATION)
     expected = _Expected()
-    elements = osmium.FileProcessor(str(path), osmium.osm.WAY | osmium.osm.RELATION)
-    item: Any  # osmium's own type allows for every kind of element
-    for item in elements.with_filter(wanted).with_filter(typed):
+    source = osmium.FileProcessor(str(path), osmium.osm.WAY | osmium.osm.RELATION)
+    for item in elements(source.with_filter(wanted).with_filter(typed)):
         if item.is_relation():
             relation = _area_relation(item, classifier)
             if relation is not None:
@@ -374,7 +375,7 @@ def line_wkb(way: Any, tally: Tally) -> bytes | None:  # noqa: ANN401
     try:
         return bytes.fromhex(_FACTORY.create_linestring(way))
     except osmium.InvalidLocationError:
-        pieces = _pieces(way)
+        pieces = _pieces(way, tally)
     except RuntimeError:  # osmium's geometry_error: fewer than two different points
         tally.drops["way with fewer than two different nodes"] += 1
         return None
@@ -385,8 +386,11 @@ def line_wkb(way: Any, tally: Tally) -> bytes | None:  # noqa: ANN401
     return bytes(shapely.to_wkb(shapely.multilinestrings([shapely.linestrings(piece) for piece in pieces])))
 
 
-def _pieces(way: Any) -> list[list[tuple[float, float]]]:  # noqa: ANN401
-    """Runs of at least two nodes that are there, as longitude and latitude."""
+def _pieces(way: Any, tally: Tally) -> list[list[tuple[float, float]]]:  # noqa: ANN401
+    """Runs of at least two nodes that are there, as longitude and latitude; counts those with an impossible place."""
+    impossible = sum(not node.location.valid() and node.location.x != _NOWHERE for node in way.nodes)
+    if impossible:
+        tally.drops["node beyond 180 degrees east or 90 degrees north, taken out of a way"] += impossible
     nodes = [(node.lon, node.lat) if node.location.valid() else None for node in way.nodes]
     runs = (list(run) for is_there, run in groupby(nodes, key=lambda node: node is not None) if is_there)
     return [[node for node in run if node is not None] for run in runs if len(set(run)) > 1]
@@ -422,7 +426,7 @@ def _scan_lost(
     members = {ref for relation in relations.values() for ref in (*relation.outer, *relation.inner)}
     lines: dict[int, shapely.Geometry] = {}
     ways = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.EntityFilter(osmium.osm.WAY))
-    for way in ways.with_filter(osmium.filter.IdFilter(closed | members)):
+    for way in elements(ways.with_filter(osmium.filter.IdFilter(closed | members))):
         wkb = line_wkb(way, scan.tally)
         if wkb is None:
             continue

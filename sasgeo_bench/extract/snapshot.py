@@ -2,7 +2,7 @@
 """An OSM file as the reader needs it: readable, sorted, and one state of the world."""
 
 import datetime as dt
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +18,11 @@ from sasgeo_bench.errors import ExtractError
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
 _HISTORY_SUFFIXES: Final = tuple(suffix for suffix in SUFFIXES if suffix.startswith(".osh"))
 _PBF_MARK: Final = b"\n\tOSMHeader"  # after four bytes of length
+_MOST_QUOTED: Final = 200  # characters of what osmium says: it quotes a value whole, however long
 _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
-_RANK: Final = {"n": 0, "w": 1, "r": 2}
+OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
+_RANK: Final = {"n": 0, "w": 1, "r": 2, "c": 3}  # nodes, ways, relations, changesets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,8 +64,7 @@ def read_header(path: Path) -> Header:
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
-        with osmium.io.Reader(str(content), osmium.osm.NOTHING) as reader:
-            header = reader.header()
+        header = _header_of(content)
         return Header(box_lonlat=_header_box(header), replicated_at=_header_time(header))
 
 
@@ -99,8 +100,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
-        with osmium.io.Reader(str(content), osmium.osm.NOTHING) as reader:
-            header = reader.header()
+        header = _header_of(content)
         box, replicated_at = _header_box(header), _header_time(header)
         is_sorted = header.get("sorting") == "Type_then_ID"
         warnings: list[str] = []
@@ -165,17 +165,53 @@ def _as_its_content(path: Path, scratch: Path) -> Path:
     return link
 
 
+def elements(source: Iterable[Any]) -> Iterator[Any]:
+    """Elements that osmium reads; whatever it refuses in the file is a `RuntimeError`.
+
+    Parameters
+    ----------
+    source : iterable
+        An `osmium.FileProcessor`, with or without filters.
+
+    Raises
+    ------
+    RuntimeError
+        On a damaged file, an id, date or coordinate that is none; `open_snapshot` turns it into an `ExtractError`.
+
+    Examples
+    --------
+    >>> list(elements([1, 2]))
+    [1, 2]
+    """
+    with _one_type():
+        yield from source
+
+
+@contextmanager
+def _one_type() -> Iterator[None]:
+    """Turn the unrelated types of what osmium's C++ side throws into `RuntimeError`, its most common one."""
+    try:
+        yield
+    except (osmium.InvalidLocationError, ValueError, IndexError, OverflowError) as error:
+        raise RuntimeError(str(error)) from error
+
+
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
     """Turn osmium's own errors on a damaged file into one line that names the file."""
     try:
         yield
-    except ExtractError:
-        raise
-    except RuntimeError as error:  # osmium has no narrower type for what the C++ side throws
-        text = " ".join(str(error).split())
-        message = f"{path} cannot be read as OSM data ({text}): it is damaged, cut short or no OSM file; get it again"
+    except (RuntimeError, UnicodeDecodeError) as error:  # text is decoded only where it is looked at
+        message = (
+            f"{path} cannot be read as OSM data ({str(error)[:_MOST_QUOTED]}): it is damaged, cut short or no OSM "
+            "file; get it again"
+        )
         raise ExtractError(message) from error
+
+
+def _header_of(path: Path) -> osmium.io.Header:
+    with _one_type(), osmium.io.Reader(str(path), osmium.osm.NOTHING) as reader:
+        return reader.header()
 
 
 def _header_box(header: osmium.io.Header) -> tuple[float, float, float, float] | None:
@@ -197,7 +233,7 @@ def _header_time(header: osmium.io.Header) -> dt.datetime | None:
 def _in_order(path: Path) -> bool:
     """Whether elements come as osmium wants them: nodes, ways, relations, each by id (negative ids first, by size)."""
     last = (-1, 0, 0)
-    for item in osmium.FileProcessor(str(path)):
+    for item in elements(osmium.FileProcessor(str(path))):
         identifier = item.id
         key = (_RANK[item.type_str()], int(identifier > 0), abs(identifier))
         if key < last:
@@ -208,8 +244,9 @@ def _in_order(path: Path) -> bool:
 
 def _sort(path: Path, target: Path) -> None:
     merger = osmium.MergeInputReader()
-    merger.add_file(str(path))
-    with osmium.SimpleWriter(str(target), overwrite=True) as writer:
+    with _one_type():
+        merger.add_file(str(path))
+    with osmium.SimpleWriter(str(target), overwrite=True) as writer, _one_type():
         merger.apply(writer, simplify=True)
 
 
@@ -219,7 +256,7 @@ def _cut_history(path: Path, target: Path, *, at: dt.date) -> None:
     kept = _versions_at(path, until=until)
     with osmium.SimpleWriter(str(target), overwrite=True) as writer:
         position = 0
-        for number, item in enumerate(osmium.FileProcessor(str(path))):
+        for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
             if position < len(kept) and kept[position] == number:
                 writer.add(item)
                 position += 1
@@ -228,8 +265,7 @@ def _cut_history(path: Path, target: Path, *, at: dt.date) -> None:
 def _versions_at(path: Path, *, until: dt.datetime) -> NDArray[np.int64]:
     """Positions in the file, ascending, of the versions alive at a moment. Needs no order of versions."""
     latest: dict[tuple[str, int], tuple[int, int, bool]] = {}
-    item: Any  # osmium's own type allows for changesets, which no such file holds
-    for number, item in enumerate(osmium.FileProcessor(str(path))):
+    for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
         if item.timestamp <= until:
             key, version = (item.type_str(), item.id), item.version
             if key not in latest or version >= latest[key][0]:

@@ -16,6 +16,7 @@ from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.ageingplot import draw_ageing
+from sasgeo_bench.store.parquetfile import read_frame, write_frame
 from sasgeo_bench.taxonomy import load_taxonomy
 
 TABLE: Final = "ageing.parquet"
@@ -58,8 +59,7 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
     StoreError
         If the folder or a file cannot be written.
     """
-    shown = ageing.table.copy(deep=False)
-    shown.attrs = {
+    attrs = {
         "attribution": ATTRIBUTION,
         "licence": LICENCE,
         "place": ageing.place,
@@ -67,7 +67,7 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
         "area_km2": ageing.area_km2,
     }
     writers: dict[str, Callable[[Path], object]] = {
-        TABLE: lambda path: shown.to_parquet(path, compression="zstd", index=False),
+        TABLE: lambda path: write_frame(ageing.table, path, attrs=attrs),
         TEXT: lambda path: path.write_text(ageing_text(ageing), encoding="utf-8"),
         PLOT: lambda path: draw_ageing(path, ageing),
     }
@@ -116,12 +116,12 @@ def read_ageing(folder: Path) -> Ageing:
         message = f"{folder} holds no {TABLE}: run measure-ageing with --out {folder} first"
         raise StoreError(message)
     try:
-        table = pd.read_parquet(path)
+        table = read_frame(path, mend="measure it again")
         facts = table.attrs
         ageing = Ageing(
             place=facts["place"], sources=tuple(facts["sources"]), area_km2=facts["area_km2"], table=table[list(DTYPES)]
         )
-    except (OSError, ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         message = f"{path} cannot be read as a table of ageing ({' '.join(str(error).split())[:120]}): measure it again"
         raise StoreError(message) from error
     return ageing

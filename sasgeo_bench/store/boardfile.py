@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
@@ -23,7 +22,9 @@ from sasgeo_bench.store.fileset import (
     check_site,
     list_files,
 )
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.packabout import BoardSaid, parse_said
+from sasgeo_bench.store.parquetfile import read_frame, read_schema, write_frame
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 
 LEADERBOARD: Final = "leaderboard"
@@ -42,6 +43,7 @@ BOARD_FILES: Final = (
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
     *("paper.parquet", "trials.parquet", "paper.md"),
 )
+MEND: Final = "score it again"
 _TOP: Final = (*BOARD_FILES, FIGURES, PICTURES, *SITE_FOLDERS)
 
 
@@ -119,10 +121,7 @@ def write_board(
 
 def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
     for name, frame in part.tables.items():
-        table = pa.Table.from_pandas(frame, preserve_index=False)
-        # pandas gives back types by the key "pandas", and what is said as `attrs` by "PANDAS_ATTRS".
-        about = {**(table.schema.metadata or {}), **said, "PANDAS_ATTRS": json.dumps(said)}
-        pq.write_table(table.replace_schema_metadata(about), folder / f"{name}.parquet", compression="zstd")
+        write_frame(frame, folder / f"{name}.parquet", attrs=said, **said)
     for name, text in part.texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     for name, draw in part.figures.items():
@@ -163,9 +162,9 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
 
 def _version(path: Path) -> str:
     try:
-        said = dict(pq.read_schema(path).metadata or {})
+        said = dict(read_schema(path, mend=MEND).metadata or {})
         return str(said.get(b"scorer_version", b"unknown"), encoding="utf-8")
-    except (OSError, pa.ArrowException):
+    except (StoreError, UnicodeDecodeError):
         return "unknown"
 
 
@@ -180,7 +179,9 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     try:
         data = (folder / BOARD).read_bytes()
         parse_said(data, BoardSaid)
-        return dict(json.loads(data)), pq.read_table(folder / f"{LEADERBOARD}.parquet").to_pandas()
+        return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
+    except StoreError:
+        raise
     except FileNotFoundError as error:
         message = f"{folder} holds no board: score some runs first"
         raise StoreError(message) from error

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.store import regiondir
 from sasgeo_bench.store.columntexts import FEATURE_TEXTS, QUERY_TEXTS, TRUTH_TEXTS
+from sasgeo_bench.store.parquetfile import read_schema
 from sasgeo_bench.store.releasedir import LICENCE_URL, TRUTHS, Release
 from sasgeo_bench.store.taskrows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
 
@@ -144,7 +144,7 @@ def _query_tables(release: Release) -> Iterator[_Table]:
 def _map_tables(folder: Path, release: Release) -> Iterator[_Table]:
     first = folder / "regions" / release.maps[0].name
     for name, (file, title, texts) in _MAP_TABLES.items():
-        schema = pq.read_schema(first / file)
+        schema = read_schema(first / file, mend="build the region again")
         yield _Table(name=name, pattern=f"regions/*/{file}", description=title, schema=schema, texts=texts)
 
 

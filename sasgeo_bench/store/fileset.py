@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders that anybody may have made: their files listed, hashed, and held against those that are known as ours."""
 
-import json
 import os
 import stat
 import tempfile
@@ -12,6 +11,7 @@ from typing import Final
 
 from sasgeo_bench.errors import StoreError, named
 from sasgeo_bench.results import one_line
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.regiondir import sha256_of
 
 SITE: Final = "site"
@@ -160,9 +160,8 @@ def check_site(folder: Path) -> None:
     >>> check_site(Path("nowhere"))
     """
     try:
-        said = json.loads((folder / SITE_SAYS).read_text(encoding="utf-8"))
-        known = said["files"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        known = read_json(folder / SITE_SAYS, mend="publish again")["files"]
+    except (StoreError, KeyError, TypeError):
         known = None
     if isinstance(known, list):
         check_known(folder, {SITE_SAYS, *map(str, known)}, "a site")

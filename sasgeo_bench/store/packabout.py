@@ -5,7 +5,9 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import one_line
+from sasgeo_bench.store.jsonfile import parse_json
 
 Model = TypeVar("Model", bound=BaseModel)
 Plain = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9+@._-]{0,199}$")]  # of what may become a folder
@@ -37,6 +39,8 @@ class ContrastSaid(_Said):
 class PipelineSaid(_Said):
     """Which pipeline a board is of."""
 
+    model_config = ConfigDict(extra="forbid")
+
     id: Plain
     sha256: str
 
@@ -48,13 +52,15 @@ class VersionSaid(_Said):
 
 
 class PackSaid(_Said):
-    """What `pack.json` says: how the results were scored, and the hash of every file.
+    """What `pack.json` says, and nothing else: how the results were scored, and the hash of every file.
 
     Examples
     --------
     >>> "files" in PackSaid.model_fields
     True
     """
+
+    model_config = ConfigDict(extra="forbid")
 
     schema_version: Literal[1, 2]
     split: Plain | None
@@ -66,6 +72,8 @@ class PackSaid(_Said):
     contestants: list[str]
     dropped: str
     files: dict[str, Sha256] | None = None  # of the first version there are none
+    licence: str = LICENCE
+    attribution: str = ATTRIBUTION
 
 
 class _Learned(_Said):
@@ -172,10 +180,10 @@ def parse_said(data: bytes | str, model: type[Model]) -> Model:
     >>> parse_said('{"remarks": 5}', BoardSaid)
     Traceback (most recent call last):
         ...
-    ValueError: remarks is 5: Input should be a valid array
+    ValueError: remarks is 5: Input should be a valid list
     """
     try:
-        return model.model_validate_json(data)
+        return model.model_validate(parse_json(data))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))

@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.pose import Pose
@@ -25,6 +24,7 @@ from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.store import learnedfile, rundir, taskdir
 from sasgeo_bench.store.boardfile import FIGURES, PICTURES
 from sasgeo_bench.store.fileset import SITE_FOLDERS, hashes_of, led_to, list_files
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.packdir import (
     CSV,
@@ -38,6 +38,7 @@ from sasgeo_bench.store.packdir import (
     sound,
 )
 from sasgeo_bench.store.packrows import RUNS_SCHEMA, TASK, TASK_SCHEMA, check_predictions, check_tables
+from sasgeo_bench.store.parquetfile import read_table, write_table
 from sasgeo_bench.store.regiondir import MANIFEST, fresh_folder, locked
 from sasgeo_bench.store.runrows import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.store.taskrows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under
@@ -47,6 +48,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of what becomes a 
 _LEVEL: Final = 19
 _PAGE_BYTES: Final = 2**24  # what is alike is told once in a page: few pages, small files
 _TEXTS: Final = ("query_id", "track", "suite", "part", "region", "prior_group", "status", "message")
+_MEND: Final = "fetch the results again"
 _AND: Final = "; "
 _NO_PICTURES: Final = "pictures of regions, suites and cases"
 _NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
@@ -205,10 +207,9 @@ def _squeeze(path: Path) -> None:
 
 def _write_table(table: pa.Table, path: Path) -> None:
     leaves = [name for name in table.column_names if name in {*_TEXTS, "about"}]
-    pq.write_table(
+    write_table(
         table,
         path,
-        compression="zstd",
         compression_level=_LEVEL,
         data_page_size=_PAGE_BYTES,
         row_group_size=max(len(table), 1),
@@ -229,13 +230,14 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
                 "region_json": region.read_text(encoding="utf-8") if region.is_file() else None,
             }
         )
-        heads = pq.read_table(item.task / taskdir.QUERIES, columns=HEAD_SCHEMA.names)
+        heads = read_table(item.task / taskdir.QUERIES, mend="make the queries again", columns=HEAD_SCHEMA.names)
         asked, view_bytes = taskdir.read_asked(item.task), taskdir.read_view_bytes(item.task)
         names = heads["query_id"].to_pylist()
         heads = heads.append_column(ASKED, pa.array([asked[name] for name in names], pa.string()))
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
-        truths.append(_numbered(pq.read_table(item.truth / taskdir.TRUTH, columns=TRUTH_SCHEMA.names), number))
+        told = read_table(item.truth / taskdir.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
+        truths.append(_numbered(told, number))
     _write_table(pa.Table.from_pylist(said, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
     _write_table(pa.concat_tables(truths), folder / "truths.parquet")
@@ -325,7 +327,7 @@ def unpack(folder: Path, into: Path) -> Unpacked:
     """
     with sound(folder):
         read_settings(folder)
-        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in TABLES}
+        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
         check_tables(tables)
         tasks = tuple(_lay_tasks(tables, into))
         asked = dict(zip(*(tables["queries"][name].to_pylist() for name in ("query_id", ASKED)), strict=True))
@@ -354,7 +356,7 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
     """
     with sound(folder):
         read_settings(folder)
-        tables = {name: pq.read_table(folder / f"{name}.parquet") for name in TABLES if name != "runs"}
+        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES if name != "runs"}
         check_tables(tables)
         return tuple(_lay_tasks(tables, into))
 
@@ -362,15 +364,15 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
     parts = {name: _parts_of(tables[name]) for name in ("queries", "truths")}
     for number, row in enumerate(tables["tasks"].to_pylist()):
-        about = json.loads(row["task_json"])
+        about = parse_json(row["task_json"])
         suite, region = (_folder_name(about[name]) for name in ("suite", "region"))
         task, truth = (into / kind / suite / region for kind in ("tasks", "truth"))
         for place in (task, truth):
             place.mkdir(parents=True)
         (task / taskdir.TASK).write_text(row["task_json"], encoding="utf-8")
         (truth / taskdir.TRUTH_OF).write_text(row["truth_json"], encoding="utf-8")
-        pq.write_table(parts["queries"][number], task / taskdir.QUERIES)
-        pq.write_table(parts["truths"][number], truth / taskdir.TRUTH)
+        write_table(parts["queries"][number], task / taskdir.QUERIES)
+        write_table(parts["truths"][number], truth / taskdir.TRUTH)
         if row["region_json"] is not None:
             place = into / "regions" / region
             place.mkdir(parents=True, exist_ok=True)
@@ -397,10 +399,10 @@ def _folder_name(name: str) -> str:
 def _lay_runs(folder: Path, runs: pa.Table, asked: Mapping[str, str], into: Path) -> Iterator[Path]:
     by_name: dict[str, list[dict[str, Any]]] = {}
     for row in runs.to_pylist():
-        by_name.setdefault(row["contestant"], []).append({**row, "about": json.loads(row["about"])})
+        by_name.setdefault(row["contestant"], []).append({**row, "about": parse_json(row["about"])})
     for listed in by_name.values():
         stem = _folder_name(_file_of(listed[0]["about"]))
-        table, start = pq.read_table(folder / PREDICTIONS / f"{stem}.parquet"), 0
+        table, start = read_table(folder / PREDICTIONS / f"{stem}.parquet", mend=_MEND), 0
         check_predictions(stem, table)
         if sum(row["rows"] for row in listed) != len(table):
             message = f"runs.parquet does not tell the {len(table)} answers of {stem}"
@@ -415,6 +417,6 @@ def _lay_runs(folder: Path, runs: pa.Table, asked: Mapping[str, str], into: Path
             key = None if said is None else said.key
             part = table.slice(start, count)
             ties = [asked_under(asked[name], key) for name in part["query_id"].to_pylist()]
-            pq.write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
+            write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
             start += count
             yield place

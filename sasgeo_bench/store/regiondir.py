@@ -5,22 +5,26 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import geopandas as gpd
 import pandas as pd
 import shapely
 from filelock import FileLock, Timeout
-from pydantic import ValidationError
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ConfigError, GridError, StoreError
 from sasgeo_bench.features import check_features
 from sasgeo_bench.graph import MapGraph
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, FileRecord, Manifest, Region
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.layerfile import read_layers
+from sasgeo_bench.store.parquetfile import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
+from sasgeo_bench.tomlfile import check_document
 
 Table = TypeVar("Table", bound=pd.DataFrame)
 
@@ -30,6 +34,8 @@ FEATURES: Final = "features.parquet"
 NODES: Final = "nodes.parquet"
 EDGES: Final = "edges.parquet"
 PREVIEW: Final = "preview.png"
+_SAID: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICENCE}
+_MEND: Final = "build the region again"
 
 
 def sha256_of(path: Path) -> str:
@@ -54,16 +60,16 @@ def file_record(path: Path) -> FileRecord:
 
 def write_tables(folder: Path, features: gpd.GeoDataFrame, graph: MapGraph) -> None:
     """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder."""
-    geographic = {"compression": "zstd", "schema_version": "1.1.0"}
+    geographic = {**CHECKED, "schema_version": "1.1.0"}
     _attributed(features).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
     _attributed(graph.nodes).to_parquet(folder / NODES, **geographic)
-    _attributed(graph.edges).to_parquet(folder / EDGES, compression="zstd", index=False)
+    write_frame(graph.edges, folder / EDGES, attrs=_SAID)
 
 
 def _attributed(table: Table) -> Table:
     """A view of the table whose parquet file says where its data come from (`attrs` in the file's metadata)."""
     shown = table.copy(deep=False)
-    shown.attrs = {"attribution": ATTRIBUTION, "licence": LICENCE}
+    shown.attrs = dict(_SAID)
     return shown
 
 
@@ -92,21 +98,16 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         message = f"{folder} holds no {MANIFEST}: build the region first"
         raise StoreError(message)
+    content = read_json(path, mend=_MEND)
+    found = content.get("schema_version") if isinstance(content, dict) else None
+    if found != SCHEMA_VERSION:
+        message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: {_MEND}"
+        raise StoreError(message)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        found = content.get("schema_version") if isinstance(content, dict) else None
-        if found != SCHEMA_VERSION:
-            message = (
-                f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: build the region again"
-            )
-            raise StoreError(message)
-        manifest = Manifest.model_validate(content)
-    except (json.JSONDecodeError, UnicodeDecodeError, ValidationError, RecursionError) as error:
-        text = " ".join(str(error).split())[:200]
-        message = f"{path} is damaged ({text}): build the region again"
-        raise StoreError(message) from error
-    except PermissionError as error:
-        message = f"{path} cannot be read: give yourself the right to"
+        manifest = check_document(content, Manifest, source=MANIFEST)
+        _ = manifest.grid, shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
+    except (ConfigError, GridError, CRSError, shapely.errors.ShapelyError) as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
     lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
     if lost:
@@ -124,16 +125,13 @@ def read_region(folder: Path) -> Region:
         If a file is missing or cannot be read.
     """
     manifest = read_manifest(folder)
-    try:
-        graph = MapGraph(nodes=gpd.read_parquet(folder / NODES), edges=pd.read_parquet(folder / EDGES))
-    except (OSError, ValueError) as error:
-        message = f"{folder} is damaged ({' '.join(str(error).split())[:200]}): build the region again"
-        raise StoreError(message) from error
+    for name in (LAYERS, FEATURES, NODES, EDGES):
+        _check_file(folder / name, manifest.files[name])
     return Region(
         manifest=manifest,
         layers=read_layers(folder / LAYERS),
-        features=read_features(folder),
-        graph=graph,
+        features=check_features(_read_geometry(folder / FEATURES)),
+        graph=MapGraph(nodes=_read_geometry(folder / NODES), edges=read_frame(folder / EDGES, mend=_MEND)),
         coverage=shapely.from_wkt(manifest.coverage.wkt),
     )
 
@@ -146,11 +144,26 @@ def read_features(folder: Path) -> gpd.GeoDataFrame:
     StoreError
         If the folder holds no region, or the file cannot be read.
     """
-    read_manifest(folder)
+    manifest = read_manifest(folder)
+    _check_file(folder / FEATURES, manifest.files[FEATURES])
+    return check_features(_read_geometry(folder / FEATURES))
+
+
+def _check_file(path: Path, said: FileRecord) -> None:
+    """Refuse a file that is not what the manifest says: nothing else covers a raster, or the footer of a GeoParquet."""
+    if not path.is_file() or file_record(path) != said:
+        message = f"{path} is missing, or not what {MANIFEST} says: {_MEND}"
+        raise StoreError(message)
+
+
+def _read_geometry(path: Path) -> gpd.GeoDataFrame:
+    """A table of geometry, after its size was looked at."""
+    with open_table(path, mend=_MEND, most_rows=MOST_VALUES):
+        pass
     try:
-        return check_features(gpd.read_parquet(folder / FEATURES))
-    except (OSError, ValueError) as error:
-        message = f"{folder} is damaged ({' '.join(str(error).split())[:200]}): build the region again"
+        return gpd.read_parquet(path, **VERIFIED)
+    except (OSError, ValueError, KeyError, TypeError, CRSError, shapely.errors.ShapelyError) as error:
+        message = f"{path} cannot be read ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
 
 

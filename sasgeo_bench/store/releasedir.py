@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.query import TASK_VERSION
 from sasgeo_bench.region import ATTRIBUTION, DATA_VERSION, LICENCE, FileRecord, Manifest
 from sasgeo_bench.split import Place, SplitFile
 from sasgeo_bench.store import taskdir
+from sasgeo_bench.store.parquetfile import open_table, read_table, table_writer
 from sasgeo_bench.store.regiondir import MANIFEST, file_record, fresh_folder, locked
 from sasgeo_bench.store.taskrows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA
 
@@ -175,7 +175,8 @@ def count_parts(task_folder: Path) -> dict[str, int]:
 
 def has_images(task_folder: Path) -> bool:
     """Whether any query of a task holds an image, as the file's own counts say it."""
-    metadata = pq.ParquetFile(task_folder / taskdir.QUERIES).metadata
+    with open_table(task_folder / taskdir.QUERIES, mend="make the queries again", is_whole=False) as source:
+        metadata = source.metadata
     columns = [
         metadata.row_group(group).column(at)
         for group in range(metadata.num_row_groups)
@@ -282,7 +283,7 @@ def _copy_queries(folder: Path, task: ReleaseTask) -> None:
 def _copy_truths(folder: Path, task: ReleaseTask) -> None:
     target = folder / "truth" / task.suite / task.map_name
     target.mkdir(parents=True)
-    heads = pq.read_table(task.folder / taskdir.QUERIES, columns=["query_id", "part"])
+    heads = read_table(task.folder / taskdir.QUERIES, mend="make the queries again", columns=["query_id", "part"])
     for part in sorted(task.told):
         ids = heads.filter(pc.equal(heads["part"], part))["query_id"].combine_chunks()
         rows = taskdir.read_batches(task.truth / taskdir.TRUTH, TRUTH_SCHEMA.names)
@@ -299,7 +300,7 @@ def _plain(batch: pa.RecordBatch) -> pa.RecordBatch:
 
 
 def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> None:
-    with pq.ParquetWriter(path, schema, compression="zstd", compression_level=9) as target:
+    with table_writer(path, schema, compression_level=9) as target:
         for batch in batches:
             if batch.num_rows:
                 target.write_batch(batch.select(schema.names).cast(schema))

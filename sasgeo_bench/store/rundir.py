@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import MatchError, PoseError, StoreError
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.learnedfile import LearnedSaid
+from sasgeo_bench.store.parquetfile import read_schema, read_table, write_table
 from sasgeo_bench.store.runrows import (
     PREDICTION_SCHEMA,
     RUN_SCHEMA,
@@ -27,6 +28,7 @@ from sasgeo_bench.store.runrows import (
 from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, asked_under, poses_of
 
 RUN: Final = "run.json"
+_MEND: Final = "write it again, or remove it where it is a part of a run"
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 
 
@@ -55,7 +57,7 @@ def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mappin
     table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA if asked is None else RUN_SCHEMA)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, scratch, compression="zstd")
+        write_table(table, scratch)
         _flush(scratch)
         scratch.rename(path)
     except OSError as error:
@@ -284,15 +286,9 @@ def read_part(path: Path) -> pa.Table:
     Raises
     ------
     StoreError
-        If it is not there, truncated, or no parquet file.
+        If it is not there, damaged, too large, or no parquet file.
     """
-    try:
-        with pq.ParquetFile(path) as source:
-            return source.read()
-    except (OSError, pa.ArrowException) as error:
-        text = " ".join(str(error).split())[:200]
-        message = f"{path} cannot be read ({text}): write it again, or remove it where it is a part of a run"
-        raise StoreError(message) from error
+    return read_table(path, mend=_MEND)
 
 
 def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | None = None) -> int:
@@ -330,7 +326,7 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
     scratch = into.with_name(f".{into.name}.partial")
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA), scratch, compression="zstd")
+        write_table(pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA), scratch)
         _flush(scratch)
         scratch.rename(into)
     except OSError as error:
@@ -393,8 +389,8 @@ def _who(about: Mapping[str, Any]) -> str:
 
 def _is_ours(path: Path) -> bool:
     try:
-        return path.is_file() and pq.read_schema(path).names == PREDICTION_SCHEMA.names
-    except (OSError, pa.ArrowException):
+        return path.is_file() and read_schema(path, mend=_MEND).names == PREDICTION_SCHEMA.names
+    except StoreError:
         return False
 
 
@@ -471,11 +467,9 @@ def read_run(folder: Path) -> dict[str, Any] | None:
     path = folder / RUN
     if not path.is_file():
         return None
-    damaged = StoreError(f"{path} is damaged: remove it and run again, the parts beside it are kept")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise damaged from error
+    mend = "remove it and run again, the parts beside it are kept"
+    content = read_json(path, mend=mend)
     if not isinstance(content, dict):
-        raise damaged
+        message = f"{path} is damaged (it says {str(content)[:40]!r}): {mend}"
+        raise StoreError(message)
     return content

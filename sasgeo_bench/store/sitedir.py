@@ -14,16 +14,17 @@ from typing import Any, Final
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import one_line
-from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, PROTECTION, SCORES, read_board
+from sasgeo_bench.store.boardfile import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
 from sasgeo_bench.store.fileset import IMAGES, SITE_FOLDERS, check_site, list_files
 from sasgeo_bench.store.fileset import SITE_SAYS as MANIFEST
+from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.packabout import PicturesSaid, parse_said
 from sasgeo_bench.store.packdir import is_pack, read_settings
+from sasgeo_bench.store.parquetfile import read_frame
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 from sasgeo_bench.store.svgfile import svg_fault
 
@@ -139,7 +140,7 @@ def _sound(folder: Path) -> Iterator[None]:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    return pq.read_table(path).to_pandas() if path.is_file() else pd.DataFrame()
+    return read_frame(path, mend=MEND) if path.is_file() else pd.DataFrame()
 
 
 def _plain_or_packed(path: Path) -> bytes | None:
@@ -203,7 +204,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
     try:
         data = said.read_bytes()
         parse_said(data, PicturesSaid)
-        content = json.loads(data)
+        content = parse_json(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
         for item in (one for listed in found.values() for one in listed):
             _check_picture(folder, str(item["file"]))

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.results import MOST_MESSAGE, Prediction
+from sasgeo_bench.store.jsonfile import read_json
+from sasgeo_bench.store.parquetfile import open_table, write_table
 from sasgeo_bench.store.regiondir import file_record, fresh_folder, locked
 from sasgeo_bench.store.runrows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.store.taskrows import ASKED
@@ -28,9 +29,6 @@ README: Final = "README.md"  # beside submissions, and no submission
 MOST_BYTES: Final = 20_000_000  # of the predictions
 _MOST_CARD_BYTES: Final = 100_000
 _MOST_SAID_BYTES: Final = 5_000_000
-_MOST_ROWS: Final = 1_000_000
-_MOST_VALUES: Final = 100_000_000  # of one column, all lists laid end to end
-_MOST_UNPACKED_BYTES: Final = 2_000_000_000
 _TEXTS: Final = ("query_id", "status", "message", ASKED)
 _LEVEL: Final = 19
 
@@ -117,7 +115,7 @@ def write_submission(
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
             (scratch / PREDICTIONS).mkdir()
             table = pa.Table.from_pylist(rows, schema=RUN_SCHEMA)
-            pq.write_table(table, scratch / name, compression="zstd", compression_level=_LEVEL, write_statistics=False)
+            write_table(table, scratch / name, compression_level=_LEVEL, write_statistics=False)
             record = file_record(scratch / name)
             _check_bytes(folder, record.bytes)
             whole = said.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
@@ -224,12 +222,7 @@ def _is_plain(entry: os.DirEntry[str]) -> bool:
 
 
 def _read_said(path: Path) -> Submission:
-    text = _text_of(path, _MOST_SAID_BYTES, f"the {SAID} of a submission")
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        message = f"{path} is no JSON ({' '.join(str(error).split())[:120]}): submit again"
-        raise StoreError(message) from error
+    content = read_json(path, mend="submit again", most_bytes=_MOST_SAID_BYTES)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         message = f"{path} has schema version {version!r}, this version reads {SCHEMA_VERSION}: submit again"
@@ -255,16 +248,9 @@ def _check_file(path: Path, said: FileSaid) -> None:
 
 def _check_table(path: Path) -> None:
     """Refuse a table of another shape, and one that unpacks to more than anyone has to say."""
-    try:
-        with pq.ParquetFile(path, read_dictionary=list(_TEXTS)) as source:
-            _check_schema(path, source.schema_arrow)
-            _check_counts(path, source.metadata)
-            texts = source.read(columns=list(_TEXTS))  # each text once, however often it stands there
-    except SasgeoError:
-        raise
-    except (OSError, ValueError, pa.ArrowException) as error:
-        message = f"{path} cannot be read ({' '.join(str(error).split())[:200]}): submit again"
-        raise StoreError(message) from error
+    with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
+        _check_schema(path, source.schema_arrow)
+        texts = source.read(columns=list(_TEXTS))  # each text once, however often it stands there
     for name in _TEXTS:
         known = (text for chunk in texts[name].chunks for text in chunk.dictionary if text.is_valid)
         longest = max((len(text.as_buffer()) for text in known), default=0)
@@ -284,20 +270,3 @@ def _check_schema(path: Path, schema: pa.Schema) -> None:
         wrong = sorted(set(plain.names) ^ set(RUN_SCHEMA.names)) or ["the types of its columns"]
         message = f"{path} holds no predictions as 'submit' writes them ({wrong[0]} is not as it must be): submit again"
         raise StoreError(message)
-
-
-def _check_counts(path: Path, about: pq.FileMetaData) -> None:
-    chunks = [
-        about.row_group(group).column(column)
-        for group in range(about.num_row_groups)
-        for column in range(about.num_columns)
-    ]
-    found = {
-        "rows": (about.num_rows, _MOST_ROWS),
-        "values in a column": (max((chunk.num_values for chunk in chunks), default=0), _MOST_VALUES),
-        "bytes unpacked": (sum(chunk.total_uncompressed_size for chunk in chunks), _MOST_UNPACKED_BYTES),
-    }
-    for what, (count, most) in found.items():
-        if count > most:
-            message = f"{path} holds {count} {what}, {most} at most: submit again"
-            raise StoreError(message)

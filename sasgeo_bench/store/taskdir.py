@@ -3,21 +3,22 @@
 
 import hashlib
 import json
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
+from pydantic import Field
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.evidence import CELLS_PER_BYTE
 from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.store.jsonfile import read_json
+from sasgeo_bench.store.parquetfile import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.store.regiondir import file_record, sha256_of
 from sasgeo_bench.store.taskrows import (
     ASKED,
@@ -34,16 +35,68 @@ from sasgeo_bench.store.taskrows import (
     truth_of,
     truth_row,
 )
+from sasgeo_bench.tomlfile import Document, check_document
+
+Count = Annotated[int, Field(ge=0)]
+Folder = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9+@._-]*$")]  # never a way out
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
 SCHEMA_VERSION: Final = 1
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of a suite or a region: one folder, never a way out
+_MEND: Final = "make the queries again"
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
-_SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
+
+
+class TaskFile(Document):
+    """Hash and size of the queries."""
+
+    sha256: str
+    bytes: Count
+
+
+class TaskFiles(Document):
+    """Files of a task, of which there is one."""
+
+    queries: Annotated[TaskFile, Field(alias=QUERIES)]
+
+
+class TaskSaid(Document):
+    """What `task.json` says; an unknown key is an error, for a later schema says so by its version.
+
+    Examples
+    --------
+    >>> TaskSaid.model_fields["suite"].is_required()
+    True
+    """
+
+    schema_version: int
+    task_version: int
+    suite: Folder
+    suite_version: Count | None = None
+    title: str
+    what: str | None = None
+    separates: str | None = None
+    falsifier: str | None = None
+    strength_unit: str | None = None
+    region: Folder
+    map_date: str | None = None
+    map_fingerprint: str
+    map_inputs_sha256: str | None = None
+    split: str | None = None
+    split_sha256: str | None = None
+    sites: Count | None = None
+    views_cells: list[Count] | None = None
+    epsg: int | None = None
+    made_by: str | None = None
+    counts: dict[str, Count]
+    prior_groups: list[str] | None = None
+    candidates_sha256: str | None = None
+    files: TaskFiles
+    licence: str | None = None
+    attribution: str | None = None
 
 
 def write_task(
@@ -77,7 +130,7 @@ def write_task(
     frozen = hashlib.sha256()
     with ExitStack() as stack:
         queries, truths = (
-            stack.enter_context(pq.ParquetWriter(path, schema, compression="zstd", compression_level=9))
+            stack.enter_context(table_writer(path, schema, compression_level=9))
             for path, schema in ((task_folder / QUERIES, FILE_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
         )
         for part in _batches(pairs):
@@ -147,35 +200,19 @@ def read_task(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         message = f"{folder} holds no {TASK}: make the queries first"
         raise StoreError(message)
+    content = read_json(path, mend=_MEND)
+    said = content if isinstance(content, dict) else {}
+    for name, known in (("schema_version", SCHEMA_VERSION), ("task_version", TASK_VERSION)):
+        if name in said and said[name] != known:
+            noun = name.replace("_", " ")
+            message = f"{path} has {noun} {said[name]!r}, this version reads {known}: {_MEND}"
+            raise StoreError(message)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        found = content["schema_version"]
-        missing = [name for name in _SAID if name not in content] or [QUERIES][QUERIES in content["files"] :]
-        names = [str(content[name]) for name in ("suite", "region") if not missing]
-        if not missing and not isinstance(content["files"][QUERIES]["sha256"], str):
-            missing = [QUERIES]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        text = " ".join(repr(error).split())[:200]
-        message = f"{path} is damaged ({text}): make the queries again"
+        check_document(content, TaskSaid, source=TASK)
+    except ConfigError as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
-    if any(not _NAME.fullmatch(name) for name in names):
-        message = f"{path} is damaged (suite and region are {names}): make the queries again"
-        raise StoreError(message)
-    if found != SCHEMA_VERSION:
-        message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: make the queries again"
-        raise StoreError(message)
-    version = content.get("task_version")
-    if not missing and version != TASK_VERSION:
-        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
-        raise StoreError(message)
-    if missing:
-        message = f"{path} is damaged (it does not say {', '.join(missing)}): make the queries again"
-        raise StoreError(message)
-    version = content.get("task_version")
-    if version != TASK_VERSION:
-        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
-        raise StoreError(message)
-    return dict(content)
+    return said
 
 
 def check_queries(folder: Path) -> None:
@@ -273,8 +310,8 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
     if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
         message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
         raise StoreError(message)
-    with _named(truth_folder / TRUTH):
-        version = (pq.read_schema(truth_folder / TRUTH).metadata or {}).get(b"task_version", b"none").decode()
+    metadata = read_schema(truth_folder / TRUTH, mend=_MEND).metadata or {}
+    version = metadata.get(b"task_version", b"none").decode(errors="replace")
     if version != str(TASK_VERSION):
         message = (
             f"{truth_folder} holds truths of task version {version}, this version reads {TASK_VERSION}: "
@@ -286,9 +323,10 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
 def read_hidden(truth_folder: Path) -> dict[str, Any]:
     """What `truth.json` says; nothing where it cannot be read."""
     try:
-        return dict(json.loads((truth_folder / TRUTH_OF).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError):
+        said = read_json(truth_folder / TRUTH_OF, mend=_MEND)
+    except StoreError:
         return {}
+    return said if isinstance(said, dict) else {}
 
 
 def map_of(manifest: Manifest) -> dict[str, str]:
@@ -314,11 +352,10 @@ def read_asked(folder: Path) -> dict[str, str]:
         If a file is missing or damaged.
     """
     about, path = _map_said(read_task(folder)), folder / QUERIES
-    with _named(path):
-        is_said = ASKED in pq.read_schema(path).names
-        columns = ["query_id", ASKED] if is_said else QUERY_SCHEMA.names
-        rows = (row for batch in _batches_of(path, columns) for row in batch.to_pylist())
-        return {row["query_id"]: _asked_of(row, about) for row in rows}
+    is_said = ASKED in read_schema(path, mend=_MEND).names
+    columns = ["query_id", ASKED] if is_said else QUERY_SCHEMA.names
+    rows = (row for batch in read_batches(path, columns) for row in batch.to_pylist())
+    return {row["query_id"]: _asked_of(row, about) for row in rows}
 
 
 def _asked_of(row: Mapping[str, Any], about: Mapping[str, str]) -> str:
@@ -333,7 +370,7 @@ def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, by
     A row group is in memory at a time.
     """
     about = _map_said(read_task(folder))
-    with pq.ParquetFile(folder / QUERIES) as source:
+    with open_table(folder / QUERIES, mend=_MEND, is_whole=False) as source:
         for batch in source.iter_batches(batch_size=_ROWS):
             sent = batch.select([name for name in batch.schema.names if name != ASKED])
             for at, name in enumerate(batch["query_id"].to_pylist()):
@@ -350,12 +387,8 @@ def read_ids(folder: Path) -> list[str]:
     StoreError
         If the file is missing or damaged.
     """
-    try:
-        return [str(name) for name in pq.read_table(folder / QUERIES, columns=["query_id"])["query_id"].to_pylist()]
-    except (OSError, pa.ArrowException) as error:
-        text = " ".join(str(error).split())[:200]
-        message = f"{folder / QUERIES} cannot be read ({text}): make the queries again"
-        raise StoreError(message) from error
+    batches = read_batches(folder / QUERIES, ["query_id"])
+    return [str(name) for batch in batches for name in batch["query_id"].to_pylist()]
 
 
 def read_view_bytes(folder: Path) -> dict[str, int]:
@@ -363,22 +396,20 @@ def read_view_bytes(folder: Path) -> dict[str, int]:
 
     The size of a packed view follows from its shape, so that no view is read. Stored results say it.
     """
-    with _named(folder / QUERIES):
-        if VIEW_BYTES in pq.read_schema(folder / QUERIES).names:
-            table = pq.read_table(folder / QUERIES, columns=["query_id", VIEW_BYTES])
-            return dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
+    if VIEW_BYTES in read_schema(folder / QUERIES, mend=_MEND).names:
+        table = read_table(folder / QUERIES, mend=_MEND, columns=["query_id", VIEW_BYTES])
+        return dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
     found: dict[str, int] = {}
     columns = ["query_id", "rows", "cols", "classes", "confidence", "vectors"]
-    with _named(folder / QUERIES):
-        for batch in _batches_of(folder / QUERIES, columns):
-            shape = (batch["rows"], batch["cols"], pc.list_value_length(batch["classes"]))
-            cells = np.prod([np.asarray(side, dtype=np.int64) for side in shape], axis=0)
-            confidence = np.asarray(pc.fill_null(pc.binary_length(batch["confidence"]), 0))
-            vectors = batch["vectors"]
-            ends = np.concatenate(([0], np.cumsum(np.asarray(pc.binary_length(vectors.values.field("wkb"))))))
-            offsets = np.asarray(vectors.offsets)
-            total = -(-cells // CELLS_PER_BYTE) + confidence + ends[offsets[1:]] - ends[offsets[:-1]]
-            found |= dict(zip(batch["query_id"].to_pylist(), total.tolist(), strict=True))
+    for batch in read_batches(folder / QUERIES, columns):
+        shape = (batch["rows"], batch["cols"], pc.list_value_length(batch["classes"]))
+        cells = np.prod([np.asarray(side, dtype=np.int64) for side in shape], axis=0)
+        confidence = np.asarray(pc.fill_null(pc.binary_length(batch["confidence"]), 0))
+        vectors = batch["vectors"]
+        ends = np.concatenate(([0], np.cumsum(np.asarray(pc.binary_length(vectors.values.field("wkb"))))))
+        offsets = np.asarray(vectors.offsets)
+        total = -(-cells // CELLS_PER_BYTE) + confidence + ends[offsets[1:]] - ends[offsets[:-1]]
+        found |= dict(zip(batch["query_id"].to_pylist(), total.tolist(), strict=True))
     return found
 
 
@@ -390,11 +421,10 @@ def read_queries(folder: Path) -> Iterator[Query]:
 
 def read_heads(folder: Path) -> Iterator[Head]:
     """Queries of a task without their views, in the order of their ids."""
-    with _named(folder / QUERIES):
-        for batch in _batches_of(folder / QUERIES, HEAD_SCHEMA.names):
-            rows = batch.drop_columns(["candidates"]).to_pylist()
-            for row, poses in zip(rows, poses_of(batch["candidates"]), strict=True):
-                yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
+    for batch in read_batches(folder / QUERIES, HEAD_SCHEMA.names):
+        rows = batch.drop_columns(["candidates"]).to_pylist()
+        for row, poses in zip(rows, poses_of(batch["candidates"]), strict=True):
+            yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
 
 
 def read_truths(folder: Path) -> Iterator[Truth]:
@@ -411,14 +441,14 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
     StoreError
         If the file is missing or damaged, or lacks a column.
     """
-    with _named(path):
-        yield from _batches_of(path, list(columns))
+    with open_table(path, mend=_MEND, is_whole=False) as source:
+        _check_columns(path, source.schema_arrow.names, columns)
+        yield from source.iter_batches(batch_size=_ROWS, columns=list(columns))
 
 
 def check_columns(path: Path, needed: Sequence[str]) -> None:
     """Refuse queries or truths without some columns; raises as `read_batches` does."""
-    with _named(path):
-        _check_columns(path, pq.read_schema(path).names, needed)
+    _check_columns(path, read_schema(path, mend=_MEND).names, needed)
 
 
 def _check_columns(path: Path, found: Sequence[str], needed: Sequence[str]) -> None:
@@ -429,23 +459,5 @@ def _check_columns(path: Path, found: Sequence[str], needed: Sequence[str]) -> N
 
 
 def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:
-    with _named(path):
-        for batch in _batches_of(path, schema.names):
-            yield from batch.to_pylist()
-
-
-def _batches_of(path: Path, columns: list[str]) -> Iterator[pa.RecordBatch]:
-    with pq.ParquetFile(path) as source:
-        _check_columns(path, source.schema_arrow.names, columns)
-        yield from source.iter_batches(batch_size=_ROWS, columns=columns)
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Tell what cannot be read in one line that names the file."""
-    try:
-        yield
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())[:200]
-        message = f"{path} cannot be read ({text}): make the queries again"
-        raise StoreError(message) from error
+    for batch in read_batches(path, schema.names):
+        yield from batch.to_pylist()

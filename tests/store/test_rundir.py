@@ -143,10 +143,12 @@ def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows
     assert into.read_bytes() == whole
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", "[" * 100_000, "\x00"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", "[" * 100_000, "\x00", '{"a": NaN}', '{"a": 1, "a": 2}'])
 def test_a_damaged_run_json_is_told_in_one_line(tmp_path, text):
     (tmp_path / rundir.RUN).write_text(text)
-    assert "run.json is damaged: remove it and run again" in refusal(rundir.read_run, tmp_path)
+    line = refusal(rundir.read_run, tmp_path)
+    assert "run.json is damaged (" in line
+    assert line.endswith("remove it and run again, the parts beside it are kept")
 
 
 def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):

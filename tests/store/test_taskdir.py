@@ -17,7 +17,7 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.metrics.cost import observation_bytes
 from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import Query, Truth
+from sasgeo_bench.query import TASK_VERSION, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.taskdir import (
     QUERIES,
@@ -34,6 +34,7 @@ from sasgeo_bench.store.taskdir import (
 from sasgeo_bench.store.taskrows import ASKED, QUERY_SCHEMA, asked_sha256, query_of, query_row, truth_of, truth_row
 
 ABOUT = {"suite": "clean", "title": "Clean", "region": "here", "map_fingerprint": "0"}
+SAID = ABOUT | {"schema_version": 1, "task_version": TASK_VERSION, "counts": {}, "files": {}}
 
 metres = st.floats(-1e7, 1e7)
 shares = st.floats(0, 1)
@@ -368,9 +369,13 @@ def test_a_task_without_its_queries_has_that_one_fault(written):
         ("3", "is damaged"),
         ("{}", "is damaged"),
         ('{"schema_version": 0}', "has schema version 0, this version reads 1"),
-        ('{"schema_version": 1}', "is damaged (it does not say suite, title, region"),
-        (json.dumps(ABOUT | {"schema_version": 1, "counts": {}, "files": {}}), "does not say queries.parquet"),
-        (json.dumps(ABOUT | {"schema_version": 1, "counts": {}, "files": 3}), "is damaged"),
+        ('{"schema_version": 1}', "is damaged (task.json: 'task_version' is missing; 'suite' is missing"),
+        (json.dumps(SAID | {"files": {}}), "'files.queries.parquet' is missing"),
+        (json.dumps(SAID | {"files": {"queries.parquet": {"sha256": 5, "bytes": 1}}}), "Input should be a valid string"),
+        (json.dumps(SAID | {"counts": {"retrieval": -1}}), "greater than or equal to 0, got -1"),
+        (json.dumps(SAID | {"suite": "../../x"}), "'suite'"),
+        (json.dumps(SAID | {"titel": "x"}), "unknown key 'titel', did you mean 'title'?"),
+        (json.dumps(SAID | {"files": 3}), "is damaged"),
         ('{"schema_version": "1"}', "has schema version '1'"),
     ],
 )

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""JSON that anybody may have written: of a bounded size, each key once, every number finite, every text printable."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import StoreError, printable
+
+MOST_BYTES: Final = 50_000_000
+_MOST_DIGITS: Final = 40  # a seed of 128 bits has 39
+_MOST_QUOTED: Final = 200
+
+
+def parse_json(data: bytes | str) -> Any:  # noqa: ANN401 - any document
+    """Content of a JSON document.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, is nested without end, names a key twice, holds a number that is not finite or has too many
+        digits, or a text that cannot be encoded.
+
+    Examples
+    --------
+    >>> parse_json('{"a": [1, 2.5]}')
+    {'a': [1, 2.5]}
+    >>> parse_json('{"a": 1, "a": 2}')
+    Traceback (most recent call last):
+        ...
+    ValueError: the key 'a' stands there twice
+    """
+    try:
+        text = data if isinstance(data, str) else data.decode()
+        content = json.loads(
+            text, object_pairs_hook=_once, parse_float=_finite, parse_int=_short, parse_constant=_no_constant
+        )
+        json.dumps(content, ensure_ascii=False).encode()  # "\ud800" is JSON, but no text
+    except RecursionError as error:
+        message = "it is nested too deep"
+        raise ValueError(message) from error
+    return content
+
+
+def read_json(path: Path, *, mend: str, most_bytes: int = MOST_BYTES) -> Any:  # noqa: ANN401 - any document
+    """Content of a JSON file; `mend` says what to do if it cannot be read.
+
+    Raises
+    ------
+    StoreError
+        If it is missing, too large, or as `parse_json` refuses it.
+
+    Examples
+    --------
+    >>> read_json(Path("nowhere.json"), mend="submit again")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere.json is damaged (No such file or directory): submit again
+    """
+    try:
+        return parse_json(_read(path, most_bytes))
+    except (OSError, ValueError) as error:
+        text = printable(getattr(error, "strerror", None) or str(error))[:_MOST_QUOTED]
+        message = f"{path} is damaged ({text}): {mend}"
+        raise StoreError(message) from error
+
+
+def _read(path: Path, most_bytes: int) -> bytes:
+    with path.open("rb") as source:
+        data = source.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        message = f"it has more than {most_bytes} bytes"
+        raise ValueError(message)
+    return data
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        message = f"the key {next(name for name in names if names.count(name) > 1)[:_MOST_QUOTED]!r} stands there twice"
+        raise ValueError(message)
+    return content
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        message = f"{text[:_MOST_DIGITS]} is too large a number"
+        raise ValueError(message)
+    return value
+
+
+def _short(text: str) -> int:
+    if len(text) > _MOST_DIGITS:
+        message = f"{text[:_MOST_DIGITS]}... has too many digits"
+        raise ValueError(message)
+    return int(text)
+
+
+def _no_constant(name: str) -> float:
+    message = f"{name} is no number of JSON"
+    raise ValueError(message)

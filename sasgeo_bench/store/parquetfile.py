@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parquet files, written with checksums and read within bounds; every table of ours goes through here.
+
+Each page carries a CRC, which any reader can verify. Pages do not cover the footer, which holds names and types of the
+columns, so a file also carries the CRC-32 of its own footer. A file of somebody else may have neither; then nothing but
+its structure is checked.
+"""
+
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sasgeo_bench.errors import SasgeoError, StoreError
+
+CHECKED: Final[Mapping[str, Any]] = {"compression": "zstd", "write_page_checksum": True}
+VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
+MOST_ROWS: Final = 1_000_000  # of a table that is turned into rows
+MOST_VALUES: Final = 100_000_000  # of all columns together, lists laid end to end
+_MOST_UNPACKED: Final = 2_000_000_000  # bytes
+_ATTRS: Final = b"PANDAS_ATTRS"  # where pandas itself looks for them
+_SEAL: Final = b"sasgeo_footer_crc32"
+_DIGITS: Final = 8  # of a CRC-32, hexadecimal
+_MARK: Final = _SEAL + bytes((0x18, _DIGITS))  # Thrift's next field, a text of so many bytes
+_TAIL_BYTES: Final = 8  # length of the footer, and the magic number
+_MOST_QUOTED: Final = 200  # characters of what a library says
+
+
+@contextmanager
+def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetWriter]:  # noqa: ANN401
+    """Open a writer of a table with checksums; `options` are those of `pyarrow.parquet.ParquetWriter`.
+
+    The table is whole when the block ends.
+    """
+    about = {key: value for key, value in (schema.metadata or {}).items() if key != _SEAL}
+    with pq.ParquetWriter(path, schema.with_metadata(about), **{**CHECKED, **options}) as writer:
+        writer.add_key_value_metadata({_SEAL.decode(): "0" * _DIGITS})
+        yield writer
+    _seal(path)
+
+
+def write_table(table: pa.Table, path: Path, *, row_group_size: int | None = None, **options: Any) -> None:  # noqa: ANN401
+    """Write a table with checksums; the same table gives the same bytes.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "table.parquet"
+    ...     write_table(pa.table({"a": [1, 2]}), path)
+    ...     read_table(path, mend="write it again").column_names
+    ['a']
+    """
+    with table_writer(path, table.schema, **options) as writer:
+        writer.write_table(table, row_group_size)
+
+
+def write_frame(frame: pd.DataFrame, path: Path, *, attrs: Mapping[str, Any], **said: str) -> None:
+    """Write a data frame with checksums; `attrs` come back as its `attrs`, `said` stands in the file's metadata."""
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    about = {**(table.schema.metadata or {}), **said, _ATTRS: json.dumps(attrs)}
+    write_table(table.replace_schema_metadata(about), path)
+
+
+def read_frame(path: Path, *, mend: str) -> pd.DataFrame:
+    """Read what `write_frame` wrote, with its `attrs`; raises as `open_table` does."""
+    table = read_table(path, mend=mend, most_rows=MOST_VALUES)
+    try:
+        frame: pd.DataFrame = table.to_pandas()
+        frame.attrs = json.loads((table.schema.metadata or {}).get(_ATTRS, b"{}"))
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError, pa.ArrowException) as error:
+        message = f"{path} cannot be read ({str(error)[:_MOST_QUOTED]}): {mend}"
+        raise StoreError(message) from error
+    return frame
+
+
+@contextmanager
+def open_table(
+    path: Path,
+    *,
+    mend: str,
+    most_rows: int = MOST_ROWS,
+    is_whole: bool = True,
+    **options: Any,  # noqa: ANN401
+) -> Iterator[pq.ParquetFile]:
+    """Open a table that may be anybody's: its footer is checked and its size is bounded before anything is read.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    mend : str
+        What to do if it cannot be read, as in "score it again".
+    most_rows : int
+        Rows that it may hold.
+    is_whole : bool
+        Whether it is read whole; otherwise each row group is bounded by itself.
+    **options
+        Those of `pyarrow.parquet.ParquetFile`.
+
+    Yields
+    ------
+    pyarrow.parquet.ParquetFile
+        Pages that carry a checksum are verified as they are read.
+
+    Raises
+    ------
+    StoreError
+        If it is missing, damaged, no table, or too large; also if reading fails while it is open.
+
+    Examples
+    --------
+    >>> with open_table(Path("nowhere.parquet"), mend="score it again"):
+    ...     pass
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere.parquet cannot be read (No such file or directory): score it again
+    """
+    try:
+        _check_footer(path)
+        with pq.ParquetFile(path, **{**VERIFIED, **options}) as source:
+            fault = size_fault(source.metadata, most_rows=most_rows, is_whole=is_whole)
+            if fault is not None:
+                message = f"{path} holds {fault}: {mend}"
+                raise StoreError(message)
+            yield source
+    except SasgeoError:
+        raise
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        text = getattr(error, "strerror", None) or str(error)
+        message = f"{path} cannot be read ({text[:_MOST_QUOTED]}): {mend}"
+        raise StoreError(message) from error
+
+
+def read_table(path: Path, *, mend: str, columns: Sequence[str] | None = None, most_rows: int = MOST_ROWS) -> pa.Table:
+    """Read a table, or some of its columns; raises as `open_table` does."""
+    with open_table(path, mend=mend, most_rows=most_rows) as source:
+        return source.read(columns=None if columns is None else list(columns))
+
+
+def read_schema(path: Path, *, mend: str) -> pa.Schema:
+    """Read names, types and metadata of a table's columns; raises as `open_table` does."""
+    with open_table(path, mend=mend, most_rows=MOST_VALUES, is_whole=False) as source:
+        return source.schema_arrow
+
+
+def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True) -> str | None:
+    """What is too large about a table, by its footer; None where all is well.
+
+    Examples
+    --------
+    >>> import io
+    >>> file = io.BytesIO()
+    >>> pq.write_table(pa.table({"a": pa.nulls(30)}), file)
+    >>> size_fault(pq.ParquetFile(file).metadata, most_rows=20)
+    '30 rows, 20 at most'
+    """
+    groups = [about.row_group(at) for at in range(about.num_row_groups)]
+    chunks = [[group.column(at) for at in range(about.num_columns)] for group in groups]
+    rows = max(about.num_rows, sum(group.num_rows for group in groups))
+    values = sum(chunk.num_values for columns in chunks for chunk in columns)
+    sizes = [sum(chunk.total_uncompressed_size for chunk in columns) for columns in chunks]
+    unpacked = sum(sizes) if is_whole else max(sizes, default=0)
+    found = {
+        "rows": (rows, most_rows),
+        "values": (values, MOST_VALUES),
+        "bytes unpacked": (unpacked, _MOST_UNPACKED),
+    }
+    return next((f"{count} {what}, {most} at most" for what, (count, most) in found.items() if count > most), None)
+
+
+def _seal(path: Path) -> None:
+    """Put the CRC of the footer, computed with zeros in its place, where the writer left zeros."""
+    with path.open("r+b") as file:
+        footer = _read_footer(file)
+        at = footer.index(_MARK) + len(_MARK)
+        file.seek(at - len(footer), os.SEEK_END)
+        file.write(_crc_of(footer, at))
+
+
+def _check_footer(path: Path) -> None:
+    """Refuse a file whose footer is not what its CRC says; one without a CRC passes."""
+    with path.open("rb") as file:
+        footer = _read_footer(file)
+    at = footer.find(_MARK) + len(_MARK)
+    if at >= len(_MARK) and footer[at : at + _DIGITS] != _crc_of(footer, at):
+        message = "its footer is damaged"
+        raise pa.ArrowInvalid(message)
+
+
+def _read_footer(file: BinaryIO) -> bytes:
+    """Footer and tail of a file; the whole of one that is shorter than it says."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - _TAIL_BYTES, 0))
+    length = int.from_bytes(file.read(4), "little") + _TAIL_BYTES
+    file.seek(max(size - length, 0))
+    return file.read()
+
+
+def _crc_of(footer: bytes, at: int) -> bytes:
+    plain = footer[:at] + b"0" * _DIGITS + footer[at + _DIGITS :]
+    return f"{zlib.crc32(plain):0{_DIGITS}x}".encode()

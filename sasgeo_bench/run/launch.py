@@ -13,10 +13,9 @@ PROGRAM: Final = "import sys; sys.path.append(sys.argv.pop(1)); from sasgeo_benc
 
 
 def main() -> None:
-    """Enter under the policy that comes through the socket of the given number, and become the given module."""
-    number, module = sys.argv[1:]
-    channel = socket.socket(fileno=int(number))
+    """Enter under the policy that comes through the socket whose number is the last argument, and start Python anew."""
+    channel = socket.socket(fileno=int(sys.argv[-1]))
     policy, _ = wire.receive(channel)
     isolation = sandbox.enter(sandbox.Policy(**policy))
     wire.send(channel, {"kind": "shut in", "isolation": isolation.to_dict()})
-    os.execv(sys.executable, [sys.executable, "-P", "-m", module, number])  # noqa: S606 - our own module
+    os.execv(sys.executable, [sys.executable, *sys.argv[1:]])  # noqa: S606 - our own module, by our own interpreter

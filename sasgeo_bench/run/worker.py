@@ -35,6 +35,7 @@ from sasgeo_bench.run.memory import WATCH_S, MemoryWatch
 from sasgeo_bench.store.taskrows import pairs_bytes
 
 _KEEPER_S: Final = 5.0  # for the process that keeps a matcher's to end all that came from it
+_ANSWERS: Final = ("-P", "-m", sasgeo_bench.run.child.__name__)
 _KEPT_BYTES: Final = 4000  # of what a matcher prints
 _START_S: Final = 120.0
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
@@ -341,12 +342,11 @@ def _environment(scratch: Path) -> dict[str, str]:
 
 
 def _command(channel: int, *, is_shut_in: bool) -> list[str]:
-    """Start the module that answers, at once or by way of the one that shuts it in."""
-    module = sasgeo_bench.run.child.__name__
+    """Start the program that answers, at once or by way of the one that shuts it in."""
     if not is_shut_in:
-        return [sys.executable, "-P", "-m", module, str(channel)]
+        return [sys.executable, *_ANSWERS, str(channel)]
     package = str(Path(sasgeo_bench.run.child.__file__).parents[2])
-    return [sys.executable, "-I", "-S", "-c", PROGRAM, package, str(channel), module]
+    return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]
 
 
 def _code() -> list[Path]:

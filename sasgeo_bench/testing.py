@@ -162,7 +162,7 @@ def check_matcher(
             refused or kit.refused or _refusal(ready),
             before,
             _listing(place.folder),
-            worker.isolation.get("files", ""),
+            worker.isolation.get("files_changed", ""),
         )
 
 

@@ -107,7 +107,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "lookalike": None,
     "plugins": None,
     "run": (
-        *("sandbox", "wire", "serve", "child", "beside", "worker", "oracle"),
+        *("kernel", "seccomp", "landlock", "root", "sandbox", "wire", "launch", "serve", "child", "beside"),
+        *("cgroup", "memory", "worker", "oracle"),
         *("lesson", "plan", "teach", "schedule", "answers", "cluster", "runner"),
     ),
     "metrics": (
@@ -152,7 +153,12 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
 FILE_ROOMS = ("extract", "imagery", "store")
 FILE_EXCEPTIONS = {
     ("taxonomy", "read_text"): "reads the taxonomy.toml packaged beside it",
-    ("run.sandbox", "open"): "opens what the kernel asks for: identity maps, and paths to be allowed",
+    ("run.sandbox", "open"): "opens what the kernel asks for: identity maps, and who came from whom",
+    ("run.landlock", "open"): "opens paths to be allowed, as the kernel asks for",
+    ("run.root", "open"): "makes files to mount others on, and reads which mounts there are",
+    ("run.cgroup", "read_text"): "reads what the kernel counts",
+    ("run.cgroup", "write_text"): "writes limits for the kernel",
+    ("run.memory", "read_text"): "reads what the kernel says of a process",
     ("run.serve", "read_bytes"): "hashes the plugin's own code",
 }
 FILE_CALLS = frozenset(

@@ -37,6 +37,9 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     memory_mb: Annotated[
         int, typer.Option(help="MB (10^6 bytes) for all processes of the matcher")
     ] = Limits().memory_bytes // 10**6,
+    scratch_mb: Annotated[
+        int, typer.Option(help="MB of files that the matcher may write, in memory, where the system has a way")
+    ] = Limits().scratch_bytes // 10**6,
     train: Annotated[
         list[Path] | None,
         typer.Option(
@@ -62,7 +65,13 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
         tasks=tasks,
         out=out,
         top_k=top_k,
-        limits=Limits(match_s=match_s, prepare_s=prepare_s, learn_s=learn_s, memory_bytes=memory_mb * 10**6),
+        limits=Limits(
+            match_s=match_s,
+            prepare_s=prepare_s,
+            learn_s=learn_s,
+            memory_bytes=memory_mb * 10**6,
+            scratch_bytes=scratch_mb * 10**6,
+        ),
         jobs=jobs,
         dask=dask,
         shard=_shard(shard),

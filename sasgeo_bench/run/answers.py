@@ -15,6 +15,7 @@ from sasgeo_bench.query import Query
 from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.run.oracle import Oracle
 from sasgeo_bench.run.plan import RunPart, RunPlan, by_map, reach_of
+from sasgeo_bench.run.sandbox import PROMISES
 from sasgeo_bench.run.schedule import Schedule
 from sasgeo_bench.run.worker import Reply, Worker
 from sasgeo_bench.store import rundir, taskdir
@@ -314,6 +315,6 @@ def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
         prepare_s=ready.seconds,
         index_bytes=ready.grown_bytes,
         peak_bytes=worker.peak_bytes,
-        isolation=dict(worker.isolation)
-        or dict.fromkeys(("files", "truth", "network", "processes"), "trusted code, not shut in"),
+        isolation=dict.fromkeys(() if "truth" in worker.isolation else PROMISES, "trusted code, not shut in")
+        | worker.isolation,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lies beside the code and tells answers: stored results, truths, runs, boards, releases, sites, other maps.
+"""What lies beside the code and tells answers: queries, truths, results, runs, boards, releases, sites, other maps.
 
 A matcher reads the folders that it is imported from. They are walked here, no links followed, so that whatever in them
 tells where a query was taken can be hidden; how far the walk came is part of what it finds.
@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.run.sandbox import SYSTEM
+from sasgeo_bench.run.root import SYSTEM
 
 MOST_ENTRIES: Final = 200_000  # names that are looked at: about a second of a disk that is awake
 MOST_DEPTH: Final = 12
@@ -30,6 +30,7 @@ _SIGNS: Final = tuple(
         ("truths.parquet",),
         ("truth.parquet",),
         ("truth.json",),
+        ("queries.parquet",),
         ("submission.json", "predictions"),
         ("board.json", "leaderboard.parquet"),
         ("release.json", "SHA256SUMS"),
@@ -42,11 +43,12 @@ _SIGN_STARTS: Final = ("truth-", "part-")  # truths of one part of a task in a r
 _TELLING: Final = frozenset(
     {
         *("pack.json", "truths.parquet", "truth.parquet", "truth.json", "scores.parquet", "submission.json"),
+        *("queries.parquet", "tasks"),
         *("truth", "runs", "boards", "predictions", "learned", "pictures", "cases"),
     }
 )
 _OUT: Final = frozenset({"tasks", "truth"})
-_OF_OUT: Final = ("truth", "runs", "boards", "release", "results")
+_OF_OUT: Final = ("tasks", "truth", "runs", "boards", "release", "results")
 _HISTORY: Final = frozenset({".git", ".hg"})  # results that were ever committed are in there
 _PASSED_OVER: Final = frozenset({"site-packages", "dist-packages", "node_modules", "__pycache__"})
 _INTERPRETER: Final = frozenset({"pyvenv.cfg", "conda-meta"})
@@ -176,7 +178,7 @@ def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]
     passed = {*_HISTORY, *_PASSED_OVER}
     if names >= _OUT:
         tells += [Telling(folder=f"{base}/{name}") for name in _OF_OUT]
-        passed |= {"truth", "runs", "boards"}
+        passed |= {"tasks", "truth", "runs", "boards"}
     if any(names >= sign for sign in _SIGNS) or any(_is_table(name) for name in names):
         parts = [name for name in sorted(names) if name in _TELLING or _is_table(name)]
         is_code = any(name.endswith(".py") for name in names)

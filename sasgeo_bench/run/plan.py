@@ -25,6 +25,8 @@ MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
+_HIDDEN: Final = ("tasks", "truth", "runs", "boards", "release")  # below a root; a query comes to whom it is asked
+_LATER_LIMITS: Final = ("scratch_bytes", "processes")  # they make another run only where somebody changes them
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 
 
@@ -198,7 +200,7 @@ def plan_run(request: RunRequest) -> RunPlan:
         list_entry_points()  # a clash of names is told here: what the plugin's own process prints is not shown
     abouts = {folder: taskdir.read_task(folder) for folder in request.tasks}
     card, code, learns = _card(request)
-    limits = {name: value for name, value in asdict(request.limits).items() if learns or name != "learn_s"}
+    limits = _hashed(request.limits, learns=learns)
     said = {"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}
     settings = json.dumps(said, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
@@ -211,6 +213,13 @@ def plan_run(request: RunRequest) -> RunPlan:
     key = None if lesson is None else _key(lesson, learned)
     parts = tuple(_part(request, card, found, key, *item) for item in abouts.items())
     return RunPlan(request=request, card=card, hash=found, parts=parts, learns=learns, lesson=lesson, learned=learned)
+
+
+def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
+    """Limits that make a run another one."""
+    passed = {name for name in _LATER_LIMITS if getattr(limits, name) == getattr(Limits(), name)}
+    passed |= set() if learns else {"learn_s"}
+    return {name: value for name, value in asdict(limits).items() if name not in passed}
 
 
 def with_learned(plan: RunPlan, learned: Learned) -> RunPlan:
@@ -264,10 +273,7 @@ def _check(request: RunRequest) -> None:
         if not 0 < seconds <= _MOST_S:
             message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
             raise ConfigError(message)
-    memory_mb = limits.memory_bytes // _BYTES_PER_MB
-    if not _LEAST_MB <= memory_mb <= _MOST_MB:
-        message = f"--memory-mb must lie between {_LEAST_MB} and {_MOST_MB}, got {memory_mb}"
-        raise ConfigError(message)
+    _check_sizes(limits)
     strange = next((status for status in request.again if status not in STATUSES), None)
     if strange is not None:
         message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"
@@ -275,6 +281,14 @@ def _check(request: RunRequest) -> None:
     if request.dask is not None and request.jobs != 1:
         message = "--jobs and --dask both say how many processes there are: leave one of them out"
         raise ConfigError(message)
+
+
+def _check_sizes(limits: Limits) -> None:
+    sizes = (("--memory-mb", limits.memory_bytes, _LEAST_MB), ("--scratch-mb", limits.scratch_bytes, 1))
+    for name, size_bytes, least_mb in sizes:
+        if not least_mb <= size_bytes // _BYTES_PER_MB <= _MOST_MB:
+            message = f"{name} must lie between {least_mb} and {_MOST_MB}, got {size_bytes // _BYTES_PER_MB}"
+            raise ConfigError(message)
 
 
 def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
@@ -293,11 +307,11 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
 
 
 def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
-    """Some maps may be read; other maps, truths, and whatever other runs wrote, may not."""
+    """Some maps may be read; other maps, all queries, truths, and whatever other runs wrote, may not."""
     folders = (*request.tasks, *request.train)
     roots = {folder.resolve().parent.parent.parent for folder in folders} | {request.out.resolve()}
     readable = [region.resolve() for region in regions]
-    hidden = [root / name for root in sorted(roots) for name in ("truth", "runs", "boards", "release")]
+    hidden = [root / name for root in sorted(roots) for name in _HIDDEN]
     # A release that lies where others are written is hidden too, unless it is itself what is run on.
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would give the world away.

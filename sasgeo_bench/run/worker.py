@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One matcher in one process, seen from outside: started, asked, watched, and ended when it must be."""
 
+import contextlib
 import os
 import shutil
 import signal
@@ -13,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
@@ -27,9 +29,13 @@ from sasgeo_bench.query import Truth
 from sasgeo_bench.results import Status, one_line
 from sasgeo_bench.run import wire
 from sasgeo_bench.run.beside import walk_code
+from sasgeo_bench.run.cgroup import Group
+from sasgeo_bench.run.launch import PROGRAM
+from sasgeo_bench.run.memory import WATCH_S, MemoryWatch
 from sasgeo_bench.store.taskrows import pairs_bytes
 
-WATCH_S: Final = 0.05  # how often memory is looked at
+_KEEPER_S: Final = 5.0  # for the process that keeps a matcher's to end all that came from it
+_ANSWERS: Final = ("-P", "-m", sasgeo_bench.run.child.__name__)
 _KEPT_BYTES: Final = 4000  # of what a matcher prints
 _START_S: Final = 120.0
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
@@ -45,8 +51,10 @@ class Limits:
         Seconds by the clock for one query, for one map, and for whatever is learnt at once.
     memory_bytes : int
         Of all its processes together, resident; and of the address space of each.
-    file_bytes : int
-        Of one file in its scratch folder.
+    file_bytes, scratch_bytes : int
+        Of one file in its scratch folder, and of all together where the system has a way.
+    processes : int
+        Processes and threads of it at once, where the system has a way.
     """
 
     match_s: float = 30.0
@@ -54,6 +62,8 @@ class Limits:
     learn_s: float = 900.0
     memory_bytes: int = 4 * 10**9
     file_bytes: int = 2**30
+    scratch_bytes: int = 10**9
+    processes: int = 1024
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,8 +111,10 @@ class Worker:
     reach: Reach
     limits: Limits
     isolation: dict[str, str] = field(default_factory=dict)
-    peak_bytes: int = 0
     starts: int = 0
+    _peak_bytes: int = 0
+    _memory: MemoryWatch | None = None
+    _group: Group | None = None
     _process: subprocess.Popen[bytes] | None = None
     _channel: socket.socket | None = None
     _printed: deque[bytes] = field(default_factory=deque)
@@ -158,7 +170,8 @@ class Worker:
         try:
             channel = self._started()
             wire.send(channel, message, blob)
-            answer = self._wait(channel, timeout_s)
+            deadline = time.monotonic() + timeout_s
+            answer, _ = wire.receive(channel, deadline=deadline, most_bytes=wire.MOST_BYTES)
         except wire.Late:
             self.end()
             return Reply(status="timeout", message=f"no answer within {timeout_s:g} s")
@@ -166,44 +179,11 @@ class Worker:
             reply = Reply(status="crash", message=self._last_words(str(closed)))
             self.end()
             return reply
-        except _TooLarge as large:
-            self.end()
-            return Reply(status="crash", message=str(large))
         try:
             return _reply_of(answer)
         except (MatchError, ValueError, TypeError, KeyError, OverflowError) as error:
             self.end()
             return Reply(status="invalid", message=one_line(f"an answer that is none: {error}"))
-
-    def _wait(self, channel: socket.socket, timeout_s: float) -> dict[str, Any]:
-        """Wait for an answer, looking at the memory meanwhile."""
-        deadline = time.monotonic() + timeout_s
-        while True:
-            step = min(deadline, time.monotonic() + WATCH_S)
-            try:
-                # Only the wait for the first byte is cut into steps.
-                if wire.is_waiting(channel, step):
-                    return wire.receive(channel, deadline=deadline, most_bytes=wire.MOST_BYTES)[0]
-            finally:
-                self._watch()
-            if time.monotonic() >= deadline:
-                raise wire.Late
-
-    def _watch(self) -> None:
-        """Sum the resident memory of the process and all that came from it."""
-        if self._process is None:
-            return
-        try:
-            root = psutil.Process(self._process.pid)
-            family = [root, *root.children(recursive=True)]
-        except psutil.Error:
-            return
-        total = _memory_bytes(family, shared=True)
-        if total > self.limits.memory_bytes:  # what forked processes share counts once, which takes longer to find out
-            total = _memory_bytes(family, shared=False)
-        self.peak_bytes = max(self.peak_bytes, total)
-        if total > self.limits.memory_bytes:
-            raise _TooLarge(total, self.limits.memory_bytes)
 
     def _started(self) -> socket.socket:
         if self._channel is not None and not self._is_gone():
@@ -211,7 +191,7 @@ class Worker:
         self.end()
         ours, theirs = socket.socketpair()
         self._scratch = Path(tempfile.mkdtemp(prefix="sasgeo-matcher-"))
-        command = [sys.executable, "-P", "-m", sasgeo_bench.run.child.__name__, str(theirs.fileno())]
+        command = _command(theirs.fileno(), is_shut_in=self.reach.is_shut_in)
         self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
             command,
             pass_fds=[theirs.fileno()],
@@ -222,29 +202,63 @@ class Worker:
             start_new_session=True,
         )
         theirs.close()
+        self._begin_watch(self._process, self._scratch)
         self._printed = deque()
         threading.Thread(target=_drain, args=(self._process.stdout, self._printed), daemon=True).start()
         self._channel = ours
         self.starts += 1
-        policy = None
         if self.reach.is_shut_in:
-            code = _code()
-            beside = walk_code(code)
-            hidden = [*map(str, self.reach.hidden), *beside.hidden([*code, *self.reach.readable])]
-            policy = {
-                "readable": [str(path) for path in (*code, *self.reach.readable)],
-                "writable": [str(self._scratch)],
-                "hidden": list(dict.fromkeys(hidden)),
-                "unsearched": beside.unsearched,
-                "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
-                "file_bytes": self.limits.file_bytes,
-            }
+            wire.send(ours, self._policy(str(self._scratch)))
+            said, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
+            self.isolation = {str(name): one_line(str(words)) for name, words in dict(said["isolation"]).items()}
+        self.isolation["memory"] = _memory_words(self.limits, self._group)
         paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
-        start = {"spec": self.spec, "policy": policy, "scratch": str(self._scratch), "paths": paths}
-        wire.send(ours, start)
-        said, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
-        self.isolation = {str(name): one_line(str(words)) for name, words in dict(said.get("isolation", {})).items()}
+        wire.send(ours, {"spec": self.spec, "scratch": str(self._scratch), "paths": paths})
         return ours
+
+    def _begin_watch(self, process: subprocess.Popen[bytes], scratch: Path) -> None:
+        """Have the kernel count its memory where it does, and look at it ourselves in any case."""
+        memory_bytes, processes = self.limits.memory_bytes, self.limits.processes
+        self._group = Group.make(memory_bytes=memory_bytes, processes=processes)
+        try:
+            if self._group is not None:
+                self._group.add(process.pid)
+        except OSError:
+            self._end_watch()
+        kill = partial(_kill_family, process)
+        self._memory = MemoryWatch(
+            process=process, most_bytes=memory_bytes, kill=kill, scratch=scratch, group=self._group
+        )
+        self._memory.start()
+
+    def _end_watch(self) -> None:
+        """Stop looking, and remove what the kernel counted in with all that is left in it."""
+        if self._memory is not None:
+            self._memory.stop()
+            self._peak_bytes = max(self._peak_bytes, self._memory.peak_bytes)
+        if self._group is not None:
+            self._group.remove()
+        self._memory, self._group = None, None
+
+    @property
+    def peak_bytes(self) -> int:
+        """Most memory that a process of this matcher and all that came from it have held at once."""
+        return max(self._peak_bytes, self._memory.peak_bytes if self._memory else 0)
+
+    def _policy(self, scratch: str) -> dict[str, Any]:
+        """Arguments of `sandbox.Policy`."""
+        code = _code()
+        beside = walk_code(code)
+        hidden = [*map(str, self.reach.hidden), *beside.hidden([*code, *self.reach.readable])]
+        return {
+            "readable": [str(path) for path in (*code, *self.reach.readable)],
+            "scratch": scratch,
+            "hidden": list(dict.fromkeys(hidden)),
+            "unsearched": beside.unsearched,
+            "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
+            "file_bytes": self.limits.file_bytes,
+            "scratch_bytes": self.limits.scratch_bytes,
+        }
 
     def _last_words(self, closed: str) -> str:
         """How a process ended, and the last line it printed."""
@@ -254,6 +268,8 @@ class Worker:
                 code = self._process.wait(timeout=2)
             except subprocess.TimeoutExpired:
                 code = None
+        if self._memory is not None and self._memory.look():
+            return f"takes more than the {self.limits.memory_bytes / 1e6:.0f} MB of memory that are allowed"
         how = closed
         if code is not None:
             how = f"died by {_signal_name(-code)}" if code < 0 else f"ended with exit status {code}"
@@ -267,6 +283,7 @@ class Worker:
             self._channel.close()
         if self._process is not None:
             _kill_family(self._process)
+        self._end_watch()
         if self._scratch is not None:
             shutil.rmtree(self._scratch, ignore_errors=True)
         self._process, self._channel, self._scratch = None, None, None
@@ -276,22 +293,6 @@ def _signal_name(number: int) -> str:
     """Name of a signal; those of real time have a number alone."""
     known = {item.value: item.name for item in signal.Signals}
     return known.get(number, f"signal {number}")
-
-
-class _TooLarge(Exception):  # noqa: N818 - a limit, told as a row's message
-    def __init__(self, found: int, most: int) -> None:
-        super().__init__(f"{found / 1e6:.0f} MB of memory, at most {most / 1e6:.0f} are allowed")
-
-
-def _memory_bytes(family: Sequence[psutil.Process], *, shared: bool) -> int:
-    """Resident memory of some processes; pages they share count for each of them, or in shares."""
-    total = 0
-    for process in family:
-        try:
-            total += process.memory_info().rss if shared else process.memory_full_info().pss
-        except psutil.Error:
-            continue
-    return total
 
 
 def _reply_of(answer: Mapping[str, Any]) -> Reply:
@@ -340,6 +341,14 @@ def _environment(scratch: Path) -> dict[str, str]:
     return {**kept, **threads, **own, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
+def _command(channel: int, *, is_shut_in: bool) -> list[str]:
+    """Start the program that answers, at once or by way of the one that shuts it in."""
+    if not is_shut_in:
+        return [sys.executable, *_ANSWERS, str(channel)]
+    package = str(Path(sasgeo_bench.run.child.__file__).parents[2])
+    return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]
+
+
 def _code() -> list[Path]:
     """Where the interpreter and everything importable lies."""
     found = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.executable), Path(os.getcwd())]  # noqa: PTH109
@@ -358,19 +367,28 @@ def _drain(stream: IO[bytes] | None, printed: deque[bytes]) -> None:
             printed.popleft()
 
 
+def _memory_words(limits: Limits, group: Group | None) -> str:
+    """Say how memory and processes are counted."""
+    most = f"{limits.memory_bytes / 1e6:.0f} MB at most"
+    if group is not None:
+        return f"{most}, and {limits.processes} processes and threads, held by the kernel (cgroup v{group.version})"
+    return f"{most}, looked at every {WATCH_S * 1000:.0f} ms; processes are not counted"
+
+
 def _kill_family(process: subprocess.Popen[bytes]) -> None:
     """Kill a process, its session, and whatever it started elsewhere."""
     try:
         family = psutil.Process(process.pid).children(recursive=True)
     except psutil.Error:
         family = []
+    process.terminate()  # the one that keeps the others kills them first
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=_KEEPER_S)
     try:
         os.killpg(process.pid, signal.SIGKILL)
     except (ProcessLookupError, PermissionError):
         process.kill()
     for member in family:
-        try:
+        with contextlib.suppress(psutil.Error):
             member.kill()
-        except psutil.Error:
-            continue
     process.wait()

@@ -25,14 +25,19 @@ def hidden(root, *kept, **limits):
 
 @pytest.mark.parametrize(
     "sign",
-    ["pack.json", "truths.parquet", "truth.parquet", "truth.json", "truth-test.parquet", "part-00001-2.parquet"],
+    [
+        *("pack.json", "truths.parquet", "truth.parquet", "truth.json", "truth-test.parquet", "part-00001-2.parquet"),
+        "queries.parquet",
+    ],
 )
 def test_one_telling_name_hides_its_folder(tmp_path, sign):
     lay(tmp_path, f"a/b/{sign}", "a/c/notes.txt")
     assert hidden(tmp_path) == (["a/b"], "")
 
 
-@pytest.mark.parametrize(("sign", "with_it"), [(a, b) for a, b in map(sorted, beside._SIGNS[4:])])
+@pytest.mark.parametrize(
+    ("sign", "with_it"), [(a, b) for a, b in map(sorted, filter(lambda sign: len(sign) > 1, beside._SIGNS))]
+)
 def test_a_name_that_others_use_too_hides_nothing_alone(tmp_path, sign, with_it):
     lay(tmp_path, f"a/{sign}", f"b/{with_it}", f"c/{sign}", f"c/{with_it}")
     assert hidden(tmp_path)[0] == ["c"]
@@ -40,14 +45,14 @@ def test_a_name_that_others_use_too_hides_nothing_alone(tmp_path, sign, with_it)
 
 def test_what_stored_results_are_called_is_what_is_looked_for():
     signs = set().union(*beside._SIGNS)
-    assert {packfile.PACK, taskdir.TRUTH, taskdir.TRUTH_OF, boardfile.BOARD, sitedir.MANIFEST} <= signs
+    assert {packfile.PACK, taskdir.QUERIES, taskdir.TRUTH, taskdir.TRUTH_OF, boardfile.BOARD, sitedir.MANIFEST} <= signs
     assert {releasedir.INDEX, submissiondir.SAID, "truths.parquet"} <= signs
 
 
-def test_a_root_of_the_program_hides_all_of_it_but_its_tasks(tmp_path):
+def test_a_root_of_the_program_hides_all_of_it(tmp_path):
     lay(tmp_path, "out/tasks/clean/a/task.json", "out/truth/clean/a/truth.parquet", "out/runs/x/run.json", "out/x.txt")
     lay(tmp_path, "out/regions/a/region.json", "out/regions/a/layers.tif")
-    everything = [*sorted(f"out/{name}" for name in ("boards", "release", "results", "runs", "truth"))]
+    everything = [*sorted(f"out/{name}" for name in ("boards", "release", "results", "runs", "tasks", "truth"))]
     assert hidden(tmp_path)[0] == sorted([*everything, "out/regions/a"])
     assert hidden(tmp_path, tmp_path / "out/regions/a")[0] == everything
 

@@ -17,6 +17,7 @@ from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
+from sasgeo_bench.run.sandbox import PROMISES
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.validate import validate
@@ -182,8 +183,9 @@ def test_a_run_without_isolation_is_another_run_and_says_what_it_lacked(task, tm
     _, shut_in = run_all(request_of(task, tmp_path, limit=1))
     report, trusted = run_all(request_of(task, tmp_path, name="Raises", limit=1, is_shut_in=False))
     assert shut_in.parent != trusted.parent
-    assert set(rundir.read_run(trusted)["isolation"].values()) == {"trusted code, not shut in"}
-    assert set(rundir.read_run(trusted)["isolation"]) == {"files", "truth", "network", "processes"}
+    said = rundir.read_run(trusted)["isolation"]
+    assert set(said) == set(rundir.read_run(shut_in)["isolation"]) == set(PROMISES)
+    assert {words for name, words in said.items() if name != "memory"} == {"trusted code, not shut in"}
     assert list(report.messages) == ["crash"]
     same = plan_run(request_of(task, tmp_path, limit=1, is_shut_in=False)).parts[0].folder
     assert same != shut_in

@@ -44,7 +44,7 @@ def ask(place, task, name, *, limits=PATIENT, times=1, is_shut_in=True):
         ("Exits", "crash", "ended with exit status 3: last words"),
         ("Raises", "crash", "ValueError: no idea where this is"),
         ("RaisesInPrepare", "crash", "ValueError: no index today"),
-        ("Leaks", "crash", "MB of memory, at most 800 are allowed|out of memory"),
+        ("Leaks", "crash", "more than the 800 MB of memory that are allowed|out of memory"),
         ("Forks", "ok", ""),
         ("Prints", "ok", ""),
         ("ScoresNan", "invalid", "score is nan, expected a finite number"),

@@ -19,7 +19,7 @@ other
     Any other control or stress at a present place without a right answer.
 
 Accepted is what the operating rejector accepts at the threshold that kept the risk at 5 % on calibration places; where
-there is none, every answer. Right is within 25 m whatever the heading, or the right candidate, as in all figures of
+there is none, every answer. Right is within 25 m whatever the heading, on both tracks, as in all figures of
 rejection. Falsifiers are no cases: of some of them nothing else is asked than no answer.
 """
 

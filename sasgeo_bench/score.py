@@ -16,8 +16,8 @@ from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Head, Truth, base_of
 from sasgeo_bench.results import Prediction
 
-SCORER_VERSION: Final = 3  # raised whenever the same predictions get other figures; rows of two never share a board
-FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false
+SCORER_VERSION: Final = 4  # raised whenever the same predictions get other figures; rows of two never share a board
+FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false, on either track
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"
 
@@ -51,7 +51,8 @@ class Score:
     position_error_m, yaw_error_deg, log_scale_error : float
         Of the first pose, for localization of a place that is present; infinite without an answer, else NaN.
     is_right : bool
-        Whether the fix is the right candidate, or within `FIX_M`; never for an absent place.
+        Whether the fix lies within `FIX_M` of where the view was taken (Eq. 12); never for an absent place. In
+        retrieval, too: a pick beside the right candidate is no false fix if it is that near, though no hit.
     confidence : float
         What the matcher says; NaN where it does not.
     latency_s : float
@@ -143,7 +144,7 @@ def score_task(
         message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
         raise MetricError(message)
     told = [predictions.get(head.query_id) for head in asked]
-    errors = _errors(asked, [by_id[head.query_id] for head in asked], told)
+    errors = _errors([by_id[head.query_id] for head in asked], told)
     rows = [
         _score(head, by_id[head.query_id], prediction, error, place_of or {})
         for head, prediction, error in zip(asked, told, errors, strict=True)
@@ -151,14 +152,10 @@ def score_task(
     return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
 
 
-def _errors(heads: Sequence[Head], truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
+def _errors(truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
     """Metres, degrees and logarithm of the scale of each first pose; NaN where there is no pose to be right about."""
-    found = [_NO_ERROR] * len(heads)
-    asked = [
-        (at, truth.pose)
-        for at, (head, truth) in enumerate(zip(heads, truths, strict=True))
-        if truth.is_present and head.track != "retrieval" and truth.pose is not None
-    ]
+    found = [_NO_ERROR] * len(truths)
+    asked = [(at, truth.pose) for at, truth in enumerate(truths) if truth.is_present and truth.pose is not None]
     errors = pose_errors([first_pose(told[at]) for at, _ in asked], [pose for _, pose in asked])
     columns = (errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist())
     for (at, _), *error in zip(asked, *columns, strict=True):
@@ -169,12 +166,11 @@ def _errors(heads: Sequence[Head], truths: Sequence[Truth], told: Sequence[Predi
 def _score(
     head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, place_of: Mapping[str, str]
 ) -> Score:
-    fix = first_pose(prediction)
     rank = MISS
-    is_right = errors[0] <= FIX_M
-    if truth.is_present and head.track == "retrieval":
-        rank = _rank(prediction, truth, head.candidates)
-        is_right = fix is not None and rank.right > 0 and _is_at(fix, head.candidates[truth.candidate])
+    is_right = errors[0] <= FIX_M  # a candidate's heading is given and its place was moved by chance: no errors of it
+    if head.track == "retrieval":
+        errors = _NO_ERROR
+        rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS
     base = base_of(head.region)
     return Score(
         query_id=head.query_id,
@@ -201,7 +197,7 @@ def _score(
         scene=truth.scene,
         is_present=truth.is_present,
         status=MISSING if prediction is None else prediction.status,
-        is_answered=fix is not None,
+        is_answered=first_pose(prediction) is not None,
         above=rank.above,
         tied=rank.tied,
         right=rank.right,

@@ -56,6 +56,23 @@ def measured(*states, area=AREA):
     return measure_ageing(History(states=states, area=area, epsg=32632), place="here").table
 
 
+def test_shares_by_number_stand_beside_those_by_amount():
+    """One of two houses goes, four sheds come: a fifth of the ground is gone, and half of the houses."""
+    old = state(OLD, [(1, "building", house(0, width=40)), (2, "building", house(100))])
+    sheds = [(at, "building", house(200 + 20 * at, width=5, depth=5)) for at in range(3, 7)]
+    found = row(measured(old, state(NEW, [(1, "building", house(0, width=40)), *sheds])), "building")
+    assert (found["vanished_share"], found["vanished_number_share"]) == (0.2, 0.5)
+    assert (found["appeared_share"], found["appeared_number_share"]) == (0.2, 0.8)
+
+
+def test_a_line_counts_by_number_where_more_than_half_of_it_is_gone():
+    lines = [(1, "road_minor", line((0, 0), (100, 0))), (2, "road_minor", line((0, 200), (100, 200)))]
+    kept = [(1, "road_minor", line((0, 0), (60, 0))), (2, "road_minor", line((0, 200), (40, 200)))]
+    found = row(measured(state(OLD, lines), state(NEW, kept)), "road_minor")
+    assert found["vanished_number_share"] == 0.5
+    assert 0.4 < found["vanished_share"] < 0.6
+
+
 def row(table, name, span="whole"):
     return table[(table["class"] == name) & (table["span"] == span)].iloc[0]
 

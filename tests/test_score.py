@@ -94,7 +94,7 @@ def test_an_absent_place_has_no_error_and_no_right_answer():
 
 CHOICES = tuple(replace(HERE, easting_m=east) for east in (100.0, 500.0, 900.0))
 CHOOSE = replace(HEAD, track="retrieval", candidates=CHOICES)
-SECOND = replace(TRUTH, candidate=1)
+SECOND = replace(TRUTH, candidate=1, pose=replace(HERE, easting_m=490.0))  # candidates are moved off their places
 
 
 @pytest.mark.parametrize(
@@ -113,6 +113,22 @@ def test_the_rank_of_a_candidate_counts_those_above_and_those_tied(places, score
     assert row["is_right"] is is_right
     assert row["pool"] == 3
     assert math.isnan(row["position_error_m"])
+
+
+NEIGHBOURS = replace(CHOOSE, candidates=tuple(replace(HERE, easting_m=east) for east in (100.0, 125.0, 125.1)))
+FIRST = replace(TRUTH, candidate=0)
+
+
+@pytest.mark.parametrize(("east", "rank", "is_right"), [(125.0, (0, 0, 0), True), (125.1, (0, 0, 0), False)])
+def test_a_pick_beside_the_right_candidate_is_a_false_fix_only_beyond_25_metres(east, rank, is_right):
+    row = row_of(answer((east, 200.0, 90.0)), head=NEIGHBOURS, truth=FIRST)
+    assert row["is_right"] is is_right
+    assert (row["above"], row["tied"], row["right"]) == rank  # no hit, either way
+
+
+def test_no_pick_is_right_where_the_true_place_is_not_among_the_candidates():
+    removed = replace(FIRST, is_present=False, candidate=-1)
+    assert not row_of(answer((125.0, 200.0, 0.0)), head=NEIGHBOURS, truth=removed)["is_right"]
 
 
 def test_two_candidates_on_one_spot_are_told_apart_by_their_order():

@@ -60,6 +60,8 @@ DTYPES: Final = {
     "amount_to": "float64",
     "vanished_share": "float64",
     "appeared_share": "float64",
+    "vanished_number_share": "float64",
+    "appeared_number_share": "float64",
     "redrawn_share": "float64",
     "retagged_share": "float64",
     "ground_lost_share": "float64",
@@ -151,7 +153,8 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
     Notes
     -----
     Only what is visible from above counts, as in the layers: a stream put into a culvert has vanished, and is counted
-    as retagged. `vanished_share` is of the older amount, `appeared_share` of the newer. Dates less than `LEAST_DAYS`
+    as retagged. `vanished_share` is of the older amount, `appeared_share` of the newer; `*_number_share` is the same by
+    number of things, each of which counts as gone (or new) if more than half of it is. Dates less than `LEAST_DAYS`
     apart get shares but no rates.
 
     Examples
@@ -314,6 +317,8 @@ def _row(change: _Change, span: str, *, place: str, name: str) -> dict[str, obje
         "amount_to": amount_to,
         "vanished_share": _share(old.lost.sum(), amount_from),
         "appeared_share": _share(new.lost.sum(), amount_to),
+        "vanished_number_share": _share(old.lost_things, change.n_from),
+        "appeared_number_share": _share(new.lost_things, change.n_to),
         "redrawn_share": _share(weight.sum(), amount_from),
         "retagged_share": _share(change.vanished.retagged, amount_from),
         "ground_lost_share": _share(old.uncovered.sum(), amount_from),

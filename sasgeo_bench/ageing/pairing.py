@@ -74,6 +74,13 @@ class Verdict:
         """Units of which more is lost than kept."""
         return np.asarray(self.lost > COVER_SHARE * self.amount)
 
+    @property
+    def lost_things(self) -> int:
+        """Number of things of which more is lost than kept; a line's pieces are added up."""
+        things = len(self.shift_m)
+        lost, amount = (np.bincount(self.thing, weights=of, minlength=things) for of in (self.lost, self.amount))
+        return int((lost > COVER_SHARE * amount).sum())
+
 
 def cut_to(shapes: Geometries, area: shapely.Geometry) -> Geometries:
     """Cut geometries to an area; those wholly within are returned as they are.

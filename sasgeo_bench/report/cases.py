@@ -8,18 +8,21 @@ absent accepted
 right but withheld
     The fix is right, and is not accepted.
 aged
-    Under a stress whose view differs more from the map than that of its control does (`changed_share`), the answer is
-    wrong or none, and that of the control is right: same site, track, prior group and size of view.
+    Under a stress whose view differs more from the map than that of its control does (`changed_share`, by at least
+    0.1), the answer is wrong or none, and that of the control is right: same matcher, site, track, prior group and
+    size of view.
 occluded
     The same with more of the view unknown (`unknown_share`, by at least 0.05).
 aliased
     The answer is wrong and accepted, at a place that has a double: alias index at least 0.9, the highest bin of a
     board, or a suite that copies places.
+also without the stress
+    Under a stress the answer is wrong or none, and so is that of a control at the site: the stress is not to blame.
 other
     Any other control or stress at a present place without a right answer.
 
 Accepted is what the operating rejector accepts at the threshold that kept the risk at 5 % on calibration places; where
-there is none, every answer. Right is within 25 m whatever the heading, or the right candidate, as in all figures of
+there is none, every answer. Right is within 25 m whatever the heading, on both tracks, as in all figures of
 rejection. Falsifiers are no cases: of some of them nothing else is asked than no answer.
 """
 
@@ -34,12 +37,14 @@ from sasgeo_bench.metrics.base import Bools
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.rejection import OWN
 
-FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but withheld", "other")
+BOTH: Final = "also without the stress"
+FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but withheld", BOTH, "other")
 OPERATING: Final = "accepted_0.05"  # column of judged rows
 COLUMNS: Final = ("query_id", "matcher", "failure", "suite", "region", "kind")
 MOST_CASES: Final = 60  # of a board
 _ALIAS: Final = 0.9
 _UNKNOWN_MORE: Final = 0.05
+_CHANGED_MORE: Final = 0.1  # the lowest bin of a board ends there: less is hardly a change
 _COPIES: Final = ("alias", "topology-twins", "instance-twins")  # suites where every place has a double
 _SITE: Final = ("pair_id", "track", "prior_group", "view_cells")
 
@@ -110,9 +115,10 @@ def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None =
     rules = (
         ("absent accepted", ~is_present & is_answered & taken & is_asked),
         ("right but withheld", is_present & is_right & has_threshold & ~taken & is_asked),
-        ("aged", is_paired & (changed > control["changed_share"].to_numpy(float))),
+        ("aged", is_paired & (changed >= control["changed_share"].to_numpy(float) + _CHANGED_MORE)),
         ("occluded", is_paired & (unknown >= control["unknown_share"].to_numpy(float) + _UNKNOWN_MORE)),
         ("aliased", is_wrong & is_answered & taken & has_double),
+        (BOTH, is_wrong & is_stress & control["is_wrong"].to_numpy(bool)),
         ("other", is_wrong),
     )
     failure = np.select([mask for _, mask in rules], [name for name, _ in rules], default="")
@@ -132,13 +138,13 @@ def _accepted(scores: pd.DataFrame, judged: pd.DataFrame | None) -> tuple[Bools,
 
 
 def _controls(scores: pd.DataFrame) -> pd.DataFrame:
-    """Of each row the control at its site: whether it is right (or all, where there are several), and what it saw."""
+    """Of each row the controls at its site: whether all are right, whether some are wrong, and what they saw."""
     controls = scores[(scores["role"] == "control").to_numpy(bool) & scores["is_present"].to_numpy(bool)]
     how = {"is_right": "all", "changed_share": "max", "unknown_share": "max"}
     found = controls.groupby(list(_SITE), as_index=False).agg(how)
     beside = scores[list(_SITE)].merge(found, on=list(_SITE), how="left")
-    is_right = beside["is_right"].eq(other=True)
-    return beside.assign(is_right=is_right).fillna({"changed_share": 0.0, "unknown_share": 0.0})
+    said = {"is_right": beside["is_right"].eq(other=True), "is_wrong": beside["is_right"].eq(other=False)}
+    return beside.assign(**said).fillna({"changed_share": 0.0, "unknown_share": 0.0})
 
 
 def sample_cases(cases: pd.DataFrame, *, each: int, most: int = MOST_CASES) -> pd.DataFrame:

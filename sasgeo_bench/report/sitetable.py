@@ -145,12 +145,19 @@ def figure_cell(row: Record | None, *, has_bar: bool = False) -> Cell:
 
 
 def rank_cell(row: Record, *, ranked: int, mark: Mark | None = None) -> Cell:
-    """A cell of a rank interval, drawn as the part of all ranks that it covers."""
+    """A cell of a rank interval, drawn as the part of all ranks that it covers; not where one matcher alone is ranked.
+
+    Examples
+    --------
+    >>> row = {"matcher": "mine", "rank_best": 1, "rank_worst": 1}
+    >>> rank_cell(row, ranked=2).bar, rank_cell(row, ranked=1).bar
+    (Bar(lo=0.0, hi=50.0, at=None), None)
+    """
     text = rank_text(row)
     if pd.isna(row["rank_best"]) or is_unranked(str(row["matcher"])):
         return Cell(text=text)
     best, worst = int(row["rank_best"]), int(row["rank_worst"])
-    bar = Bar(lo=round(100 * (best - 1) / max(ranked, 1), 1), hi=round(100 * worst / max(ranked, 1), 1))
+    bar = Bar(lo=round(100 * (best - 1) / ranked, 1), hi=round(100 * worst / ranked, 1)) if ranked > 1 else None
     return Cell(text=text, key=best + worst / 1e4, bar=bar, marks=() if mark is None else (mark,))
 
 

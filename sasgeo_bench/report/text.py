@@ -248,7 +248,7 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "verdict": "which is better at 5 %; `null` where neither is shown to be, with or without ruling out a difference "
     f"that matters; `not decided` with fewer than {LEAST_BLOCKS} blocks",
     "rejector": "says of each answer how likely it is false; `own` is the matcher's own confidence, fitted to nothing",
-    "aurc": "mean share of false fixes (beyond 25 m, whatever the heading, or not the right candidate) among the "
+    "aurc": "mean share of false fixes (beyond 25 m, whatever the heading, on both tracks) among the "
     "surest 1, 2, ..., all queries; lower is better",
     "coverage_at_risk_0.05, risk_reached_at_0.05": "share of queries accepted by the threshold that kept false fixes "
     "at 5 % on other places, and the share of false fixes among them here",

@@ -26,17 +26,20 @@ PLOT: Final = "ageing.svg"
 _READING: Final = f"""\
 Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g} or, where split or merged, by the ground
 they share; lines by the length within {NEAR_M:g} m of a line of the other map. Vanished is a share of the older amount,
-appeared of the newer; re-drawn is what was kept and moved by more than {REDRAWN_M:g} m (areas: their centroid, so an
-area that grew has moved too). Ground lost and gained is what the class no longer, or newly, covers. Rates are those of
-an exponential life whose end is known only to lie between two dates, with 95 % intervals from 1,000 draws of blocks of
-1 km. Of what vanished or appeared, some is retagged (another class of its kind gave or took its place), some tags tell
-to be the world's change (construction, demolished, a start date after the older map) or the map's catching up (a start
-date before); the rest cannot be told. A dash: nothing to measure, or a rate of dates less than {LEAST_DAYS} days apart;
-"all": no bound."""
+appeared of the newer: of the ground or length ("amount"), and of the number of things, each of which counts where more
+than half of it does. Small things make the two differ. Re-drawn is what was kept and moved by more than {REDRAWN_M:g} m
+(areas: their centroid, so an area that grew has moved too). Ground lost and gained is what the class no longer, or
+newly, covers. Rates are those of an exponential life whose end is known only to lie between two dates, by amount, with
+95 % intervals from 1,000 draws of blocks of 1 km. Of what vanished or appeared, some is retagged (another class of its
+kind gave or took its place), some tags tell to be the world's change (construction, demolished, a start date after the
+older map) or the map's catching up (a start date before); the rest cannot be told. A dash: nothing to measure, or a
+rate of dates less than {LEAST_DAYS} days apart; "all": no bound."""
 
+_BOTH_WAYS: Final = ("vanished", "vanished_number", "appeared", "appeared_number")
 _CONTROLS: Final = """\
 Pairs of maps so near in time that next to nothing can have changed: what is found here is not ageing but the floor of
-the method, mostly things that one extract was cut to hold and the other was not. Shares vanished, appeared."""
+the method, mostly things that one extract was cut to hold and the other was not. Shares of the amount that vanished,
+appeared."""
 
 
 def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
@@ -247,7 +250,8 @@ def _place_cells(ageing: Ageing) -> list[str]:
 
 _RATE_HEAD: Final = (
     *("first amount", "last amount", "vanishes, %/year", "appears, %/year"),
-    *("vanished", "appeared", "re-drawn", "ids gone"),
+    *("vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
+    *("re-drawn, amount", "ids gone, number"),
     *("of vanished: world, retagged, untold", "of appeared: world, catch-up, retagged, untold"),
 )
 
@@ -265,7 +269,7 @@ def _rate_table(table: pd.DataFrame, *, by: str) -> str:
                 _amount(share["amount_to"], share["unit"]),
                 _rate(rate, "vanish_per_year"),
                 _rate(rate, "appear_per_year"),
-                *(_percent(share[f"{what}_share"]) for what in ("vanished", "appeared", "redrawn", "id_vanished")),
+                *(_percent(share[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "id_vanished")),
                 _shares(rate, "vanished", ("world", "retagged", "untold")),
                 _shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")),
             ]
@@ -274,7 +278,8 @@ def _rate_table(table: pd.DataFrame, *, by: str) -> str:
 
 
 _PAIR_HEAD: Final = (
-    *("class", "from", "to", "things", "vanished", "appeared", "re-drawn", "retagged", "ground lost, gained"),
+    *("class", "from", "to", "things", "vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
+    *("re-drawn", "retagged", "ground lost, gained"),
     *("shift median, p90", "ids gone", "vanishes, %/year", "appears, %/year"),
 )
 
@@ -287,7 +292,7 @@ def _pair_cells(row: pd.Series) -> list[str]:
         f"{row['date_from']:%Y-%m-%d}",
         f"{row['date_to']:%Y-%m-%d}",
         f"{row['n_from']:,} to {row['n_to']:,}",
-        *(_percent(row[f"{what}_share"]) for what in ("vanished", "appeared", "redrawn", "retagged")),
+        *(_percent(row[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "retagged")),
         f"{_percent(row['ground_lost_share'])}, {_percent(row['ground_gained_share'])}",
         "-" if pd.isna(shifts[0]) else f"{shifts[0]:.1f} m, {shifts[1]:.1f} m",
         _percent(row["id_vanished_share"]),

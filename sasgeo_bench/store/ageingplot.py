@@ -105,12 +105,14 @@ def _within(percent: float) -> float:
 
 
 def _draw_shares(chart: Axes, table: pd.DataFrame, names: list[str]) -> None:
-    """What ids say is gone against what geometry says, first map against last."""
+    """What ids say is gone against what geometry says, by amount and by number, first map against last."""
     whole = table[table["span"] == "whole"].set_index("class").loc[names]
-    pairs = zip(100 * whole["id_vanished_share"], 100 * whole["vanished_share"], strict=True)
-    for at, (by_id, by_place) in enumerate(pairs):
-        chart.plot([by_id, by_place], [at, at], color="#bbbbbb", lw=1.5, zorder=1)
+    columns = ("id_vanished_share", "vanished_share", "vanished_number_share")
+    for at, (by_id, by_place, by_number) in enumerate(zip(*(100 * whole[name] for name in columns), strict=True)):
+        ends = [end.reduce([by_id, by_place, by_number]) for end in (np.fmin, np.fmax)]
+        chart.plot(ends, [at, at], color="#bbbbbb", lw=1.5, zorder=1)
         chart.plot(by_id, at, marker="s", color=_BY_ID, ms=6, ls="", zorder=3)
+        chart.plot(by_number, at, marker="o", color="none", mec=_WHOLE, ms=5, ls="", mew=1.4, zorder=4)
         chart.plot(by_place, at, marker="D", color="white", mec=_WHOLE, ms=7, ls="", mew=1.4, zorder=2)
     chart.set_xlim(-3, 103)
     _dress(chart, "gone from first map to last, %", len(names))
@@ -148,14 +150,15 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
             ms=7,
             mew=1.4,
             ls="",
-            label="first map to last, by geometry",
+            label="first map to last, by geometry (amount)",
         ),
-        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="first map to last, by id"),
+        Line2D([], [], color="none", mec=_WHOLE, ms=5, mew=1.4, label="the same, by number", **common),
+        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="by id"),
     ]
-    figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=5, frameon=False)
+    figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=6, frameon=False)
     note = (
         "What appears may be mapping that catches up. Rates beyond the scale lie on its edges. "
-        "By geometry: share of the amount; by id: share of the things."
+        "Amount: ground or length; by number and by id: share of the things."
     )
     figure.text(0.015, 0.33 / height, note, fontsize=8.5, color="#444444", va="top")
     figure.text(0.985, 0.33 / height, ATTRIBUTION, fontsize=8.5, va="top", ha="right")

@@ -46,9 +46,17 @@ def said(table, accepted):
 def test_a_wrong_answer_on_an_older_map_is_aged_if_its_control_is_right():
     table = asked(CONTROL, row(90.0, changed_share=0.3))
     assert classes(table) == {"q1": "aged"}
-    assert classes(asked(row(90.0, role="control"), row(90.0, changed_share=0.3)))["q1"] == "other"
+    assert classes(asked(CONTROL, row(90.0, changed_share=0.09))) == {"q1": "other"}  # hardly changed
     assert classes(asked(CONTROL, row(90.0, changed_share=0.3, view_cells=96))) == {"q1": "other"}  # of another size
     assert classes(asked(CONTROL, row(90.0, changed_share=0.3, pair_id="elsewhere"))) == {"q1": "other"}
+
+
+@pytest.mark.parametrize("stress", [{"changed_share": 0.3}, {"unknown_share": 0.4}, {}])
+def test_a_matcher_that_fails_the_control_too_has_not_failed_for_the_stress(stress):
+    table = asked(row(90.0, role="control"), row(90.0, **stress))
+    assert classes(table) == {"q0": "other", "q1": "also without the stress"}
+    several = asked(CONTROL, row(np.inf, role="control"), row(90.0, **stress))
+    assert classes(several)["q2"] == "also without the stress"
 
 
 def test_a_wrong_answer_to_a_view_of_which_more_is_unknown_is_occluded_if_its_control_is_right():

@@ -19,6 +19,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "processes": None,
     "tomlfile": None,
     "angles": None,
+    "bounds": None,
     "pose": None,
     "grid": None,
     "taxonomy": None,
@@ -106,7 +107,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "lookalike": None,
     "plugins": None,
     "run": (
-        *("sandbox", "wire", "serve", "child", "beside", "worker", "oracle"),
+        *("sandbox", "wire", "replies", "serve", "child", "beside", "worker", "oracle"),
         *("lesson", "plan", "teach", "schedule", "answers", "cluster", "runner"),
     ),
     "metrics": (

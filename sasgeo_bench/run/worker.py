@@ -2,7 +2,7 @@
 """One matcher in one process, seen from outside: started, asked, watched, and ended when it must be."""
 
 import os
-import shutil
+import secrets
 import signal
 import socket
 import subprocess
@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
@@ -21,17 +21,18 @@ import psutil
 
 import sasgeo_bench.run.child
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matcher import Match, MatcherCard, check_learned
-from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Truth
-from sasgeo_bench.results import Status, one_line
+from sasgeo_bench.results import one_line
 from sasgeo_bench.run import wire
 from sasgeo_bench.run.beside import walk_code
+from sasgeo_bench.run.replies import Reply, read_reply
+from sasgeo_bench.store.regiondir import remove_tree
 from sasgeo_bench.store.taskrows import pairs_bytes
 
 WATCH_S: Final = 0.05  # how often memory is looked at
 _KEPT_BYTES: Final = 4000  # of what a matcher prints
 _START_S: Final = 120.0
+_SLACK_S: Final = 0.1  # of processor seconds beyond those of all processors: clocks tick
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
 
@@ -63,26 +64,6 @@ class Reach:
     readable: Sequence[Path]
     hidden: Sequence[Path]
     is_shut_in: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reply:
-    """What came of a question: a status, a line that says why, seconds and processor seconds inside, the answer.
-
-    Of a plugin that was loaded: its card, a hash of its code, and whether it has a `learn`; of a map: by how much
-    memory grew; of a lesson: what was learnt.
-    """
-
-    status: Status
-    message: str = ""
-    seconds: float | None = None
-    cpu_s: float = 0.0
-    match: Match | None = None
-    card: MatcherCard | None = None
-    code: str = ""
-    learns: bool = False
-    grown_bytes: int | None = None
-    learned: str | None = None
 
 
 @dataclass(kw_only=True)
@@ -129,7 +110,7 @@ class Worker:
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
         message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
-        return self._ask(message, blob, timeout_s=self.limits.learn_s)
+        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARNT_BYTES)
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, with what was learnt before."""
@@ -154,11 +135,16 @@ class Worker:
     def _is_gone(self) -> bool:
         return self._process is None or self._process.poll() is not None
 
-    def _ask(self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float) -> Reply:
+    def _ask(
+        self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float, most_bytes: int = wire.MOST_BYTES
+    ) -> Reply:
+        nonce = secrets.token_hex(16)  # nobody can have answered before it was asked
         try:
             channel = self._started()
-            wire.send(channel, message, blob)
-            answer = self._wait(channel, timeout_s)
+            asked = time.perf_counter()
+            wire.send(channel, {**message, "nonce": nonce}, blob, deadline=time.monotonic() + timeout_s)
+            answer, came = self._wait(channel, timeout_s, most_bytes)
+            reply = read_reply(message["kind"], answer, nonce=nonce)
         except wire.Late:
             self.end()
             return Reply(status="timeout", message=f"no answer within {timeout_s:g} s")
@@ -169,21 +155,25 @@ class Worker:
         except _TooLarge as large:
             self.end()
             return Reply(status="crash", message=str(large))
-        try:
-            return _reply_of(answer)
-        except (MatchError, ValueError, TypeError, KeyError, OverflowError) as error:
+        except (MatchError, wire.Garbled) as error:
             self.end()
             return Reply(status="invalid", message=one_line(f"an answer that is none: {error}"))
+        if reply.status != "ok":
+            return reply
+        seconds = came - asked
+        most_cpu_s = seconds * (os.cpu_count() or 1) + _SLACK_S
+        return replace(reply, seconds=seconds, cpu_s=min(reply.cpu_s, most_cpu_s))
 
-    def _wait(self, channel: socket.socket, timeout_s: float) -> dict[str, Any]:
-        """Wait for an answer, looking at the memory meanwhile."""
+    def _wait(self, channel: socket.socket, timeout_s: float, most_bytes: int) -> tuple[dict[str, Any], float]:
+        """Wait for an answer, looking at the memory meanwhile; it, and when it was there."""
         deadline = time.monotonic() + timeout_s
         while True:
             step = min(deadline, time.monotonic() + WATCH_S)
             try:
                 # Only the wait for the first byte is cut into steps.
                 if wire.is_waiting(channel, step):
-                    return wire.receive(channel, deadline=deadline, most_bytes=wire.MOST_BYTES)[0]
+                    answer, _ = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
+                    return answer, time.perf_counter()
             finally:
                 self._watch()
             if time.monotonic() >= deadline:
@@ -268,7 +258,7 @@ class Worker:
         if self._process is not None:
             _kill_family(self._process)
         if self._scratch is not None:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            remove_tree(self._scratch)
         self._process, self._channel, self._scratch = None, None, None
 
 
@@ -292,44 +282,6 @@ def _memory_bytes(family: Sequence[psutil.Process], *, shared: bool) -> int:
         except psutil.Error:
             continue
     return total
-
-
-def _reply_of(answer: Mapping[str, Any]) -> Reply:
-    """An answer taken apart with care: the process it comes from is not trusted."""
-    status, message = str(answer["status"]), one_line(str(answer.get("message", "")))
-    if status != "ok":
-        known: dict[str, Status] = {"crash": "crash", "invalid": "invalid", "refused": "refused"}
-        return Reply(status=known.get(status, "invalid"), message=message)
-    seconds = answer.get("seconds")
-    seconds = None if seconds is None else max(0.0, float(seconds))
-    row = answer.get("match")
-    if row is None:
-        card = answer.get("card")
-        return Reply(
-            status="ok",
-            seconds=seconds,
-            card=None if card is None else _card_of(card),
-            code=str(answer.get("code", "")),
-            learns=answer.get("learns") is True,
-            grown_bytes=int(answer.get("grown_bytes", 0)),
-            learned=check_learned(answer["learned"]) if "learned" in answer else None,
-        )
-    numbers = [[float(value) for value in candidate] for candidate in row["candidates"]]
-    poses = [Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in numbers]
-    match = Match(
-        poses=poses,
-        scores=[candidate[4] for candidate in numbers],
-        confidence=None if row["confidence"] is None else float(row["confidence"]),
-        diagnostics={str(name): float(value) for name, value in dict(row["diagnostics"]).items()},
-    )
-    return Reply(status="ok", seconds=seconds, cpu_s=max(0.0, float(answer["cpu_s"])), match=match)
-
-
-def _card_of(said: Mapping[str, Any]) -> MatcherCard:
-    """A card as it came, held to what a card must be."""
-    lists = ("tracks", "needs", "trained_on")
-    fields: dict[str, Any] = {name: tuple(value) if name in lists else value for name, value in said.items()}
-    return MatcherCard(**fields)
 
 
 def _environment(scratch: Path) -> dict[str, str]:

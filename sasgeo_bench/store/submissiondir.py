@@ -14,8 +14,9 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sasgeo_bench.bounds import MOST_MESSAGE
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.results import MOST_MESSAGE, Prediction
+from sasgeo_bench.results import Prediction
 from sasgeo_bench.store.regiondir import file_record, fresh_folder, locked
 from sasgeo_bench.store.runrows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.store.taskrows import ASKED

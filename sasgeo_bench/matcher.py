@@ -4,8 +4,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
+from sasgeo_bench.bounds import BOUNDS, MOST_CANDIDATES, MOST_DIAGNOSTICS, MOST_NAME, bounds_text, is_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Head, Query, Track, Truth
@@ -13,8 +15,6 @@ from sasgeo_bench.region import Region
 
 Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
-MOST_CANDIDATES: Final = 1000  # of one answer
-MOST_DIAGNOSTICS: Final = 64
 MOST_SAID: Final = 4000  # characters of a field of a card
 MOST_LEARNED_BYTES: Final = 2**20  # of what a matcher has learnt, as UTF-8
 SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
@@ -222,8 +222,8 @@ def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
     ------
     MatchError
         With found and expected, if it is not a Match, gives more than `top_k` poses, as many scores as it should not,
-        a number that is not finite, scores out of order, a confidence out of 0..1, a pose twice or one that is no
-        candidate of a retrieval query.
+        a number out of `bounds.BOUNDS`, scores out of order, a pose twice or one that is no candidate of a retrieval
+        query, or diagnostics with a name that is no line of at most `bounds.MOST_NAME` characters.
     """
     if not isinstance(match, Match):
         message = f"match() returned {type(match).__name__}, expected sasgeo_bench.matcher.Match"
@@ -232,11 +232,12 @@ def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
     if count > min(top_k, MOST_CANDIDATES):
         message = f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}"
         raise MatchError(message)
-    if len(match.scores) != count:
-        message = f"match() returned {len(match.scores)} scores for {count} poses, expected one each"
+    # What has a length may still give more or fewer than it says.
+    scores = [_number(score, "score") for score in islice(match.scores, MOST_CANDIDATES + 1)]
+    poses = [_pose(pose) for pose in islice(match.poses, count)]
+    if len(poses) != count or len(scores) != count:
+        message = f"match() returned {len(scores)} scores for {len(poses)} poses, expected one each"
         raise MatchError(message)
-    scores = [_number(score, "score") for score in match.scores]
-    poses = [_pose(pose) for pose in match.poses]
     fallen = next((at for at in range(1, count) if scores[at] > scores[at - 1]), None)
     if fallen is not None:
         message = (
@@ -244,25 +245,23 @@ def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
         )
         raise MatchError(message)
     confidence = None if match.confidence is None else _number(match.confidence, "confidence")
-    if confidence is not None and not 0 <= confidence <= 1:
-        message = f"confidence is {confidence:g}, expected 0..1 or None"
-        raise MatchError(message)
     if query.track == "retrieval":
         _check_candidates(poses, query.candidates)
     diagnostics = _diagnostics(match.diagnostics)
     return Match(poses=poses, scores=scores, confidence=confidence, diagnostics=diagnostics)
 
 
-def _number(value: object, name: str) -> float:
+def _number(value: object, name: str, *, shown: str = "") -> float:
     try:
         if isinstance(value, str | bytes):
             raise TypeError(value)  # noqa: TRY301 - Python reads "0.5" as a number, the door does not
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError) as error:
-        message = f"{name} is a {type(value).__name__}, expected a number"
+        message = f"{shown or name} is a {type(value).__name__}, expected a number"
         raise MatchError(message) from error
-    if not math.isfinite(number):
-        message = f"{name} is {number}, expected a finite number"
+    least, most = BOUNDS[name]
+    if not least <= number <= most:
+        message = f"{shown or name} is {number:g}, expected a finite number within {bounds_text(name)}"
         raise MatchError(message)
     return number
 
@@ -312,7 +311,16 @@ def _diagnostics(given: object) -> dict[str, float]:
     if len(given) > MOST_DIAGNOSTICS:
         message = f"diagnostics holds {len(given)} entries, expected at most {MOST_DIAGNOSTICS}"
         raise MatchError(message)
-    return {str(name): _number(value, f"diagnostics[{str(name)!r}]") for name, value in given.items()}
+    pairs = [(str(name), value) for name, value in islice(given.items(), MOST_DIAGNOSTICS + 1)]
+    wrong = next((name for name, _ in pairs if not name or not is_line(name, MOST_NAME)), None)
+    if wrong is not None:
+        message = f"diagnostics holds the name {wrong[:MOST_NAME]!r}, expected 1..{MOST_NAME} printable characters"
+        raise MatchError(message)
+    found = {name: _number(value, "diagnostics", shown=f"diagnostics[{name!r}]") for name, value in pairs}
+    if len(found) != len(given):
+        message = f"diagnostics holds {len(given)} entries under {len(found)} names, expected each name once"
+        raise MatchError(message)
+    return found
 
 
 def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | None:

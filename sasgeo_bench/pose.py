@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.angles import normalize_deg, rotation, wrap_deg
+from sasgeo_bench.bounds import BOUNDS, bounds_text
 from sasgeo_bench.errors import PoseError
 
 _SMALL: Final = 1e-9  # below this (c - 1) / log(c) is 1 to the last digit that matters
@@ -42,6 +43,9 @@ class Pose:
             message = f"scale must be positive, got {self.scale!r}"
             raise PoseError(message)
         if type(self.yaw_deg) is not float or not 0.0 < self.yaw_deg < 360.0:  # noqa: PLR2004 - in its range already
+            if not abs(self.yaw_deg) <= BOUNDS["yaw_deg"][1]:
+                message = f"yaw_deg must lie within {bounds_text('yaw_deg')}, got {self.yaw_deg!r}"
+                raise PoseError(message)
             object.__setattr__(self, "yaw_deg", float(normalize_deg(self.yaw_deg)))
 
     def to_map(self, offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:

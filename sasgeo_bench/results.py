@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
+from sasgeo_bench.bounds import MOST_MESSAGE
 from sasgeo_bench.errors import printable
 from sasgeo_bench.pose import Pose
 
 Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
 STATUSES: Final[tuple[Status, ...]] = get_args(Status)
-MOST_MESSAGE: Final = 300  # characters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +34,10 @@ class Prediction:
     message : str
         In one line, why there is no answer.
     latency_s : float, optional
-        Of `match` alone; None for files and where there is no answer.
+        By the runner's clock, from when the query was sent until the answer was read; None where there is no answer,
+        and in files whose author says nothing of it. Rows of older programs have the matcher's own clock here.
+    matcher_s : float, optional
+        Of `match` alone by the clock of the matcher's own process; no figure is made of it.
     """
 
     query_id: str
@@ -44,6 +47,7 @@ class Prediction:
     status: Status = "ok"
     message: str = ""
     latency_s: float | None = None
+    matcher_s: float | None = None
 
 
 def one_line(text: str) -> str:

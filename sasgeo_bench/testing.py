@@ -18,7 +18,8 @@ from sasgeo_bench.matcher import MatcherCard, candidates_at, check_match, lacks
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.request import Wanted, plan_requests
-from sasgeo_bench.run.worker import Limits, Reach, Reply, Worker
+from sasgeo_bench.run.replies import Reply
+from sasgeo_bench.run.worker import Limits, Reach, Worker
 from sasgeo_bench.store import taskdir, taskrows
 from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.store.regiondir import read_region

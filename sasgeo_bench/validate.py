@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.errors import MatchError, PoseError, StoreError, counted
-from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
+import pyarrow as pa
+
+from sasgeo_bench.bounds import MOST_CANDIDATES
+from sasgeo_bench.errors import MatchError, StoreError, counted
+from sasgeo_bench.matcher import Match, check_match
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import TASK_VERSION, Head, PriorGroup
-from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
-from sasgeo_bench.store.runrows import differing_columns, prediction_of
+from sasgeo_bench.store.runrows import differing_columns, prediction_of, row_faults
 from sasgeo_bench.store.submissiondir import SAID, predictions_name
 from sasgeo_bench.store.taskrows import ASKED
 from sasgeo_bench.submissionfile import Submission
@@ -91,11 +93,12 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
         for column, found, expected in differing:
             yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
         unread += bool(differing)
+        wrong = {} if differing else _faults_by_row(file.name, table)
         for row, item in enumerate([] if differing else table.to_pylist()):
             tie = rundir.tie_of(item)
             is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
             if item["query_id"] not in before and not is_aside:
-                yield from _row_faults(file.name, row, item, queries, seen)
+                yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
     yield from _missing(path.name, [] if unread else queries, seen)
 
 
@@ -141,9 +144,11 @@ def submission_faults(
     queries, asked = _asked_of(mine), _asked(mine)
     seen: dict[str, str] = {}
     file = folder / predictions_name(said.card.name)
-    for row, item in enumerate(rundir.read_part(file).to_pylist()):
+    table = rundir.read_part(file)
+    wrong = _faults_by_row(file.name, table)
+    for row, item in enumerate(table.to_pylist()):
         name = item["query_id"]
-        yield from _row_faults(file.name, row, item, queries, seen)
+        yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
         if name in asked and item[ASKED] != asked[name]:
             yield Violation(
                 file=file.name,
@@ -248,8 +253,22 @@ def _reach_m(bounds_m: Bounds, group: PriorGroup) -> Bounds:
     return west - more_m, south - more_m, east + more_m, north + more_m
 
 
+def _faults_by_row(file: str, table: pa.Table) -> dict[int, list[Violation]]:
+    """Numbers, names and texts out of their bounds."""
+    found: dict[int, list[Violation]] = {}
+    for one in row_faults(table):
+        wrong = Violation(file=file, row=one.row, column=one.column, found=one.found, expected=one.expected)
+        found.setdefault(one.row, []).append(wrong)
+    return found
+
+
 def _row_faults(
-    file: str, row: int, item: Mapping[str, Any], queries: Mapping[str, _Asked], seen: dict[str, str]
+    file: str,
+    row: int,
+    item: Mapping[str, Any],
+    queries: Mapping[str, _Asked],
+    seen: dict[str, str],
+    wrong: Sequence[Violation],
 ) -> Iterator[Violation]:
     name = item["query_id"]
     if name not in queries:
@@ -263,12 +282,9 @@ def _row_faults(
         )
         return
     seen[name] = f"{file}, row {row}"
-    if item["status"] not in STATUSES:
-        yield Violation(file=file, row=row, column="status", found=repr(item["status"]), expected=", ".join(STATUSES))
+    if wrong:
+        yield from wrong
         return
-    latency_s = item["latency_s"]
-    if latency_s is not None and not latency_s >= 0:
-        yield Violation(file=file, row=row, column="latency_s", found=str(latency_s), expected="0 or more, or null")
     if item["status"] != _ANSWERED:
         if item["candidates"]:
             count = len(item["candidates"])
@@ -285,10 +301,6 @@ def _row_faults(
 
 def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) -> Iterator[Violation]:
     """What is wrong with the answer itself."""
-    empty = next((at for at, one in enumerate(item["candidates"] or ()) if one is None or None in one.values()), None)
-    if empty is not None:
-        yield Violation(file=file, row=row, column="candidates", found=f"null in place {empty}", expected="numbers")
-        return
     try:
         prediction = prediction_of(item)
         match = Match(
@@ -299,13 +311,9 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) 
         )
         check_match(match, query.head, top_k=MOST_CANDIDATES)
         _check_inside(match.poses, query)
-    except PoseError as error:
-        expected, _, found = str(error).partition(", got ")
-        yield Violation(file=file, row=row, column="candidates", found=found, expected=expected)
     except MatchError as error:
         found, _, expected = str(error).partition(", expected ")
-        column = next((name for name in ("diagnostics", "confidence") if name in found), "candidates")
-        yield Violation(file=file, row=row, column=column, found=found, expected=expected or "an answer")
+        yield Violation(file=file, row=row, column="candidates", found=found, expected=expected or "an answer")
 
 
 def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:

@@ -20,6 +20,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "progress": None,
     "tomlfile": None,
     "angles": None,
+    "bounds": None,
     "pose": None,
     "grid": None,
     "taxonomy": None,
@@ -70,7 +71,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "submissionfile": None,
     "store": (
-        *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
+        *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile"),
+        *("rundir", "submissiondir"),
         *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
         *(
             "preview",
@@ -107,7 +109,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "lookalike": None,
     "plugins": None,
     "run": (
-        *("kernel", "seccomp", "landlock", "root", "sandbox", "wire", "launch", "serve", "child", "beside"),
+        *("kernel", "seccomp", "landlock", "root", "sandbox", "wire", "replies", "launch", "serve", "child", "beside"),
         *("cgroup", "memory", "worker", "oracle"),
         *("lesson", "plan", "teach", "schedule", "answers", "cluster", "runner"),
     ),

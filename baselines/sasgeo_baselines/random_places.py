@@ -8,8 +8,9 @@ import numpy as np
 
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import middle_m
+from sasgeo_bench.bounds import MOST_CANDIDATES
 from sasgeo_bench.grid import Grid
-from sasgeo_bench.matcher import MOST_CANDIDATES, WITHHELD, Match, MatcherCard
+from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Query
 from sasgeo_bench.region import Region

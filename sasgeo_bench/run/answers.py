@@ -15,9 +15,10 @@ from sasgeo_bench.query import Query
 from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.run.oracle import Oracle
 from sasgeo_bench.run.plan import RunPart, RunPlan, by_map, reach_of
+from sasgeo_bench.run.replies import Reply
 from sasgeo_bench.run.sandbox import PROMISES
 from sasgeo_bench.run.schedule import Schedule
-from sasgeo_bench.run.worker import Reply, Worker
+from sasgeo_bench.run.worker import Worker
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.store.taskrows import asked_under
@@ -245,6 +246,7 @@ def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
         confidence=match.confidence,
         diagnostics=match.diagnostics,
         latency_s=reply.seconds,
+        matcher_s=reply.own_s,
     )
 
 
@@ -312,7 +314,7 @@ class _Writer:
 def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
     """What a process has told of its map and of itself."""
     return Cost(
-        prepare_s=ready.seconds,
+        prepare_s=ready.own_s if ready.own_s is None or ready.seconds is None else min(ready.own_s, ready.seconds),
         index_bytes=ready.grown_bytes,
         peak_bytes=worker.peak_bytes,
         isolation=dict.fromkeys(() if "truth" in worker.isolation else PROMISES, "trusted code, not shut in")

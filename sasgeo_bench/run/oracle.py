@@ -11,7 +11,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.plugins import ORACLE
 from sasgeo_bench.query import Query, Truth
-from sasgeo_bench.run.worker import Reply
+from sasgeo_bench.run.replies import Reply
 from sasgeo_bench.store import taskdir, taskrows
 
 CARD: Final = MatcherCard(
@@ -65,7 +65,8 @@ class Oracle:
             raise StoreError(message)
         start = time.perf_counter()
         self._truths = {truth.query_id: truth for truth in taskdir.read_truths(self._folder)}
-        return Reply(status="ok", seconds=time.perf_counter() - start, grown_bytes=0)
+        seconds = time.perf_counter() - start
+        return Reply(status="ok", seconds=seconds, own_s=seconds, grown_bytes=0)
 
     def match(self, query: bytes, *, top_k: int) -> Reply:
         """Answer one query."""

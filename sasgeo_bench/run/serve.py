@@ -45,18 +45,19 @@ class Server:
                 message, blob = wire.receive(self.channel)
             except wire.Closed:
                 return
+            said = {"nonce": message["nonce"]}
             try:
-                answer = self._answer(message, blob)
+                answer = wire.packed(said | self._answer(message, blob))
             except MatchError as error:
-                answer = {"status": "invalid", "message": one_line(str(error))}
+                answer = wire.packed(said | {"status": "invalid", "message": one_line(str(error))})
             except MemoryError:
-                answer = {"status": "crash", "message": "out of memory"}
+                answer = wire.packed(said | {"status": "crash", "message": "out of memory"})
             except OSError as error:
                 status = "refused" if error.errno in _REFUSED else "crash"
-                answer = {"status": status, "message": told(error)}
+                answer = wire.packed(said | {"status": status, "message": told(error)})
             except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
-                answer = {"status": "crash", "message": told(error)}
-            wire.send(self.channel, answer)
+                answer = wire.packed(said | {"status": "crash", "message": told(error)})
+            wire.put(self.channel, answer)
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
         if message["kind"] == "load":
@@ -183,5 +184,5 @@ def match_row(match: Match) -> dict[str, Any]:
             for pose, score in zip(match.poses, match.scores, strict=True)
         ],
         "confidence": match.confidence,
-        "diagnostics": dict(match.diagnostics),
+        "diagnostics": [[name, value] for name, value in match.diagnostics.items()],
     }

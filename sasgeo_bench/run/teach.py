@@ -5,7 +5,8 @@ from sasgeo_bench.progress import Tell
 from sasgeo_bench.results import one_line
 from sasgeo_bench.run.lesson import Lesson, read_pairs
 from sasgeo_bench.run.plan import Learned, RunPlan, reach_of, with_learned
-from sasgeo_bench.run.worker import Reply, Worker
+from sasgeo_bench.run.replies import Reply
+from sasgeo_bench.run.worker import Worker
 from sasgeo_bench.store.learnedfile import read_learned, write_learned
 from sasgeo_bench.store.regiondir import locked
 

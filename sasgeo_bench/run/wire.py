@@ -8,8 +8,10 @@ import struct
 import time
 from typing import Any, Final
 
-MOST_BYTES: Final = 16 * 2**20  # of a message from a matcher's process; what it sends is not trusted
+MOST_BYTES: Final = 2**20  # of a message from a matcher's process; what it sends is not trusted
+MOST_LEARNT_BYTES: Final = 8 * 2**20  # of one with what was learnt: JSON may write a byte of it as six
 _HEAD: Final = struct.Struct("!II")
+_LEAST_S: Final = 1e-3  # no time at all would be taken for a socket that never waits
 
 
 class Closed(Exception):  # noqa: N818 - it is no error: the other side has gone
@@ -17,14 +19,32 @@ class Closed(Exception):  # noqa: N818 - it is no error: the other side has gone
 
 
 class Late(Exception):  # noqa: N818
-    """Nothing came in time."""
+    """Nothing came in time, or nobody read what was sent."""
 
 
-def send(channel: socket.socket, message: dict[str, Any], blob: bytes = b"") -> None:
-    """Send a message; `Closed` if the other side has gone."""
-    text = json.dumps(message, allow_nan=True).encode()
+class Garbled(Exception):  # noqa: N818
+    """What came is whole, and no message."""
+
+
+def send(channel: socket.socket, message: dict[str, Any], blob: bytes = b"", *, deadline: float | None = None) -> None:
+    """Send a message; `Closed` if the other side has gone, `Late` if it does not read until a deadline."""
+    put(channel, packed(message, blob), deadline=deadline)
+
+
+def packed(message: dict[str, Any], blob: bytes = b"") -> bytes:
+    """A message as it is sent."""
+    text = json.dumps(message).encode()
+    return _HEAD.pack(len(text), len(blob)) + text + blob
+
+
+def put(channel: socket.socket, data: bytes, *, deadline: float | None = None) -> None:
+    """Send a packed message, as `send` does."""
     try:
-        channel.sendall(_HEAD.pack(len(text), len(blob)) + text + blob)
+        channel.settimeout(None if deadline is None else max(deadline - time.monotonic(), _LEAST_S))
+        channel.sendall(data)
+        channel.settimeout(None)
+    except TimeoutError as error:
+        raise Late from error
     except OSError as error:
         raise Closed(str(error)) from error
 
@@ -46,7 +66,9 @@ def receive(
     Raises
     ------
     Closed
-        If the other side has gone, the message is too long, or it is none.
+        If the other side has gone, or the message is too long.
+    Garbled
+        If it is no JSON object; one that has a name twice, or a number that is none, is none.
     Late
         If it did not come in time.
     """
@@ -57,14 +79,29 @@ def receive(
     text = _exactly(channel, text_bytes, deadline)
     blob = _exactly(channel, blob_bytes, deadline)
     try:
-        found = json.loads(text)
+        found = json.loads(text, object_pairs_hook=_once, parse_constant=_refused)
     except (ValueError, RecursionError) as error:
-        message = "an answer that is no JSON"
-        raise Closed(message) from error
+        message = f"no JSON ({error})"
+        raise Garbled(message) from error
     if not isinstance(found, dict):
-        message = "an answer that is no JSON object"
-        raise Closed(message)
+        message = "no JSON object"
+        raise Garbled(message)
     return found, blob
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, each name in it once: of two readers one might take the first value and one the last."""
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        message = "a name is there twice"
+        raise ValueError(message)
+    return found
+
+
+def _refused(name: str) -> float:
+    """Refuse NaN and Infinity, which Python reads and JSON does not know."""
+    message = f"{name} is no number"
+    raise ValueError(message)
 
 
 def is_waiting(channel: socket.socket, deadline: float) -> bool:

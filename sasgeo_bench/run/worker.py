@@ -3,7 +3,7 @@
 
 import contextlib
 import os
-import shutil
+import secrets
 import signal
 import socket
 import subprocess
@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -23,21 +23,22 @@ import psutil
 
 import sasgeo_bench.run.child
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matcher import Match, MatcherCard, check_learned
-from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Truth
-from sasgeo_bench.results import Status, one_line
+from sasgeo_bench.results import one_line
 from sasgeo_bench.run import wire
 from sasgeo_bench.run.beside import walk_code
 from sasgeo_bench.run.cgroup import Group
 from sasgeo_bench.run.launch import PROGRAM
 from sasgeo_bench.run.memory import WATCH_S, MemoryWatch
+from sasgeo_bench.run.replies import Reply, read_reply
+from sasgeo_bench.store.regiondir import remove_tree
 from sasgeo_bench.store.taskrows import pairs_bytes
 
 _KEEPER_S: Final = 5.0  # for the process that keeps a matcher's to end all that came from it
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.run.child.__name__)
 _KEPT_BYTES: Final = 4000  # of what a matcher prints
 _START_S: Final = 120.0
+_SLACK_S: Final = 0.1  # of processor seconds beyond those of all processors: clocks tick
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
 
@@ -73,26 +74,6 @@ class Reach:
     readable: Sequence[Path]
     hidden: Sequence[Path]
     is_shut_in: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reply:
-    """What came of a question: a status, a line that says why, seconds and processor seconds inside, the answer.
-
-    Of a plugin that was loaded: its card, a hash of its code, and whether it has a `learn`; of a map: by how much
-    memory grew; of a lesson: what was learnt.
-    """
-
-    status: Status
-    message: str = ""
-    seconds: float | None = None
-    cpu_s: float = 0.0
-    match: Match | None = None
-    card: MatcherCard | None = None
-    code: str = ""
-    learns: bool = False
-    grown_bytes: int | None = None
-    learned: str | None = None
 
 
 @dataclass(kw_only=True)
@@ -141,7 +122,7 @@ class Worker:
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
         message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
-        return self._ask(message, blob, timeout_s=self.limits.learn_s)
+        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARNT_BYTES)
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, with what was learnt before."""
@@ -166,12 +147,18 @@ class Worker:
     def _is_gone(self) -> bool:
         return self._process is None or self._process.poll() is not None
 
-    def _ask(self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float) -> Reply:
+    def _ask(
+        self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float, most_bytes: int = wire.MOST_BYTES
+    ) -> Reply:
+        nonce = secrets.token_hex(16)  # nobody can have answered before it was asked
         try:
             channel = self._started()
-            wire.send(channel, message, blob)
+            asked = time.perf_counter()
             deadline = time.monotonic() + timeout_s
-            answer, _ = wire.receive(channel, deadline=deadline, most_bytes=wire.MOST_BYTES)
+            wire.send(channel, {**message, "nonce": nonce}, blob, deadline=deadline)
+            answer, _ = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
+            came = time.perf_counter()
+            reply = read_reply(message["kind"], answer, nonce=nonce)
         except wire.Late:
             self.end()
             return Reply(status="timeout", message=f"no answer within {timeout_s:g} s")
@@ -179,11 +166,14 @@ class Worker:
             reply = Reply(status="crash", message=self._last_words(str(closed)))
             self.end()
             return reply
-        try:
-            return _reply_of(answer)
-        except (MatchError, ValueError, TypeError, KeyError, OverflowError) as error:
+        except (MatchError, wire.Garbled) as error:
             self.end()
             return Reply(status="invalid", message=one_line(f"an answer that is none: {error}"))
+        if reply.status != "ok":
+            return reply
+        seconds = came - asked
+        most_cpu_s = seconds * (os.cpu_count() or 1) + _SLACK_S
+        return replace(reply, seconds=seconds, cpu_s=min(reply.cpu_s, most_cpu_s))
 
     def _started(self) -> socket.socket:
         if self._channel is not None and not self._is_gone():
@@ -285,7 +275,7 @@ class Worker:
             _kill_family(self._process)
         self._end_watch()
         if self._scratch is not None:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            remove_tree(self._scratch)
         self._process, self._channel, self._scratch = None, None, None
 
 
@@ -293,44 +283,6 @@ def _signal_name(number: int) -> str:
     """Name of a signal; those of real time have a number alone."""
     known = {item.value: item.name for item in signal.Signals}
     return known.get(number, f"signal {number}")
-
-
-def _reply_of(answer: Mapping[str, Any]) -> Reply:
-    """An answer taken apart with care: the process it comes from is not trusted."""
-    status, message = str(answer["status"]), one_line(str(answer.get("message", "")))
-    if status != "ok":
-        known: dict[str, Status] = {"crash": "crash", "invalid": "invalid", "refused": "refused"}
-        return Reply(status=known.get(status, "invalid"), message=message)
-    seconds = answer.get("seconds")
-    seconds = None if seconds is None else max(0.0, float(seconds))
-    row = answer.get("match")
-    if row is None:
-        card = answer.get("card")
-        return Reply(
-            status="ok",
-            seconds=seconds,
-            card=None if card is None else _card_of(card),
-            code=str(answer.get("code", "")),
-            learns=answer.get("learns") is True,
-            grown_bytes=int(answer.get("grown_bytes", 0)),
-            learned=check_learned(answer["learned"]) if "learned" in answer else None,
-        )
-    numbers = [[float(value) for value in candidate] for candidate in row["candidates"]]
-    poses = [Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in numbers]
-    match = Match(
-        poses=poses,
-        scores=[candidate[4] for candidate in numbers],
-        confidence=None if row["confidence"] is None else float(row["confidence"]),
-        diagnostics={str(name): float(value) for name, value in dict(row["diagnostics"]).items()},
-    )
-    return Reply(status="ok", seconds=seconds, cpu_s=max(0.0, float(answer["cpu_s"])), match=match)
-
-
-def _card_of(said: Mapping[str, Any]) -> MatcherCard:
-    """A card as it came, held to what a card must be."""
-    lists = ("tracks", "needs", "trained_on")
-    fields: dict[str, Any] = {name: tuple(value) if name in lists else value for name, value in said.items()}
-    return MatcherCard(**fields)
 
 
 def _environment(scratch: Path) -> dict[str, str]:

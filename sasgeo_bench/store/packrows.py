@@ -10,8 +10,7 @@ import pyarrow.compute as pc
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.query import PriorGroup
-from sasgeo_bench.results import STATUSES
-from sasgeo_bench.store.runrows import differing_columns
+from sasgeo_bench.store.runrows import differing_columns, row_faults
 from sasgeo_bench.store.taskrows import ASKED, HEAD_SCHEMA, POSE_FIELDS, TRUTH_SCHEMA, VIEW_BYTES
 
 TASK: Final = "task"  # column: number of the row in tasks.parquet
@@ -133,14 +132,9 @@ def check_predictions(name: str, table: pa.Table) -> None:
         column, found, expected = differing[0]
         message = f"{name}.parquet: {column}: found {found}, expected {expected}"
         raise ValueError(message)
-    _refuse(name, "query_id", _numbers(table["query_id"].is_null()))
-    _refuse(name, "status", ~_is_in(table["status"], STATUSES))
-    for column, most in (("confidence", 1.0), ("latency_s", np.inf)):
-        values = _numbers(table[column].cast(pa.float64()).drop_null())
-        _refuse(name, column, ~((values >= 0) & (values <= most)))
-    listed = _listed(table["candidates"])
-    _check_poses(name, listed)
-    _refuse(name, "score", ~np.isfinite(_numbers(listed["score"]).astype(float)))
+    for wrong in row_faults(table):
+        message = f"{name}.parquet, row {wrong.row}, {wrong.column}: found {wrong.found}, expected {wrong.expected}"
+        raise ValueError(message)
 
 
 def _listed(column: pa.ChunkedArray) -> pa.Table:

@@ -5,27 +5,27 @@ import json
 import os
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.errors import MatchError, PoseError, StoreError
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.errors import MatchError, StoreError
+from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.parquetfile import read_schema, read_table, write_table
 from sasgeo_bench.store.runrows import (
+    PART_SCHEMA,
     PREDICTION_SCHEMA,
-    RUN_SCHEMA,
     differing_columns,
-    prediction_of,
     prediction_row,
-    with_candidates,
+    predictions_of,
+    row_faults,
 )
-from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, asked_under, poses_of
+from sasgeo_bench.store.taskrows import ASKED, asked_under
 
 RUN: Final = "run.json"
 _MEND: Final = "write it again, or remove it where it is a part of a run"
@@ -54,7 +54,7 @@ def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mappin
     rows = [prediction_row(item) for item in predictions]
     if asked is not None:
         rows = [row | {ASKED: asked[row["query_id"]]} for row in rows]
-    table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA if asked is None else RUN_SCHEMA)
+    table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA if asked is None else PART_SCHEMA)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_table(table, scratch)
@@ -157,7 +157,7 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
         aside |= {replace(tie, status="") for tie, mine in zip(ties, is_mine, strict=True) if not mine}
         if not all(is_mine):
             table = table.filter(pa.array(is_mine, pa.bool_()))
-        for prediction in _rows_of(part, table, found):
+        for prediction in predictions_of(table):
             found.setdefault(prediction.query_id, prediction)
     return Answers(found, len(aside))
 
@@ -218,66 +218,24 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
         raise StoreError(message)
     seen: set[str] = set()
     for part in reversed(parts):
-        for prediction in _rows_of(part, _checked(part), seen):
+        for prediction in predictions_of(_checked(part)):
             if prediction.query_id not in seen:
                 seen.add(prediction.query_id)
                 yield prediction
 
 
 def _checked(part: Path) -> pa.Table:
-    """A part that holds the columns of predictions."""
+    """A part that holds the columns of predictions, and rows that are some."""
     table = read_part(part)
     for name, found, expected in differing_columns(table):
         fault = f"{name}: found {found}, expected {expected}"[:200]
         message = f"{part} holds no predictions ({fault}): 'validate' lists all that is missing"
         raise StoreError(message)
-    return table
-
-
-def _rows_of(part: Path, table: pa.Table, seen: Collection[str]) -> Iterable[Prediction]:
-    """Rows, last first."""
-    return _sound(table) or _one_by_one(part, table, seen)
-
-
-def _sound(table: pa.Table) -> list[Prediction]:
-    """All rows, last first, by columns; none where a row may need a word of its own."""
-    column = table["candidates"].combine_chunks()
-    if not isinstance(column, pa.ListArray) or any(table[name].null_count for name in ("query_id", "status")):
-        return []
-    values = column.values
-    if values.null_count or any(values.field(name).null_count for name in (*POSE_FIELDS, "score")):
-        return []
-    try:
-        poses = poses_of(column)
-    except (PoseError, TypeError):
-        return []
-    scores, ends = values.field("score").to_pylist(), column.offsets.to_pylist()
-    rows = table.drop_columns(["candidates"]).to_pylist()
-    return [
-        with_candidates(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
-        for at in reversed(range(len(rows)))
-    ]
-
-
-def _one_by_one(part: Path, table: pa.Table, seen: Collection[str]) -> Iterator[Prediction]:
-    """Rows of queries that were not seen yet, last first, each refused in a word of its own."""
-    for number, row in reversed(list(enumerate(table.to_pylist()))):
-        if row["query_id"] not in seen:
-            yield _read_row(part, number, row)
-
-
-def _read_row(part: Path, number: int, row: Mapping[str, Any]) -> Prediction:
-    """One row of a file that may be anyone's."""
-    where = f"{part}, row {number}, is no prediction"
-    absent = next((name for name in ("query_id", "status") if row[name] is None), None)
-    if absent is not None:
-        message = f"{where} ({absent} is null): 'validate' says all that is wrong"
+    for wrong in row_faults(table):
+        fault = one_line(f"{wrong.column}: found {wrong.found}, expected {wrong.expected}")
+        message = f"{part}, row {wrong.row}, is no prediction ({fault}): 'validate' says all that is wrong"
         raise StoreError(message)
-    try:
-        return prediction_of(row)
-    except (PoseError, TypeError) as error:
-        message = f"{where} ({error}): 'validate' says all that is wrong"
-        raise StoreError(message) from error
+    return table
 
 
 def read_part(path: Path) -> pa.Table:
@@ -288,7 +246,13 @@ def read_part(path: Path) -> pa.Table:
     StoreError
         If it is not there, damaged, too large, or no parquet file.
     """
-    return read_table(path, mend=_MEND)
+    table = read_table(path, mend=_MEND)
+    try:
+        table.validate(full=True)  # offsets, and texts that are none, which Arrow takes as they come
+    except pa.ArrowException as error:
+        message = f"{path} cannot be read ({one_line(str(error))}): {_MEND}"
+        raise StoreError(message) from error
+    return table
 
 
 def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | None = None) -> int:

@@ -13,8 +13,9 @@ from typing import Final
 
 import pyarrow as pa
 
+from sasgeo_bench.bounds import MOST_MESSAGE
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.results import MOST_MESSAGE, Prediction
+from sasgeo_bench.results import Prediction
 from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.parquetfile import open_table, write_table
 from sasgeo_bench.store.regiondir import file_record, fresh_folder, locked

@@ -300,6 +300,110 @@ class LiesOnTheWire(Plain):
         return super().match(query, top_k=top_k)
 
 
+ANSWER = (
+    '{"nonce": "NONCE", "status": "ok", "seconds": 0.1, "cpu_s": 0.1, '
+    '"match": {"candidates": %s, "confidence": %s, "diagnostics": %s}}'
+)
+
+
+def write_past_the_server(text, *, times=1):
+    """Write a message to the socket of this process, as an answer to the question that was asked last."""
+    frame = sys._getframe()
+    while not (isinstance(frame.f_locals.get("message"), dict) and "self" in frame.f_locals):
+        frame = frame.f_back
+    data = text.replace("NONCE", frame.f_locals["message"]["nonce"]).encode()
+    frame.f_locals["self"].channel.sendall((len(data).to_bytes(4, "big") + bytes(4) + data) * times)
+
+
+class FarAway(Plain):
+    """Answers past all checks of its own process, with a place that is none."""
+
+    def match(self, query, *, top_k):
+        write_past_the_server(ANSWER % ("[[1e300, 0.0, 0.0, 1.0, 1.0]]", "null", "[]"))
+        time.sleep(1000)
+
+
+class CardOfAList(Plain):
+    def __init__(self):
+        write_past_the_server('{"nonce": "NONCE", "status": "ok", "code": "", "learns": false, "card": [[]]}')
+        time.sleep(1000)
+
+
+class AnswersInAdvance(Plain):
+    """Says at once what it will answer to the next question, which then seems to take no time."""
+
+    def match(self, query, *, top_k):
+        write_past_the_server(ANSWER % ("[]", "null", "[]"), times=2)
+        return super().match(query, top_k=top_k)
+
+
+class OddName(Plain):
+    """As an ordinary plugin may: the name of a diagnostic comes out of a file name, half of a pair of surrogates."""
+
+    def match(self, query, *, top_k):
+        return Match(poses=(), scores=(), diagnostics={"\ud800": 1.0})
+
+
+class PoseFarAway(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=[Pose(easting_m=1e300, northing_m=0.0, yaw_deg=0.0)], scores=[1.0])
+
+
+class DigsDeep(Plain):
+    """Leaves 1,100 nested folders in its scratch folder, and takes the rights to some."""
+
+    def match(self, query, *, top_k):
+        Path("closed").mkdir(exist_ok=True)
+        Path("closed/in").mkdir(exist_ok=True)
+        Path("closed").chmod(0)
+        for _ in range(1100):
+            Path("nested").mkdir(exist_ok=True)
+            os.chdir("nested")
+        return super().match(query, top_k=top_k)
+
+
+class NotAnException(BaseException):
+    """Is not caught by whoever catches exceptions."""
+
+    def __str__(self):
+        raise type(self)
+
+
+class RaisesWhatNobodyCatches(Plain):
+    def match(self, query, *, top_k):
+        raise NotAnException
+
+
+class Liar:
+    """Raises wherever it is looked at."""
+
+    def __len__(self):
+        return 1
+
+    def __iter__(self):
+        raise NotAnException
+
+    __float__ = __str__ = __repr__ = __iter__
+
+
+class AnswersLiars(Plain):
+    def match(self, query, *, top_k):
+        return Match(poses=Liar(), scores=Liar(), diagnostics={"a": Liar()})
+
+
+class SetsItsClock(Plain):
+    """Has its process's clocks run the way it likes, and takes 0.3 s for an answer."""
+
+    def match(self, query, *, top_k):
+        time.sleep(0.3)
+        return super().match(query, top_k=top_k)
+
+    def __init__(self):
+        time.perf_counter = lambda: 1.0
+        ticks = iter(range(10**9))
+        time.process_time = lambda: 1e6 * next(ticks)
+
+
 class NoMatcher:
     """Has a card and no verbs."""
 

@@ -55,6 +55,12 @@ def ask(place, task, name, *, limits=PATIENT, times=1, is_shut_in=True):
         ("ReturnsText", "invalid", "match.. returned str, expected"),
         ("ReturnsMany", "invalid", "returned 1000000 poses, expected at most top_k = 5"),
         ("LiesOnTheWire", "crash", "an answer of 2147483647 bytes"),
+        ("FarAway", "invalid", "an answer that is none: match.candidates.0.0: Input should be less than"),
+        ("CardOfAList", "invalid", "an answer that is none: "),
+        ("OddName", "invalid", "the name .*, expected 1..64 printable characters"),
+        ("PoseFarAway", "invalid", "easting_m is 1e.300, expected a finite number within"),
+        ("RaisesWhatNobodyCatches", "crash", "ended with exit status 1"),
+        ("AnswersLiars", "crash", "ended with exit status 1"),
         ("NoMatcher", "invalid", "NoMatcher is not a matcher, it has no prepare and no match"),
         ("NoCard", "invalid", "card is a NoneType, expected a"),
         ("BadCard", "invalid", "licence is empty"),
@@ -211,3 +217,24 @@ def test_nothing_is_left_of_a_matcher(place, task, name):
     after = psutil.Process(os.getpid()).children(recursive=True)
     assert [child for child in after if child.pid not in before] == []
     assert worker.peak_bytes > 50 * 2**20
+
+
+def test_an_answer_that_came_before_its_question_is_refused_and_the_process_is_replaced(place, task):
+    replies, worker = ask(place, task, "AnswersInAdvance", limits=PATIENT, times=3)
+    assert [reply.status for reply in replies] == ["ok", "invalid", "ok"]
+    assert "it was not made for this question" in replies[1].message
+    assert worker.starts == 2
+
+
+def test_the_runners_clock_counts_whatever_a_process_says_of_its_own(place, task):
+    (reply,), _ = ask(place, task, "SetsItsClock", limits=PATIENT)
+    assert reply.own_s == 0.0
+    assert reply.seconds >= 0.3  # it sleeps so long
+    assert reply.cpu_s <= reply.seconds * os.cpu_count() + 0.2
+
+
+def test_nothing_is_left_of_a_scratch_folder_however_deep_it_is(place, task, monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (reply,), _ = ask(place, task, "DigsDeep", limits=PATIENT)
+    assert reply.status == "ok", reply.message
+    assert list(tmp_path.iterdir()) == []

@@ -106,18 +106,31 @@ def test_where_a_clock_was_set_back_the_row_that_was_written_last_still_counts(t
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("query_id", None, "(query_id is null)"),
-        ("status", None, "(status is null)"),
-        ("candidates", [{"easting_m": None}], "is no prediction ("),
-        ("candidates", [{"easting_m": float("nan")}], "(a pose has finite values, got Pose(easting_m=nan"),
-        ("candidates", [{"scale": 0.0}], "(scale must be positive, got 0.0)"),
-        ("candidates", [None], "is no prediction ("),
+        ("query_id", None, "(query_id: found None, expected the id of a query)"),
+        ("status", None, "(status: found None, expected ok, timeout"),
+        ("candidates", [{"easting_m": None}], "(candidates: found easting_m is nan, expected -1e+08..1e+08)"),
+        ("candidates", [{"easting_m": float("nan")}], "easting_m is nan"),
+        ("candidates", [{"easting_m": 1e300}], "easting_m is 1e+300"),
+        ("candidates", [{"yaw_deg": 1e300}], "yaw_deg is 1e+300, expected -1e+06..1e+06"),
+        ("candidates", [{"scale": 0.0}], "(candidates: found scale is 0, expected 0.001..1000)"),
+        ("candidates", [None], "(candidates: found a null, expected poses with scores)"),
+        ("candidates", None, "(candidates: found null, expected a list, empty where there is no pose)"),
+        ("candidates", [{}] * 1001, "(candidates: found 1001 poses, expected at most 1000)"),
+        ("confidence", 1.5, "(confidence: found confidence is 1.5, expected 0..1 or null)"),
+        ("latency_s", float("inf"), "(latency_s: found latency_s is inf, expected 0..604800 or null)"),
+        ("latency_s", -1.0, "latency_s is -1"),
+        ("message", "x" * 1_000_000, "expected a line of at most 300 printable characters)"),
+        ("message", "two\nlines", "(message: found 'two\\nlines', expected"),
+        ("diagnostics", [("margin", 1.0), ("seen", 2.0), ("margin", 3.0)], "(diagnostics: found 'margin' twice"),
+        ("diagnostics", [("margin", None)], "diagnostics['margin'] is nan"),
+        ("diagnostics", [("", 1.0)], "found the name '', expected names of 1..64 printable characters"),
+        ("diagnostics", [(str(at), 0.0) for at in range(65)], "found 65 numbers, expected at most 64"),
     ],
 )
 def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words):
     row = rows.to_pylist()[0]
     if name == "candidates":
-        value = [item and row["candidates"][0] | item for item in value]
+        value = value and [None if item is None else row["candidates"][0] | item for item in value]
     table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=runrows.PREDICTION_SCHEMA)
     pq.write_table(table, tmp_path / "mine.parquet")
     told = refusal(everything, tmp_path / "mine.parquet")

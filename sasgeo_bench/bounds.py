@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which numbers and texts an answer may hold, the same for a plugin, a file, a submission and stored results."""
+
+from collections.abc import Mapping
+from typing import Final
+
+MOST_CANDIDATES: Final = 1000  # of one answer
+MOST_DIAGNOSTICS: Final = 64
+MOST_NAME: Final = 64  # characters of the name of a diagnostic
+MOST_MESSAGE: Final = 300  # characters
+MOST_S: Final = 7 * 86_400.0  # of one answer: no run allows more
+_MOST_M: Final = 1e8  # farther than any projected coordinate on Earth
+_MOST_TURN_DEG: Final = 1e6  # far beyond it the digits of a number do not tell a heading
+_MOST: Final = 3.4028234663852886e38  # largest single-precision number: squares and differences stay finite
+
+# Least and most of each number; none may be NaN or infinite.
+BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
+    "easting_m": (-_MOST_M, _MOST_M),
+    "northing_m": (-_MOST_M, _MOST_M),
+    "yaw_deg": (-_MOST_TURN_DEG, _MOST_TURN_DEG),
+    "scale": (1e-3, 1e3),
+    "score": (-_MOST, _MOST),
+    "confidence": (0.0, 1.0),
+    "diagnostics": (-_MOST, _MOST),
+    "latency_s": (0.0, MOST_S),
+    "matcher_s": (0.0, MOST_S),
+}
+
+
+def is_line(text: str, most: int) -> bool:
+    """Whether a text is one line of printable characters, `most` of them at most; it may be empty.
+
+    Examples
+    --------
+    >>> is_line("margin", 64), is_line("margin" + chr(10), 64), is_line(chr(0xD800), 64)
+    (True, False, False)
+    """
+    return len(text) <= most and text.isprintable()
+
+
+def bounds_text(name: str) -> str:
+    """The bounds of a number, as an error says them.
+
+    Examples
+    --------
+    >>> bounds_text("scale"), bounds_text("confidence")
+    ('0.001..1000', '0..1')
+    """
+    least, most = BOUNDS[name]
+    return f"{least:g}..{most:g}"

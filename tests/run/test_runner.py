@@ -57,7 +57,11 @@ def run_all(request):
 
 def table(*paths):
     """All rows by query, without what differs from run to run: the time they took."""
-    found = {item.query_id: replace(item, latency_s=None) for path in paths for item in rundir.read_predictions(path)}
+    found = {
+        item.query_id: replace(item, latency_s=None, matcher_s=None)
+        for path in paths
+        for item in rundir.read_predictions(path)
+    }
     return [found[name] for name in sorted(found)]
 
 

@@ -18,10 +18,11 @@ from sasgeo_bench.paper.task import region_name
 from sasgeo_bench.paperboard import paper_extra
 from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.plugins import check_names
+from sasgeo_bench.privateseed import PrivateSeed
 from sasgeo_bench.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.rows import YARDSTICK, is_unranked
-from sasgeo_bench.request import Request, Wanted, plan_requests
+from sasgeo_bench.request import Request, Wanted, plan_requests, root_of
 from sasgeo_bench.requests import carry_out
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import Progress, run
@@ -45,7 +46,10 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class PipelinePlan:
-    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board."""
+    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board.
+
+    With a private seed all is below `out`, which then is the root of private runs.
+    """
 
     spec: PipelineFile
     requests: tuple[Request, ...]
@@ -53,6 +57,7 @@ class PipelinePlan:
     out: Path
     jobs: int
     dask: str | None = None
+    private: PrivateSeed | None = None
 
     def to_text(self) -> str:
         """What of each stage is up to date; every matcher is loaded to find out what it was asked.
@@ -133,7 +138,10 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
     paper = plan.spec.paper
     if paper is None:
         return _Stage(name="", made=(), lacking=())
-    found = {seed: made_paper_task(seed=seed, trials=paper.trials, out=plan.out) for seed in paper.seeds}
+    found = {
+        seed: made_paper_task(seed=seed, trials=paper.trials, out=plan.out, private=plan.private)
+        for seed in paper.seeds
+    }
     tasks = plan.out / "tasks" / PAPER_SUITE
     there = {seed: (tasks / region_name(seed)).is_dir() for seed in paper.seeds}
     return _Stage(
@@ -188,7 +196,7 @@ def board_folder(plan: PipelinePlan) -> Path:
     return plan.out / "boards" / plan.spec.id
 
 
-def plan_pipeline(
+def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may choose
     spec: PipelineFile,
     *,
     out: Path,
@@ -197,6 +205,7 @@ def plan_pipeline(
     region_folders: tuple[Path, ...] = (),
     jobs: int = 1,
     dask: str | None = None,
+    private: PrivateSeed | None = None,
 ) -> PipelinePlan:
     """Turn a pipeline file into requests; nothing is read but files of settings.
 
@@ -214,6 +223,8 @@ def plan_pipeline(
         Processes of each matcher.
     dask : str, optional
         A cluster to run on instead.
+    private : PrivateSeed, optional
+        Draws all queries instead of the file's seed, into the folder `private` of the root.
 
     Raises
     ------
@@ -223,6 +234,7 @@ def plan_pipeline(
         If no installed package has a matcher or a rejector of a name.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
+    out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
         wanted = Wanted(
@@ -230,7 +242,7 @@ def plan_pipeline(
             regions=tuple(spec.regions),
             split=str(spec.split),  # a file with tasks names one
             count=task.sites,
-            seed=spec.seed,
+            seed=seed,
             out=out,
             group=None if task.prior is None else PriorGroup.parse(task.prior),
             extract_folders=extract_folders,
@@ -254,7 +266,7 @@ def plan_pipeline(
         regions=CONTROL_REGIONS,
         split=CONTROL_SPLIT,
         count=CONTROL_SITES,
-        seed=spec.seed,
+        seed=seed,
         out=out,
         may_be_fewer=True,
     )
@@ -265,6 +277,7 @@ def plan_pipeline(
         out=out,
         jobs=jobs,
         dask=dask,
+        private=private,
     )
 
 
@@ -442,6 +455,7 @@ def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest
         limits=Limits(match_s=plan.spec.match_s),
         jobs=plan.jobs,
         dask=plan.dask,
+        hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
     )
 
 
@@ -467,8 +481,8 @@ def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
     if paper is None:
         return []
     return [
-        made_paper_task(seed=seed, trials=paper.trials, out=plan.out)
-        or make_paper_task(seed=seed, trials=paper.trials, out=plan.out, tell=tell)
+        made_paper_task(seed=seed, trials=paper.trials, out=plan.out, private=plan.private)
+        or make_paper_task(seed=seed, trials=paper.trials, out=plan.out, private=plan.private, tell=tell)
         for seed in paper.seeds
     ]
 

@@ -58,6 +58,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "duplicates": None,
     "pipelinefile": None,
     "twin": None,
+    "privateseed": None,
     "suites": (
         *("base", "sites", "mining", "vectors", "twins"),
         *("clean", "occlusion", "false_unknown", "local_warp", "topology_twins", "instance_twins", "grade_separation"),
@@ -70,7 +71,18 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissionfile": None,
     "store": (
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
-        *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
+        *(
+            "fileset",
+            "packabout",
+            "boardfile",
+            "packrows",
+            "packdir",
+            "packfile",
+            "svgfile",
+            "sitedir",
+            "pluginfiles",
+            "seedfile",
+        ),
         *(
             "preview",
             "picture",

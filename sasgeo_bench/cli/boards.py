@@ -11,7 +11,16 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boards import Board
-from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
+from sasgeo_bench.cli.console import (
+    Bars,
+    ExtractFolders,
+    Out,
+    RegionFolders,
+    SeedFile,
+    print_table,
+    private_seed,
+    tell,
+)
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.packing import board_of, request_of, score_all
@@ -137,6 +146,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     region_folders: RegionFolders = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
+    seed_file: SeedFile = None,
     results: Results = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
@@ -154,6 +164,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         region_folders=tuple(region_folders or ()),
         jobs=jobs,
         dask=dask,
+        private=private_seed(seed_file),
     )
     if dry_run:
         typer.echo(plan.to_text())

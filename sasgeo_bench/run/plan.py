@@ -65,6 +65,8 @@ class RunRequest:
         Says what is one place, and how far from each other places to learn from and places that are asked must lie.
     is_oracle : bool
         Lets it learn from what it is asked: a yardstick, never ranked.
+    hidden : sequence of Path
+        Files that the matcher must not see besides truths and the like, as that of a private seed.
     """
 
     spec: str
@@ -82,6 +84,7 @@ class RunRequest:
     most_trained: int = 200
     split: Split | None = None
     is_oracle: bool = False
+    hidden: Sequence[Path] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -302,7 +305,7 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would give the world away.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
-    hidden += [path for path in maps if path not in readable]
+    hidden += [*(path for path in maps if path not in readable), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
 
 
@@ -327,6 +330,9 @@ def _part(
         raise StoreError(message)
     taskdir.check_queries(task)
     root = task.resolve().parent.parent.parent
+    if taskdir.PRIVATE in about and request.out.resolve() != root:
+        message = f"{task} is of a private seed, whose answers stay beside it: say --out {task.parent.parent.parent}"
+        raise ConfigError(message)
     region = root / "regions" / about["region"]
     if not taskdir.is_of_map(about, read_manifest(region)):
         message = f"{region} was built anew since the queries of {task} were made: make them again"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
@@ -138,10 +138,8 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
     paper = plan.spec.paper
     if paper is None:
         return _Stage(name="", made=(), lacking=())
-    found = {
-        seed: made_paper_task(seed=seed, trials=paper.trials, out=plan.out, private=plan.private)
-        for seed in paper.seeds
-    }
+    made = partial(made_paper_task, trials=paper.trials, out=plan.out, private=plan.private)
+    found = {seed: made(seed=seed) for seed in paper.seeds}
     tasks = plan.out / "tasks" / PAPER_SUITE
     there = {seed: (tasks / region_name(seed)).is_dir() for seed in paper.seeds}
     return _Stage(
@@ -293,6 +291,7 @@ def run_pipeline(
     progress: Progress | None = None,
     results: Path | None = None,
     has_cases: bool = True,
+    private: Path | None = None,
 ) -> Board:
     """Draw what is missing, run what has no row, score all of it and write the board.
 
@@ -308,6 +307,8 @@ def run_pipeline(
         Folder to store the board in, with the answers and truths it was made of, as <id>/.
     has_cases : bool
         Whether the board shows queries that went wrong, with their truths.
+    private : Path, optional
+        The board of a private seed of this pipeline, which the rows are held against.
 
     Returns
     -------
@@ -345,10 +346,11 @@ def run_pipeline(
         rejectors=plan.spec.rejectors,
         contrasts=contrasts,
         draws=plan.spec.draws,
-        pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
+        pipeline=plan.spec.said,
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
         jobs=plan.jobs,
+        private=private,
     )
     board = make_board(request, tell=tell)
     if results is not None:
@@ -480,24 +482,15 @@ def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
     paper = plan.spec.paper
     if paper is None:
         return []
-    return [
-        made_paper_task(seed=seed, trials=paper.trials, out=plan.out, private=plan.private)
-        or make_paper_task(seed=seed, trials=paper.trials, out=plan.out, private=plan.private, tell=tell)
-        for seed in paper.seeds
-    ]
+    asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
+    made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
+    return [made(seed=seed) or draw(seed=seed) for seed in paper.seeds]
 
 
 def _contrasts(spec: PipelineFile) -> tuple[Contrast, ...]:
     return tuple(
         Contrast(
-            name=item.name,
-            first=item.first,
-            second=item.second,
-            suites=tuple(item.suites),
-            kinds=tuple(item.kinds),
-            metric=item.metric,
-            track=item.track,
-            min_effect=item.min_effect,
+            **item.model_dump(exclude={"why", "suites", "kinds"}), suites=tuple(item.suites), kinds=tuple(item.kinds)
         )
         for item in spec.contrast
     )

@@ -316,7 +316,7 @@ def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, 
     Returns
     -------
     Board
-        As it was written: runs are `reproduced`, submissions `as submitted`.
+        As it was written: submissions are `as submitted`, runs as the stored results say.
 
     Raises
     ------

@@ -129,7 +129,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "score": None,
     "report": (
         *("measures", "rows", "strata", "steps", "tables", "rejection", "integrity", "contrasts", "falsifiers"),
-        *("controls", "costs", "text", "latex", "protection", "cases"),
+        *("reproduction", "controls", "costs", "text", "latex", "protection", "cases"),
         *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots"),
         *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "coast", "siteplots", "site"),
     ),
@@ -138,6 +138,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "contestants": None,
     "judging": None,
     "apart": None,
+    "privateboard": None,
     "boards": None,
     "boardfigures": None,
     "casepanels": None,

@@ -4,6 +4,7 @@
 import re
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -25,6 +26,8 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.packing import board_of, request_of, score_all
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.privateboard import check_public, read_private
+from sasgeo_bench.privateseed import seed_said
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.store.catalog import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.submissions import submissions_for
@@ -61,6 +64,12 @@ Submissions = Annotated[
     list[Path] | None,
     typer.Option(help="a submission, or a folder of them, beside stored results; those for their board are scored"),
 ]
+Private = Annotated[
+    Path | None,
+    typer.Option(
+        help="board of a private seed of the same pipeline, OUT/private/boards/<id>: rows it bears out are reproduced"
+    ),
+]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
@@ -85,6 +94,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     ] = None,
     rejector: Rejectors = None,
     submissions: Submissions = None,
+    private: Private = None,
     region_folders: RegionFolders = None,
     without: Annotated[
         list[str] | None, typer.Option(help="region whose queries are left out, on each of its maps; may be repeated")
@@ -117,6 +127,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         draws=draws or usual.draws,
         without=without or (),
         submissions=submitted,
+        private=private,
         jobs=jobs,
     )
     board = score_all(request, tell=tell, has_cases=cases, results=results)
@@ -147,6 +158,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
     seed_file: SeedFile = None,
+    private: Private = None,
     results: Results = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
@@ -169,13 +181,22 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     if dry_run:
         typer.echo(plan.to_text())
         return
+    if plan.private is not None and (results is not None or private is not None):
+        check_public(seed_said(plan.private), str(board_folder(plan)))
+    if private is not None:
+        read_private(private, plan.spec.said)
+    carry_out = partial(run_pipeline, plan, tell=tell, results=results, has_cases=cases, private=private)
     if sys.stderr.isatty():
         with Bars() as bars:
-            board = run_pipeline(plan, tell=tell, progress=bars, results=results, has_cases=cases)
+            board = carry_out(progress=bars)
     else:
-        board = run_pipeline(plan, tell=tell, results=results, has_cases=cases)
+        board = carry_out()
     show_board(board)
     typer.echo(str(board_folder(plan)))
+    if plan.private is not None:
+        tell(f"next: sasgeo-bench score --predictions docs/results/{spec.id} --private {board_folder(plan)}")
+        _check_controls(board)
+        return
     tell(_how_to_publish(board_folder(plan)))
     if not matcher:
         tell(f"next: sasgeo-bench leaderboard {pipeline} --matcher NAME adds one of yours (new-matcher begins one)")

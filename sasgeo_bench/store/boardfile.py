@@ -189,6 +189,30 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         raise StoreError(message) from error
 
 
+def read_scores(folder: Path) -> pd.DataFrame:
+    """Scored rows of a board, those of all contestants.
+
+    Raises
+    ------
+    StoreError
+        If they are missing or damaged.
+
+    Examples
+    --------
+    >>> read_scores(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no scores.parquet that can be read: score it again
+    """
+    path = folder / f"{SCORES}.parquet"
+    try:
+        scores: pd.DataFrame = pq.read_table(path).to_pandas()
+    except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
+        message = f"{folder} holds no {path.name} that can be read: score it again"
+        raise StoreError(message) from error
+    return scores
+
+
 def read_pictures(folder: Path) -> dict[str, bytes]:
     """Pictures of a board, or of stored results, as they were written: name in `pictures/` -> content.
 

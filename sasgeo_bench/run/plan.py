@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.plugins import ORACLE, list_entry_points
+from sasgeo_bench.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.results import STATUSES, Status, matcher_hash
 from sasgeo_bench.run.lesson import Lesson, plan_lesson
 from sasgeo_bench.run.oracle import CARD
@@ -289,9 +289,7 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
     if reply.status != "ok" or reply.card is None:
         said = reply.message or "the plugin says nothing of itself"
         raise MatchError(said if request.spec in said else f"{request.spec}: cannot be made ({said})")
-    if reply.card.name == ORACLE:
-        message = f"{request.spec}: card: {ORACLE!r} is the name of a control of the runner, choose another one"
-        raise MatchError(message)
+    check_card_name(request.spec, reply.card.name)
     return reply.card, reply.code, reply.learns
 
 

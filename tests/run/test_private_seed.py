@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.privateseed import PrivateSeed
 from sasgeo_bench.request import Wanted, plan_requests
 from sasgeo_bench.run import beside, sandbox
 from sasgeo_bench.run.plan import RunRequest, plan_run, reach_of
 from sasgeo_bench.store import rundir
 from sasgeo_bench.tasks import make_tasks
+from sasgeo_bench.testing import check_matcher
 from tests.run.seedthief import SECRET
 
 pytestmark = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kernel has no Landlock")
@@ -82,6 +83,17 @@ def test_every_run_hides_the_files_of_seeds_beside_the_code(made):
 def test_the_file_of_a_pipelines_seed_is_hidden_wherever_it_lies(tmp_path):
     request = RunRequest(spec="random", tasks=[], out=tmp_path, hidden=[tmp_path / "far" / "my.seed"])
     assert tmp_path / "far" / "my.seed" in reach_of(request, ()).hidden
+
+
+def test_a_matcher_that_bears_a_shipped_name_is_refused_before_it_is_asked_or_tried(made, monkeypatch):
+    monkeypatch.chdir(made)
+    monkeypatch.syspath_prepend(str(made))
+    spec, words = "seedthief:PassesForFftVote", "its card is named 'fft_vote', as a matcher that ships: rename it"
+    task = made / "out" / "private" / "tasks" / "clean" / "town-riverside"
+    with pytest.raises(MatchError, match=words):
+        plan_run(RunRequest(spec=spec, tasks=[task], out=made / "out" / "private"))
+    (check,) = check_matcher(spec)
+    assert (check.outcome, check.found) == ("fail", f"{spec}: {words}")
 
 
 def test_answers_to_private_queries_stay_beside_them(made):

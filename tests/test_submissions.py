@@ -210,6 +210,7 @@ def test_what_a_runner_has_taught_must_stand_on_the_card(stored, tmp_path):
     ("changes", "fault"),
     [
         ({"name": "prior_centre"}, "'prior_centre' is the name of a control of every board"),
+        ({"name": "sasgeo"}, "'sasgeo' is the name of a matcher that ships"),
         ({"name": "oracle_mine"}, "'oracle_mine' is the name of a control of every board"),
         ({"name": "../mine"}, "'name'"),
         ({"name": "Mine"}, "'name'"),

@@ -4,7 +4,7 @@
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +18,7 @@ from sasgeo_bench.entries import Entry, find_entries, leave_out
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.judging import Judging, carry_out
 from sasgeo_bench.metrics.draws import DRAWS
+from sasgeo_bench.privateboard import OnPrivate, hold_private, kept_private, seed_of
 from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
 from sasgeo_bench.region import DATA_VERSION
@@ -83,6 +84,10 @@ class ScoreRequest:
         Folders of submissions, scored as files are, but held to more (`validate.submission_faults`).
     jobs : int
         Processes that fit rejectors.
+    private : Path, optional
+        A board of a private seed of the same pipeline, which the rows are held against.
+    kept : mapping, optional
+        What `board.json` of stored results says: of a private seed it is kept where no other board is named.
     """
 
     predictions: Sequence[Path]
@@ -100,6 +105,8 @@ class ScoreRequest:
     without: Collection[str] = ()
     submissions: Sequence[Path] = ()
     jobs: int = 1
+    private: Path | None = None
+    kept: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +116,8 @@ class Board:
     `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
     `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id,
     `truths` all that is known of it, controls among them. `everyone` are the entries with those who were asked nothing
-    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are.
+    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are,
+    `on_private` what came of the rows on a private seed.
     """
 
     entries: tuple[Entry, ...]
@@ -127,6 +135,7 @@ class Board:
     truths: Mapping[str, Truth] = field(default_factory=dict)
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
+    on_private: OnPrivate = field(default_factory=OnPrivate)
 
 
 def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
@@ -162,6 +171,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell)
     folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
+    seed_of([task.about for task in tasks])
     _check_files([item.entry for item in told], folders, request.split)
     everything = {item.entry.name: _scored(item, tasks, request) for item in told}
     predictions = {item.entry.name: item.predictions for item in told}
@@ -172,6 +182,8 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     entries = tuple(item.entry for item in told if item.entry.name in scores)
     _check_some(scores)
     apart = _apart(entries, scores, request.split, tell)
+    on_private = _on_private(request, entries, scores, tasks, tell)
+    entries = tuple(replace(entry, how=on_private.how(entry)) for entry in entries)
     rows = list(_leaderboards(scores, whole, request.draws, apart, progress))
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
@@ -207,6 +219,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
         truths={truth.query_id: truth for task in tasks for truth in task.truths},
         everyone=tuple(item.entry for item in told),
         apart=apart,
+        on_private=on_private,
     )
     _tell_gone(request.board, board.everyone, tell)
     if request.extras:
@@ -255,6 +268,30 @@ def _apart(
     found = set_apart(entries, scores, split)
     for name, why in found.items():
         tell(f"{name}: set apart, {why}")
+    return found
+
+
+def _on_private(
+    request: ScoreRequest,
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    tasks: Sequence[ScoredTask],
+    tell: Tell,
+) -> OnPrivate:
+    """What came of the rows on a private seed: of the board that is named, else as stored results say."""
+    if request.private is None:
+        return OnPrivate() if request.without else kept_private(request.kept, entries, request.root)
+    found = hold_private(
+        request.private,
+        entries=entries,
+        scores=scores,
+        tasks=[task.about for task in tasks],
+        pipeline=request.pipeline,
+        draws=request.draws,
+        tell=tell,
+    )
+    for name, row in found.rows.items():
+        tell(f"{name}: {row['verdict']} ({row['why']})")
     return found
 
 
@@ -371,6 +408,7 @@ def _scored(told: Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> p
 
 def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
     """What `board.json` says."""
+    seed = seed_of(board.tasks)
     return {
         "scorer_version": SCORER_VERSION,
         "task_version": TASK_VERSION,
@@ -378,6 +416,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "libraries": _libraries(),
         "pipeline": dict(request.pipeline) or None,
+        **{name: said for name, said in ((taskdir.PRIVATE, seed), ("private", board.on_private.seed)) if said},
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
         "contrasts": [asdict(item) for item in request.contrasts],
@@ -396,6 +435,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
                 "set_apart": board.apart.get(entry.name),
                 "isolation": entry.runs[0].get("isolation") if entry.runs else None,
                 "learned": entry.learned(),
+                **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
             }
             for entry in board.entries
         ],

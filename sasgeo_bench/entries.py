@@ -12,7 +12,7 @@ from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
 from sasgeo_bench.matcher import check_name
 from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.query import base_of
-from sasgeo_bench.report.rows import AS_SUBMITTED, REPRODUCED, is_unranked
+from sasgeo_bench.report.rows import AS_SUBMITTED, RUN_HERE, is_unranked
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store import rundir
 from sasgeo_bench.store.learnedfile import LearnedSaid
@@ -125,7 +125,7 @@ def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tup
             name=shown(name, number, digest),
             version=number,
             hash=digest,
-            how=REPRODUCED,
+            how=RUN_HERE,
             sources=tuple(folder for folder, _ in found),
             runs=tuple(about for _, about in found),
         )

@@ -16,9 +16,11 @@ from sasgeo_bench.entries import Entry
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.plugins import check_registered
+from sasgeo_bench.privateboard import check_public, seed_of
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.results import one_line
+from sasgeo_bench.store.boardfile import read_board
 from sasgeo_bench.store.catalog import find_split
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.packdir import check_results, is_pack, read_settings
@@ -71,7 +73,7 @@ def pack_board(
     Raises
     ------
     ConfigError
-        If a contestant is a file of predictions: nobody can say who answered.
+        If a contestant is a file of predictions: nobody can say who answered; or the board is of a private seed.
     StoreError
         If it would be too large, or cannot be written; what was there is as it was.
     """
@@ -79,6 +81,7 @@ def pack_board(
     if submitted is not None:
         message = f"{submitted} is a file of predictions: only boards of runs are stored"
         raise ConfigError(message)
+    check_public(seed_of(board.tasks), str(request.board))
     truth = request.truth or request.root / "truth"
     names = [(str(about["suite"]), str(about["region"])) for about in board.tasks]
     tasks = [
@@ -270,7 +273,8 @@ def score_all(
             kept=kept,
             has_cases=has_cases,
         )
-        board = make_board(replace(laid, extras=(figures, pictures)), tell=tell, progress=progress)
+        said = {} if kept is None else read_board(kept)[0]
+        board = make_board(replace(laid, extras=(figures, pictures), kept=said), tell=tell, progress=progress)
         if results is not None:
             lacks = "" if kept is None else str(read_settings(kept)["dropped"])
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())

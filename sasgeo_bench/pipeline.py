@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
@@ -18,11 +18,12 @@ from sasgeo_bench.paper.task import region_name
 from sasgeo_bench.paperboard import paper_extra
 from sasgeo_bench.pipelinefile import PAPER_SUITE, PipelineFile
 from sasgeo_bench.plugins import check_names
+from sasgeo_bench.privateseed import PrivateSeed
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.rows import YARDSTICK, is_unranked
-from sasgeo_bench.request import Request, Wanted, plan_requests
+from sasgeo_bench.request import Request, Wanted, plan_requests, root_of
 from sasgeo_bench.requests import carry_out
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import run
@@ -44,7 +45,10 @@ MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is co
 
 @dataclass(frozen=True, kw_only=True)
 class PipelinePlan:
-    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board."""
+    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board.
+
+    With a private seed all is below `out`, which then is the root of private runs.
+    """
 
     spec: PipelineFile
     requests: tuple[Request, ...]
@@ -52,6 +56,7 @@ class PipelinePlan:
     out: Path
     jobs: int
     dask: str | None = None
+    private: PrivateSeed | None = None
 
     def to_text(self) -> str:
         """What of each stage is up to date; every matcher is loaded to find out what it was asked.
@@ -132,7 +137,8 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
     paper = plan.spec.paper
     if paper is None:
         return _Stage(name="", made=(), lacking=())
-    found = {seed: made_paper_task(seed=seed, trials=paper.trials, out=plan.out) for seed in paper.seeds}
+    made = partial(made_paper_task, trials=paper.trials, out=plan.out, private=plan.private)
+    found = {seed: made(seed=seed) for seed in paper.seeds}
     tasks = plan.out / "tasks" / PAPER_SUITE
     there = {seed: (tasks / region_name(seed)).is_dir() for seed in paper.seeds}
     return _Stage(
@@ -187,7 +193,7 @@ def board_folder(plan: PipelinePlan) -> Path:
     return plan.out / "boards" / plan.spec.id
 
 
-def plan_pipeline(
+def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may choose
     spec: PipelineFile,
     *,
     out: Path,
@@ -196,6 +202,7 @@ def plan_pipeline(
     region_folders: tuple[Path, ...] = (),
     jobs: int = 1,
     dask: str | None = None,
+    private: PrivateSeed | None = None,
 ) -> PipelinePlan:
     """Turn a pipeline file into requests; nothing is read but files of settings.
 
@@ -213,6 +220,8 @@ def plan_pipeline(
         Processes of each matcher.
     dask : str, optional
         A cluster to run on instead.
+    private : PrivateSeed, optional
+        Draws all queries instead of the file's seed, into the folder `private` of the root.
 
     Raises
     ------
@@ -222,6 +231,7 @@ def plan_pipeline(
         If no installed package has a matcher or a rejector of a name.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
+    out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
         wanted = Wanted(
@@ -229,7 +239,7 @@ def plan_pipeline(
             regions=tuple(spec.regions),
             split=str(spec.split),  # a file with tasks names one
             count=task.sites,
-            seed=spec.seed,
+            seed=seed,
             out=out,
             group=None if task.prior is None else PriorGroup.parse(task.prior),
             extract_folders=extract_folders,
@@ -253,7 +263,7 @@ def plan_pipeline(
         regions=CONTROL_REGIONS,
         split=CONTROL_SPLIT,
         count=CONTROL_SITES,
-        seed=spec.seed,
+        seed=seed,
         out=out,
         may_be_fewer=True,
     )
@@ -264,6 +274,7 @@ def plan_pipeline(
         out=out,
         jobs=jobs,
         dask=dask,
+        private=private,
     )
 
 
@@ -279,6 +290,7 @@ def run_pipeline(
     progress: Progress | None = None,
     results: Path | None = None,
     has_cases: bool = True,
+    private: Path | None = None,
 ) -> Board:
     """Draw what is missing, run what has no row, score all of it and write the board.
 
@@ -294,6 +306,8 @@ def run_pipeline(
         Folder to store the board in, with the answers and truths it was made of, as <id>/.
     has_cases : bool
         Whether the board shows queries that went wrong, with their truths.
+    private : Path, optional
+        The board of a private seed of this pipeline, which the rows are held against.
 
     Returns
     -------
@@ -331,10 +345,11 @@ def run_pipeline(
         rejectors=plan.spec.rejectors,
         contrasts=contrasts,
         draws=plan.spec.draws,
-        pipeline={"id": plan.spec.id, "sha256": plan.spec.sha256},
+        pipeline=plan.spec.said,
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
         jobs=plan.jobs,
+        private=private,
     )
     board = make_board(request, tell=tell, progress=progress)
     if results is not None:
@@ -441,6 +456,7 @@ def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest
         limits=Limits(match_s=plan.spec.match_s),
         jobs=plan.jobs,
         dask=plan.dask,
+        hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
     )
 
 
@@ -465,24 +481,15 @@ def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
     paper = plan.spec.paper
     if paper is None:
         return []
-    return [
-        made_paper_task(seed=seed, trials=paper.trials, out=plan.out)
-        or make_paper_task(seed=seed, trials=paper.trials, out=plan.out, tell=tell)
-        for seed in paper.seeds
-    ]
+    asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
+    made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
+    return [made(seed=seed) or draw(seed=seed) for seed in paper.seeds]
 
 
 def _contrasts(spec: PipelineFile) -> tuple[Contrast, ...]:
     return tuple(
         Contrast(
-            name=item.name,
-            first=item.first,
-            second=item.second,
-            suites=tuple(item.suites),
-            kinds=tuple(item.kinds),
-            metric=item.metric,
-            track=item.track,
-            min_effect=item.min_effect,
+            **item.model_dump(exclude={"why", "suites", "kinds"}), suites=tuple(item.suites), kinds=tuple(item.kinds)
         )
         for item in spec.contrast
     )

@@ -112,6 +112,11 @@ class PipelineFile(Document):
                     del task[name]
         return hashlib.sha256(json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
+    @property
+    def said(self) -> dict[str, str]:
+        """Which pipeline it is, as `board.json` says it."""
+        return {"id": self.id, "sha256": self.sha256}
+
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:
         if self.rejectors and (self.split is None or not self.task):

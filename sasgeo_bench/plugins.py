@@ -18,11 +18,12 @@ MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 BUILT_IN: Final = "sasgeo-baselines"
 _OURS: Final = ("sasgeo-bench", BUILT_IN)  # the distributions whose names win
+_MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
 ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
-    """Every entry point of a group by its name; of two with one name the built-in one, else the first.
+    """Every entry point of a group by its name; of two with one name the built-in one, else the first to be listed.
 
     Warns
     -----
@@ -35,23 +36,76 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
         If an installed package has entry points that cannot be read.
     """
     found: dict[str, EntryPoint] = {}
-    try:
-        installed = entry_points(group=group)
-    except Exception as error:
-        message = f"an installed package has entry points that cannot be read ({told(error)}): reinstall or remove it"
-        raise MatchError(message) from error
-    points = sorted(installed, key=lambda point: (_home(point) not in _OURS, _home(point), point.value))
-    for point in points:
+    for point in _installed(group):
         if group == MATCHERS and point.name == ORACLE:
             message = f"{_home(point)} ({point.value}) is not used: {ORACLE!r} is the name of a control of the runner"
             warnings.warn(message, stacklevel=2)
         elif point.name not in found:
             found[point.name] = point
         elif found[point.name].value != point.value:
-            kept, lost = _home(found[point.name]), _home(point)
-            message = f"two plugins are named {point.name!r}: {kept} is used, {lost} ({point.value}) is not"
+            message = _clash(found[point.name], point)
             warnings.warn(message, stacklevel=2)
     return dict(sorted(found.items()))
+
+
+def _installed(group: str) -> list[EntryPoint]:
+    """Entry points of a group, those of ours first."""
+    try:
+        installed = entry_points(group=group)
+    except Exception as error:
+        message = f"an installed package has entry points that cannot be read ({told(error)}): reinstall or remove it"
+        raise MatchError(message) from error
+    return sorted(installed, key=lambda point: (_home(point) not in _OURS, _home(point), point.value))
+
+
+def _clash(first: EntryPoint, other: EntryPoint) -> str:
+    """Name both of two plugins of one name, and say which is used: ours, or else none."""
+    lost = f"{_home(other)} ({other.value})"
+    if _home(first) in _OURS:
+        return f"two plugins are named {first.name!r}: {_home(first)} is used, {lost} is not"
+    return (
+        f"two plugins are named {first.name!r}: {_home(first)} ({first.value}) and {lost}, so neither is used: "
+        "uninstall one, or name module:Class"
+    )
+
+
+def shipped_names() -> frozenset[str]:
+    """Names of the matchers that ship, which no other plugin may bear.
+
+    Examples
+    --------
+    >>> "oracle_pose" in shipped_names()
+    True
+    """
+    return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in _OURS)})
+
+
+def check_card_name(spec: str, name: str) -> None:
+    """Refuse a matcher of others whose card bears the name of one that ships: its row would pass for that one's.
+
+    Parameters
+    ----------
+    spec : str
+        How it was named: a name, or module:Class.
+    name : str
+        Of its card.
+
+    Raises
+    ------
+    MatchError
+        Naming both.
+
+    Examples
+    --------
+    >>> check_card_name("mine:Matcher", "oracle_pose")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: mine:Matcher: its card is named 'oracle_pose', as a matcher that ships: rename it
+    """
+    is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped_names()
+    if not is_ours and name in shipped_names():
+        message = f"{one_line(spec)}: its card is named {name!r}, as a matcher that ships: rename it"
+        raise MatchError(message)
 
 
 def _home(point: EntryPoint) -> str:
@@ -168,6 +222,10 @@ def _known(name: str, group: str, kind: str) -> EntryPoint:
         hint = f", did you mean {near[0]!r}?" if near else ""
         message = f"there is no {kind} {name!r}{hint} (list-{kind}s shows all; or module:Class)"
         raise MatchError(message)
+    others = {point.value: point for point in _installed(group) if point.name == name and point != points[name]}
+    rival = next((point for value, point in others.items() if value != points[name].value), None)
+    if rival is not None and _home(points[name]) not in _OURS:
+        raise MatchError(_clash(points[name], rival))
     return points[name]
 
 

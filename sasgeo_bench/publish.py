@@ -11,6 +11,7 @@ from typing import Any, Final
 from sasgeo_bench.boardshape import check_shape
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.pipelinefile import PipelineFile
+from sasgeo_bench.privateboard import check_public
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.site import site_pages
@@ -39,6 +40,7 @@ from sasgeo_bench.store.sitedir import (
     read_board_files,
     write_site,
 )
+from sasgeo_bench.store.taskdir import PRIVATE
 
 _MAP: Final = "places.svg"
 _RATES: Final = "ageing-rates.svg"
@@ -65,6 +67,8 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
     ------
     StoreError
         If there is no sound board, or the site cannot be written; an older site is then as it was.
+    ConfigError
+        If the board is of a private seed.
     """
     if into is None and (board / SITE).is_symlink():
         message = f"{board / SITE} is a link: name where it leads with --into"
@@ -76,6 +80,7 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
         raise StoreError(message)
     with held(board, target, tell=tell):
         files = read_board_files(board)
+        check_public(files.about.get(PRIVATE), str(board))
         with _sound(board):
             for name, table in {LEADERBOARD: files.board, **files.tables}.items():
                 check_shape(name, table)

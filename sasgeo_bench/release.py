@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.privateboard import check_public
+from sasgeo_bench.privateseed import LEAST_BITS
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.region import LICENCE, Manifest
 from sasgeo_bench.results import one_line
@@ -40,7 +42,6 @@ from sasgeo_bench.tasks import built_anew, is_of_region
 
 HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
 _EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": "rio-cogeo"}
-_LEAST_SECRET_SEED: Final = 2**64  # each guess is checked by a single hash, that of a query's id
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,6 +240,7 @@ def _map(folder: Path) -> ReleaseMap:
 
 
 def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None:
+    check_public(task.about.get(taskdir.PRIVATE), str(task.folder))
     if not taskdir.is_of_map(task.about, manifest):
         raise StoreError(built_anew(task.map_name))
     if task.about.get("split") != split.id:
@@ -258,7 +260,7 @@ def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
     """Say where truths that are kept back could be drawn again by whoever tries a few seeds."""
     hiding = [task for task in tasks if set(task.parts) - task.told]
     seeds: list[Any] = [taskdir.read_hidden(task.truth).get("seed") for task in hiding]
-    guessable = sum(isinstance(seed, int) and abs(seed) < _LEAST_SECRET_SEED for seed in seeds)
+    guessable = sum(isinstance(seed, int) and abs(seed) < 2**LEAST_BITS for seed in seeds)
     if guessable:
         tell(
             f"warning: truths of {counted(guessable, 'task')} are kept back, but their seed is so small that anyone "

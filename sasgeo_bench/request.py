@@ -5,11 +5,13 @@ import datetime as dt
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from sasgeo_bench.build import plan_build
 from sasgeo_bench.errors import ConfigError, ExtractError
+from sasgeo_bench.privateseed import PrivateSeed, Seed
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import PriorGroup
 from sasgeo_bench.regionfile import RegionFile
@@ -26,6 +28,8 @@ from sasgeo_bench.suites.all_suites import find_suite
 from sasgeo_bench.suites.base import EVERYTHING, Choice
 from sasgeo_bench.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
 
+PRIVATE_ROOT: Final = "private"  # below the root of public queries: nothing of the two is ever in one folder
+
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
@@ -41,7 +45,7 @@ class Request:
         Says the blocks and their parts.
     count : int
         Sites; each carries all the variants of the suite.
-    seed : int
+    seed : int or PrivateSeed
         Root of all chance.
     out : Path
         Root of what is built.
@@ -61,7 +65,7 @@ class Request:
     region: RegionFile
     split: Split
     count: int
-    seed: int
+    seed: Seed
     out: Path
     group: PriorGroup | None = None
     elsewhere: RegionFile | None = None
@@ -81,7 +85,7 @@ class Wanted:
     regions: tuple[str, ...]
     split: str
     count: int
-    seed: int
+    seed: Seed
     out: Path
     group: PriorGroup | None = None
     extract_folders: tuple[Path, ...] = ()
@@ -138,6 +142,17 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         for item in {item.id: item for item in named}.values()
         for name in dict.fromkeys(wanted.suites)
     )
+
+
+def root_of(out: Path, seed: PrivateSeed | None) -> Path:
+    """Root of what a seed draws: that of public queries, or for a private seed the folder `private` in it.
+
+    Examples
+    --------
+    >>> root_of(Path("out"), PrivateSeed("3f" * 16)).as_posix(), root_of(Path("out"), None).as_posix()
+    ('out/private', 'out')
+    """
+    return out if seed is None else out / PRIVATE_ROOT
 
 
 def check_count(count: int) -> None:

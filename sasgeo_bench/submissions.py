@@ -13,6 +13,7 @@ from sasgeo_bench.boards import Board
 from sasgeo_bench.boardtasks import AskedTask
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.packing import board_of, laid_tasks, request_of, score_all, stored_settings
+from sasgeo_bench.plugins import shipped_names
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import CONTROLS, TASK_VERSION
 from sasgeo_bench.region import ATTRIBUTION, DATA_VERSION, LICENCE
@@ -115,8 +116,13 @@ def _split_of(board: Path) -> Split | None:
 def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> None:
     """Refuse a name that another row has, and training on places that nobody knows."""
     taken = {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
-    if is_unranked(card.name) or card.name in taken:
-        whose = "a control of every board" if is_unranked(card.name) else f"a matcher on the board {board.name}"
+    kinds = {
+        "a control of every board": is_unranked(card.name),
+        f"a matcher on the board {board.name}": card.name in taken,
+        "a matcher that ships": card.name in shipped_names(),
+    }
+    whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
+    if whose is not None:
         message = f"{path}: {card.name!r} is the name of {whose}: choose another name"
         raise ConfigError(message)
     if not board_of([board]):
@@ -317,7 +323,7 @@ def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, 
     Returns
     -------
     Board
-        As it was written: runs are `reproduced`, submissions `as submitted`.
+        As it was written: submissions are `as submitted`, runs as the stored results say.
 
     Raises
     ------

@@ -4,7 +4,7 @@
 import datetime as dt
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -22,6 +22,7 @@ from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
 from sasgeo_bench.perturb.ageing import Ageing
+from sasgeo_bench.privateseed import seed_said
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.region import Region
@@ -129,7 +130,7 @@ def why_to_draw(request: Request) -> str:
         return "not there yet"
     if any(said.get("request_sha256") == _request_sha256(request) for said in there):
         return "task, truths or map changed since"
-    if all(said.get("seed") != request.seed for said in there):
+    if all(said | seed_said(request.seed) != said for said in there):
         return "drawn with another seed"
     counts = [said.get("count") for said in there]
     if not {request.count, None} & set(counts):
@@ -158,7 +159,7 @@ def _request_sha256(request: Request) -> str:
         # No query hangs on where others learn: a half that changes its places draws nothing anew.
         "split": request.split.spec.model_dump(mode="json", exclude={"place": {"__all__": {"half"}}}),
         "count": [request.count, request.may_be_fewer],
-        "seed": request.seed,
+        "seed": request.seed if isinstance(request.seed, int) else request.seed.commitment,
         "group": None if request.group is None else request.group.name,
         "made_by": version("sasgeo-bench"),
     }
@@ -327,7 +328,7 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name
     # With the seed anyone could draw the truths again, so it is kept with them.
-    hidden: dict[str, Any] = {"seed": request.seed, "count": request.count, "maps": len(by_map)}
+    hidden: dict[str, Any] = {**seed_said(request.seed), "count": request.count, "maps": len(by_map)}
     hidden["request_sha256"] = _request_sha256(request)
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
@@ -348,7 +349,7 @@ def put_task(
     about : dict
         What `task.json` says; `suite` and `region` name the folders, `sites` counts the sites.
     hidden : dict
-        What `truth.json` says.
+        What `truth.json` says; `task.json` says of a private seed the same.
     out : Path
         Root.
     tell : callable
@@ -357,7 +358,8 @@ def put_task(
     Raises
     ------
     StoreError
-        If a folder holds something that is not ours, or cannot be written.
+        If a folder holds something that is not ours, or cannot be written; or one of the queries there and these is of
+        a private seed, and the other is not.
     """
     task_folder = out / "tasks" / about["suite"] / about["region"]
     truth_folder = out / "truth" / about["suite"] / about["region"]
@@ -365,6 +367,8 @@ def put_task(
     check_apart(task_folder, out / "truth")
     taskdir.check_ours(task_folder, (taskdir.QUERIES, taskdir.TASK))
     taskdir.check_ours(truth_folder, (taskdir.TRUTH, taskdir.TRUTH_OF))
+    _check_unmixed(truth_folder, hidden)
+    about |= {name: hidden[name] for name in (taskdir.PRIVATE,) if name in hidden}
     try:
         with (
             regiondir.locked(task_folder, tell=tell),
@@ -379,6 +383,15 @@ def put_task(
         message = f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         raise StoreError(message) from error
     return Made(folder=task_folder, queries=total, sites=about["sites"])
+
+
+def _check_unmixed(truth_folder: Path, hidden: Mapping[str, Any]) -> None:
+    """Refuse to draw by a public seed where a private one has drawn, and the other way round."""
+    before = taskdir.read_hidden(truth_folder)
+    if before and (taskdir.PRIVATE in before) != (taskdir.PRIVATE in hidden):
+        kinds = ("public", "private") if taskdir.PRIVATE in hidden else ("private", "public")
+        message = f"{truth_folder} was drawn by a {kinds[0]} seed, and this one is {kinds[1]}: choose another --out"
+        raise StoreError(message)
 
 
 def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.evidence import UNKNOWN
 from sasgeo_bench.matcher import MatcherCard, candidates_at, check_match, lacks
+from sasgeo_bench.plugins import check_card_name
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import Region
 from sasgeo_bench.request import Wanted, plan_requests
@@ -146,6 +147,11 @@ def check_matcher(
         loaded = worker.load()
         if loaded.status != "ok" or loaded.card is None:
             yield Check(name="loads, and has a card", outcome="fail", found=loaded.message)
+            return
+        try:
+            check_card_name(spec, loaded.card.name)
+        except MatchError as error:
+            yield Check(name="loads, and has a card", outcome="fail", found=str(error))
             return
         yield Check(name="loads, and has a card", outcome="pass", found=f"{loaded.card.name} {loaded.card.version}")
         taught = _taught(worker, place) if loaded.learns else None

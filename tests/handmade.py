@@ -10,7 +10,7 @@ import pandas as pd
 
 from sasgeo_bench.report.contrasts import Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.report.controls import Verdict, verdict_frame
-from sasgeo_bench.report.rows import REPRODUCED, Contestant, Row, to_frame, with_contestants
+from sasgeo_bench.report.rows import RUN_HERE, Contestant, Row, to_frame, with_contestants
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.store.boardfile import Extra, write_board
@@ -71,7 +71,7 @@ def card_of(name, **changes):
 
 
 def entry_of(name, **changes):
-    said = {"name": name, "version": "1", "hash": "0123abcd", "how": "reproduced", "card": card_of(name), "learned": []}
+    said = {"name": name, "version": "1", "hash": "0123abcd", "how": "run here", "card": card_of(name), "learned": []}
     return said | {"isolation": {"network": "none"}} | changes
 
 
@@ -89,8 +89,8 @@ def about_of(entries, **changes):
 def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):
     """Write a board of these parts."""
     table = to_frame([]) if table is None else table
-    named = {entry["name"]: Contestant(entry["version"], entry["hash"], REPRODUCED) for entry in entries}
-    nobody = Contestant("1", "", REPRODUCED)
+    named = {entry["name"]: Contestant(entry["version"], entry["hash"], RUN_HERE) for entry in entries}
+    nobody = Contestant("1", "", RUN_HERE)
     write_board(
         folder,
         tables={

@@ -60,6 +60,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "duplicates": None,
     "pipelinefile": None,
     "twin": None,
+    "privateseed": None,
     "suites": (
         *("base", "sites", "mining", "vectors", "twins"),
         *("clean", "occlusion", "false_unknown", "local_warp", "topology_twins", "instance_twins", "grade_separation"),
@@ -72,8 +73,8 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "submissionfile": None,
     "store": (
         *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile"),
-        *("rundir", "submissiondir"),
-        *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
+        *("rundir", "submissiondir", "fileset", "packabout", "boardfile", "packrows", "packdir", "packfile"),
+        *("svgfile", "sitedir", "pluginfiles", "seedfile"),
         *(
             "preview",
             "picture",
@@ -121,7 +122,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "score": None,
     "report": (
         *("measures", "rows", "strata", "steps", "tables", "rejection", "integrity", "contrasts", "falsifiers"),
-        *("controls", "costs", "text", "latex", "protection", "cases"),
+        *("reproduction", "controls", "costs", "text", "latex", "protection", "cases"),
         *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots"),
         *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "coast", "siteplots", "site"),
     ),
@@ -130,6 +131,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "contestants": None,
     "judging": None,
     "apart": None,
+    "privateboard": None,
     "boards": None,
     "boardfigures": None,
     "casepanels": None,

@@ -150,7 +150,7 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
     about, table = read_board(out / "boards" / "mine")
     assert [(entry["name"], entry["how"]) for entry in about["entries"]] == [
         ("mine", "as submitted"),
-        ("oracle_pose", "reproduced"),
+        ("oracle_pose", "run here"),
     ]
     assert about["attribution"] == "(c) OpenStreetMap contributors, ODbL"
     assert len(table) == len(board.table)

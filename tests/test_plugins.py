@@ -10,7 +10,14 @@ import pytest
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.plugins import BUILT_IN, MATCHERS, check_names, list_entry_points, load_matcher
+from sasgeo_bench.plugins import (
+    BUILT_IN,
+    MATCHERS,
+    check_card_name,
+    check_names,
+    list_entry_points,
+    load_matcher,
+)
 
 SOUND = """
 from sasgeo_bench.matcher import WITHHELD, MatcherCard
@@ -159,12 +166,30 @@ def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, 
 
 
 @pytest.mark.parametrize("order", [("b-second", "a-first"), ("a-first", "b-second")])
-def test_of_two_outsiders_with_one_name_the_first_by_its_package_is_used(install, order) -> None:
+def test_of_two_outsiders_with_one_name_neither_is_used_and_one_line_names_both(install, order) -> None:
     for name in order:
         module = name.replace("-", "_")
         install(name, {"mine": f"{module}:Sound"}, **{module: SOUND})
-    with pytest.warns(UserWarning, match=r"a-first is used, b-second \(b_second:Sound\) is not"):
-        assert type(load_matcher("mine")).__module__ == "a_first"
+    install("x-own", {"other": "other:Sound"}, other=SOUND)
+    words = "two plugins are named 'mine': a-first (a_first:Sound) and b-second (b_second:Sound), so neither is used"
+    warnings.simplefilter("ignore")
+    assert refusal("mine").startswith(words)
+    with pytest.raises(MatchError, match="two plugins are named 'mine'"):
+        check_names(matchers=["mine"])
+    assert type(load_matcher("other")).__module__ == "other"  # which costs nobody else
+    assert type(load_matcher("b_second:Sound")).__module__ == "b_second"
+
+
+@pytest.mark.parametrize("name", ["fft_vote", "oracle_pose", "sasgeo"])
+def test_a_matcher_of_others_whose_card_bears_a_shipped_name_is_refused(name) -> None:
+    for spec in ("mine:Matcher", "sasgeo_bench_mine:Matcher", "mine"):
+        with pytest.raises(
+            MatchError, match=f"^{spec}: its card is named '{name}', as a matcher that ships: rename it$"
+        ):
+            check_card_name(spec, name)
+    check_card_name("mine:Matcher", "mine")
+    check_card_name("sasgeo_baselines.fft_vote:FftVote", "fft_vote")
+    check_card_name("fft_vote", "fft_vote")
 
 
 def test_every_one_of_three_that_loses_is_told(install) -> None:

@@ -210,6 +210,7 @@ def test_what_a_runner_has_taught_must_stand_on_the_card(stored, tmp_path):
     ("changes", "fault"),
     [
         ({"name": "prior_centre"}, "'prior_centre' is the name of a control of every board"),
+        ({"name": "sasgeo"}, "'sasgeo' is the name of a matcher that ships"),
         ({"name": "oracle_mine"}, "'oracle_mine' is the name of a control of every board"),
         ({"name": "../mine"}, "'name'"),
         ({"name": "Mine"}, "'name'"),
@@ -476,7 +477,7 @@ def test_submissions_stand_beside_what_was_run_and_say_so(copied, stored, tmp_pa
     said = {entry["name"]: entry for entry in about["entries"]}
     assert {name: entry["how"] for name, entry in said.items()} == {
         "mine": "as submitted",
-        "prior_centre": "reproduced",
+        "prior_centre": "run here",
     }
     assert said["mine"]["card"]["source"] == "original"
     assert (said["mine"]["trained_on"], said["mine"]["set_apart"]) == ([], None)
@@ -531,7 +532,7 @@ def test_one_command_publishes_stored_results_and_submissions(copied, stored, pr
     assert said.split()[-1] == str(tmp_path / "site" / "index.html")
     page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     assert "as submitted" in page
-    assert "reproduced" in page
+    assert "run here" in page
     code, _, err = program("publish", "--board", tmp_path, "--submissions", copied.parent, "--out", tmp_path)
     assert code == 2
     assert "holds no stored results" in err

@@ -10,11 +10,22 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boards import Board
-from sasgeo_bench.cli.console import ExtractFolders, Out, RegionFolders, print_table, shown_progress, tell
+from sasgeo_bench.cli.console import (
+    ExtractFolders,
+    Out,
+    RegionFolders,
+    SeedFile,
+    print_table,
+    private_seed,
+    shown_progress,
+    tell,
+)
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.packing import board_of, request_of, score_all
 from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.privateboard import check_public, read_private
+from sasgeo_bench.privateseed import seed_said
 from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
 from sasgeo_bench.store.catalog import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.submissions import submissions_for
@@ -51,6 +62,12 @@ Submissions = Annotated[
     list[Path] | None,
     typer.Option(help="a submission, or a folder of them, beside stored results; those for their board are scored"),
 ]
+Private = Annotated[
+    Path | None,
+    typer.Option(
+        help="board of a private seed of the same pipeline, OUT/private/boards/<id>: rows it bears out are reproduced"
+    ),
+]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
@@ -75,6 +92,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     ] = None,
     rejector: Rejectors = None,
     submissions: Submissions = None,
+    private: Private = None,
     region_folders: RegionFolders = None,
     without: Annotated[
         list[str] | None, typer.Option(help="region whose queries are left out, on each of its maps; may be repeated")
@@ -107,6 +125,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
         draws=draws or usual.draws,
         without=without or (),
         submissions=submitted,
+        private=private,
         jobs=jobs,
     )
     with shown_progress() as progress:
@@ -137,6 +156,8 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     region_folders: RegionFolders = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
+    seed_file: SeedFile = None,
+    private: Private = None,
     results: Results = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
@@ -154,14 +175,23 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         region_folders=tuple(region_folders or ()),
         jobs=jobs,
         dask=dask,
+        private=private_seed(seed_file),
     )
     if dry_run:
         typer.echo(plan.to_text())
         return
+    if plan.private is not None and (results is not None or private is not None):
+        check_public(seed_said(plan.private), str(board_folder(plan)))
+    if private is not None:
+        read_private(private, plan.spec.said)
     with shown_progress() as progress:
-        board = run_pipeline(plan, tell=tell, progress=progress, results=results, has_cases=cases)
+        board = run_pipeline(plan, tell=tell, progress=progress, results=results, has_cases=cases, private=private)
     show_board(board)
     typer.echo(str(board_folder(plan)))
+    if plan.private is not None:
+        tell(f"next: sasgeo-bench score --predictions docs/results/{spec.id} --private {board_folder(plan)}")
+        _check_controls(board)
+        return
     tell(_how_to_publish(board_folder(plan)))
     if not matcher:
         tell(f"next: sasgeo-bench leaderboard {pipeline} --matcher NAME adds one of yours (new-matcher begins one)")

@@ -16,6 +16,9 @@ from rich.table import Table
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.extract.scan import Box
+from sasgeo_bench.privateseed import LEAST_BITS, REPRODUCING_BITS, PrivateSeed
+from sasgeo_bench.request import PRIVATE_ROOT
+from sasgeo_bench.store.seedfile import VARIABLE, take_seed
 
 EXIT_USER: Final = 2
 PIPE_WIDTH: Final = 200
@@ -34,6 +37,30 @@ ExtractFolders = Annotated[
     list[Path] | None,
     typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
 ]
+
+SeedFile = Annotated[
+    Path | None,
+    typer.Option(
+        help=f"file NAME.seed with a private seed, readable by you alone (or the seed in {VARIABLE}): draw by it, into "
+        "OUT/private"
+    ),
+]
+
+
+def private_seed(file: Path | None, *, public: int | None = None) -> PrivateSeed | None:
+    """Take the private seed of a file or of the environment, and say what is to be known of it; None without one."""
+    seed = take_seed(file)
+    if seed is None:
+        return None
+    if public is not None:
+        message = "--seed is public and a private seed is given too: leave one of them out"
+        raise ConfigError(message)
+    tell(f"drawing by a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}, into OUT/{PRIVATE_ROOT}")
+    if seed.bits < LEAST_BITS:
+        tell(f"warning: {seed.bits} bits are no secret: whoever sees a query can find the seed; use 32 hex digits")
+    elif seed.bits < REPRODUCING_BITS:
+        tell(f"warning: a board of this seed makes no row reproduced: that takes {REPRODUCING_BITS} bits")
+    return seed
 
 
 def read_date(text: str | None) -> dt.date | None:

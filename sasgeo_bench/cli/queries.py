@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import ExtractFolders, Out, OwnRegionFolders, print_table, tell
+from sasgeo_bench.cli.console import ExtractFolders, Out, OwnRegionFolders, SeedFile, print_table, private_seed, tell
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.processes import spread
 from sasgeo_bench.query import PriorGroup
-from sasgeo_bench.request import Request, Wanted, plan_requests
+from sasgeo_bench.request import Request, Wanted, plan_requests, root_of
 from sasgeo_bench.suites.all_suites import EVERY_SUITE, SUITES, find_suite
 from sasgeo_bench.tasks import make_tasks
 
@@ -40,7 +40,8 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
     ] = None,
     split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8,
-    seed: Annotated[int, typer.Option(help="root of all chance")] = 0,
+    seed: Annotated[int | None, typer.Option(help="public seed, the root of all chance; default: 0")] = None,
+    seed_file: SeedFile = None,
     prior: Annotated[
         str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")
     ] = None,
@@ -53,16 +54,17 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
     jobs: Annotated[int, typer.Option(min=1, help="regions at once")] = 1,
 ) -> None:
     """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
+    private = private_seed(seed_file, public=seed)
     wanted = Wanted(
         suites=tuple(suite or SUITES),
         regions=tuple(regions or ()),
         split=split,
         count=n,
-        seed=seed,
+        seed=private or seed or 0,
         group=PriorGroup.parse(prior) if prior else None,
         extract_folders=tuple(extracts or ()),
         region_folders=tuple(region_folders or ()),
-        out=out,
+        out=root_of(out, private),
         may_be_fewer=up_to,
     )
     requests = plan_requests(wanted, tell=tell)

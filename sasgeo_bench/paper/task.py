@@ -31,6 +31,7 @@ from sasgeo_bench.paper.trials import (
 from sasgeo_bench.paper.windows import MARGIN_M, WINDOW_CELLS, WINDOW_M, Windows
 from sasgeo_bench.pipelinefile import PAPER_SUITE
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.privateseed import PrivateSeed, seed_said
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.region import DATA_VERSION, SCHEMA_VERSION, Region
@@ -52,7 +53,9 @@ STRENGTH_UNIT: Final = "map-change probability"
 DATA: Final = "procedural regions, no OSM data in them"  # what pictures and tables say of where they come from
 
 
-def make_paper_task(*, seed: int, out: Path, trials: int = TRIALS, tell: Tell) -> Path:
+def make_paper_task(
+    *, seed: int, out: Path, trials: int = TRIALS, private: PrivateSeed | None = None, tell: Tell
+) -> Path:
     """Make the paper's 30 regions and draw its retrieval trials on them.
 
     Parameters
@@ -63,6 +66,8 @@ def make_paper_task(*, seed: int, out: Path, trials: int = TRIALS, tell: Tell) -
         Root: the region goes to `out/regions/paper-poc-<seed>`, the task to `out/tasks/paper-poc/paper-poc-<seed>`.
     trials : int
         How many; the first of a longer request are those of a shorter one.
+    private : PrivateSeed, optional
+        Root of all chance instead; the public seed is then a name.
     tell : callable
         Gets one line for every step.
 
@@ -86,17 +91,19 @@ def make_paper_task(*, seed: int, out: Path, trials: int = TRIALS, tell: Tell) -
         raise ConfigError(message)
     check_roots(out)
     seeds = Seeds(root=seed, names=(SUITE, str(VERSION)))
+    if private is not None:
+        seeds = Seeds(root=private, names=(SUITE, str(VERSION), str(seed)))
     tell(f"{region_name(seed)}: drawing {TILES} tiles")
     folder = build_made(_spec(seed), _generated(seed, seeds), out=out, tell=tell)
     drawer = PaperDrawer.of(regiondir.read_region(folder), seeds)
     pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
-    hidden = {"seed": seed, "request_sha256": _request_sha256(seed, trials)}
+    hidden = {**seed_said(private or seed), "request_sha256": _request_sha256(seed, trials, private)}
     made = put_task(pairs, _about(drawer.region), hidden, out=out, tell=tell)
     tell(f"{SUITE} on {region_name(seed)}: {made.queries} trials in {made.folder}")
     return made.folder
 
 
-def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS) -> Path | None:
+def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS, private: PrivateSeed | None = None) -> Path | None:
     """Task folder of these trials, or None if they have to be drawn; nothing is drawn to find out.
 
     Task, truths and region are as they were written, and nothing that decides what they hold has changed since.
@@ -108,7 +115,7 @@ def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS) -> Path | Non
     """
     folder = out / "tasks" / SUITE / region_name(seed)
     said = taskdir.read_hidden(out / "truth" / SUITE / region_name(seed))
-    if said.get("request_sha256") != _request_sha256(seed, trials):
+    if said.get("request_sha256") != _request_sha256(seed, trials, private):
         return None
     try:
         faults = [*check_task(folder, out=out), *regiondir.differing_files(out / "regions" / region_name(seed))]
@@ -117,7 +124,7 @@ def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS) -> Path | Non
         return None
 
 
-def _request_sha256(seed: int, trials: int) -> str:
+def _request_sha256(seed: int, trials: int, private: PrivateSeed | None) -> str:
     """Hash of all that decides which trials come of a seed; the recipe itself is in it by its version."""
     said = {
         "suite": [SUITE, VERSION, TASK_VERSION],
@@ -126,6 +133,8 @@ def _request_sha256(seed: int, trials: int) -> str:
         "trials": trials,
         "made_by": version("sasgeo-bench"),
     }
+    if private is not None:
+        said["private_seed"] = private.commitment
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 

@@ -10,6 +10,7 @@ import pandas as pd
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.report.contrasts import Finding
 from sasgeo_bench.report.controls import Verdict
+from sasgeo_bench.report.reproduction import seed_table
 from sasgeo_bench.report.text import DAGGER, control_table, finding_table, tables_of
 
 _ESCAPED: Final = {
@@ -50,6 +51,9 @@ def board_latex(
     lines = [f"% {about['made_by']}, scorer version {about['scorer_version']}; {ATTRIBUTION}", *_HEAD]
     if findings:
         lines += _table("Registered contrasts", "contrasts", finding_table(findings))
+    seeds = seed_table(about)
+    if len(seeds):
+        lines += _table("Public and private seed", "seeds", seeds)
     for title, table in tables_of(board):
         lines += _table(title, title.partition(" (")[0], table)
     if verdicts:

@@ -14,8 +14,10 @@ from sasgeo_bench.metrics.intervals import Interval
 from sasgeo_bench.score import MISSING
 
 ALL_SUITES: Final = "all suites"
-REPRODUCED: Final = "reproduced"  # how answers came: we ran the code,
-AS_SUBMITTED: Final = "as submitted"  # or their author gave them
+AS_SUBMITTED: Final = "as submitted"  # how answers came: their author gave them,
+RUN_HERE: Final = "run here"  # or we ran the code, on queries of a public seed alone,
+REPRODUCED: Final = "reproduced"  # or on a private seed too, where it is not shown to do worse,
+NOT_REPRODUCED: Final = "not reproduced"  # or where it is
 UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: beside the ranks
 YARDSTICK: Final = "oracle_"  # how the names of yardsticks begin, which know what no matcher can: beside the ranks, too
 _THREADS: Final = 4  # each holds some 100 MB of draws

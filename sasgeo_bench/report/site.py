@@ -10,7 +10,8 @@ from typing import Any, Final
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.report.controls import Verdict
-from sasgeo_bench.report.siteboard import Book, contrasts_of, control_table, sections_of
+from sasgeo_bench.report.reproduction import seed_lines
+from sasgeo_bench.report.siteboard import Book, contrasts_of, control_table, sections_of, seeds_of
 from sasgeo_bench.report.sitepages import (
     cost_table,
     figures_by_kind,
@@ -92,6 +93,8 @@ def site_pages(source: SiteSource) -> dict[str, str]:
             "control_lines": control_lines(controls),
             "controls_held": bool(controls) and all(item.holds for item in controls),
             "has_controls": bool(controls),
+            "seed_line": seed_lines(source.about)[0],
+            "seeds": seeds_of(source.about),
             "warnings": warnings_of(source.board),
             "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
             "counts": _counts(source, book),

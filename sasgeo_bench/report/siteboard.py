@@ -11,6 +11,7 @@ import pandas as pd
 from sasgeo_bench.errors import counted
 from sasgeo_bench.report.contrasts import LESS_THAN_MATTERS, Contrast, chosen_rows
 from sasgeo_bench.report.measures import CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.report.reproduction import SEEDS_NOTE, seed_table
 from sasgeo_bench.report.rows import ALL_SUITES, is_unranked, name_alone
 from sasgeo_bench.report.sitesource import SiteSource
 from sasgeo_bench.report.sitetable import (
@@ -396,6 +397,21 @@ def places_of(contrast: Contrast, scores: pd.DataFrame, n: int) -> int:
     rows = [chosen_rows(contrast, scores[scores["matcher"] == name]) for name in whose]
     shared = rows[0][rows[0]["query_id"].isin(rows[1]["query_id"])]
     return int(shared["place"].nunique()) if len(shared) == n else 0
+
+
+def seeds_of(about: Mapping[str, Any]) -> Table | None:
+    """Figures on the public and on a private seed; None where no row was held against a private one."""
+    found = seed_table(about).rename(columns={"verdict": "shown"})
+    if not len(found):
+        return None
+    texts = {"matcher", "suite", "track", "figure", "shown"}
+    return Table(
+        name="seeds",
+        title="Public and private seed",
+        columns=tuple(column(str(name), is_number=name not in texts) for name in found.columns),
+        rows=tuple(Row(cells=tuple(Cell(text=str(value)) for value in row)) for row in found.itertuples(index=False)),
+        notes=(SEEDS_NOTE,),
+    )
 
 
 def control_table(controls: pd.DataFrame) -> Table | None:

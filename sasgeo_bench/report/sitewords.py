@@ -7,6 +7,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.metrics.compare import LEAST_BLOCKS
 from sasgeo_bench.query import PriorGroup
+from sasgeo_bench.report.rows import AS_SUBMITTED, NOT_REPRODUCED, REPRODUCED, RUN_HERE
 from sasgeo_bench.report.sitetable import Column, Mark
 from sasgeo_bench.report.text import DAGGER
 
@@ -73,6 +74,11 @@ MEANINGS: Final[dict[str, str]] = {
     "hazardous": "Share that is misleading and has an error beyond the alert limit, with its 95 % interval",
     "exceeded": "Share with an error beyond the level, available or not, with its 95 % interval",
     "supports": "What the misleading ones among the available support",
+    "figure": "Of what: success or recall under stress, or false fixes at absent places",
+    "public": "The figure on the public seed of this board",
+    "private": "The same on a private seed, whose queries nobody else can draw",
+    "private less public": "Difference with its interval; all intervals of a matcher hold at once (95 %)",
+    "shown": "Whether the private figure is shown to be worse",
     "verdict": "held, or FAILED: then do not trust this board",
     "found": "How many were right, or answered where none must be",
     "expected": "What guessing is worth, or how many there must be",
@@ -84,7 +90,9 @@ NOTE: Final = (
 )
 _HEADINGS: Final = {"known": "to 5 deg", "weak": "to 20 deg", "unknown": "unknown"}
 MARKS: Final[dict[str, str]] = {  # words beside names and ranks
-    "reproduced": "the matcher's code was run here on these queries",
+    "run here": "the matcher's code was run here, on queries of a public seed, which code can draw again",
+    "reproduced": "it was run on a private seed of 128 bits too, and no figure is shown to be worse there",
+    "not reproduced": "it was run on a private seed too, and is shown to be worse there: do not trust the row",
     "as submitted": "a file of answers; nobody here has run its code",
     "trained on": "the places that its parameters come from",
     "set apart": "in a table of its own, for the reason that is told there",
@@ -92,8 +100,13 @@ MARKS: Final[dict[str, str]] = {  # words beside names and ranks
 }
 CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure is worth that nobody earned")
 _HOW: Final = {
-    "reproduced": Mark(text="reproduced", meaning=MARKS["reproduced"], tone="good"),
-    "as submitted": Mark(text="as submitted", meaning=MARKS["as submitted"], tone="warn"),
+    name: Mark(text=name, meaning=MARKS[name], tone=tone)
+    for name, tone in {
+        RUN_HERE: "plain",
+        REPRODUCED: "good",
+        NOT_REPRODUCED: "warn",
+        AS_SUBMITTED: "warn",
+    }.items()
 }
 
 
@@ -139,6 +152,7 @@ def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:
     if is_control:
         return (CONTROL,)
     how = str(entry.get("how") or "")
+    how = RUN_HERE if how == REPRODUCED and not entry.get("private") else how  # said by programs before there was one
     marks = [_HOW.get(how, Mark(text=how, meaning="as the board says"))] if how else []
     places = [str(place) for place in entry.get("trained_on") or ()]
     if places:

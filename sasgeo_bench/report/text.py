@@ -15,7 +15,8 @@ from sasgeo_bench.report.controls import Verdict, verdict_frame
 from sasgeo_bench.report.falsifiers import Falsifier
 from sasgeo_bench.report.integrity import AS_DRAWN
 from sasgeo_bench.report.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
-from sasgeo_bench.report.rows import ALL_SUITES, REPRODUCED, is_apart, is_unranked
+from sasgeo_bench.report.reproduction import SEEDS_NOTE, seed_lines, seed_table
+from sasgeo_bench.report.rows import ALL_SUITES, RUN_HERE, is_apart, is_unranked
 from sasgeo_bench.report.steps import GROUP
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
 
@@ -99,7 +100,7 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
         rows.append(
             {
                 "matcher": matcher,
-                "how": main.get("how", REPRODUCED),
+                "how": main.get("how", RUN_HERE),
                 primary: figure_text(main) if main["is_applicable"] else "not applicable",
                 "rank": rank_text(main),
                 WITHIN.name: "-" if near is None else figure_text(near),
@@ -118,8 +119,8 @@ def _suite_table(part: pd.DataFrame, primary: str) -> pd.DataFrame:
 
 
 def _without_how(table: pd.DataFrame) -> pd.DataFrame:
-    """The table as it is, or without a column that says of all rows that we ran the code."""
-    return table.drop(columns="how") if (table["how"] == REPRODUCED).all() else table
+    """The table as it is, or without a column that says of all rows that we ran the code and no more."""
+    return table.drop(columns="how") if (table["how"] == RUN_HERE).all() else table
 
 
 def _pick(rows: pd.DataFrame, metric: str, stratum: str) -> pd.Series | None:
@@ -233,7 +234,9 @@ _TERMS: Final = {  # docs/scoring.md says the same at more length
     "chance": "in a title, what guessing among the candidates reaches",
     "rank": "ranks a matcher can have, all pairs at once; `-` where there are fewer than "
     f"{LEAST_BLOCKS} blocks: they rank nobody, as they decide no contrast",
-    "how": "`reproduced`: we ran the code; `as submitted`: the answers came from its author, and nobody else ran it",
+    "how": "`run here`: we ran the code, on queries of a public seed, which code can draw again; `reproduced`: on a "
+    "private seed of 128 bits too, where no figure is shown to be worse; `not reproduced`: where one is; "
+    "`as submitted`: the answers came from its author, and nobody else ran it",
     "set apart": "in no rank, for a place that it was trained on is among those it is tested on",
     "detectable": "least difference from the best other matcher that these queries would show; inf where none would, "
     "`-` where nobody is ranked",
@@ -319,9 +322,15 @@ def board_markdown(
         "",
         _NOTE.format(draws=about["draws"]),
         "",
-        *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board), *training_lines(about))),
+        *(
+            f"- {line}"
+            for line in (*control_lines(verdicts), *seed_lines(about), *warnings_of(board), *training_lines(about))
+        ),
         "",
     ]
+    seeds = seed_table(about)
+    if len(seeds):
+        lines += ["## Public and private seed", "", SEEDS_NOTE, "", *markdown_table(seeds), ""]
     if findings:
         lines += ["## Registered contrasts", "", *markdown_table(finding_table(findings)), ""]
     if falsifiers:
@@ -459,7 +468,7 @@ def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple
         primary = primary_of(str(track)).name
         rows = []
         for matcher, mine in part.groupby("matcher", sort=True):
-            row = {"matcher": str(matcher), "how": mine["how"].iloc[0] if "how" in mine else REPRODUCED}
+            row = {"matcher": str(matcher), "how": mine["how"].iloc[0] if "how" in mine else RUN_HERE}
             total = []
             for suite, one in mine.groupby("suite", sort=True):
                 shown = _main(one, primary)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.run.root import SYSTEM
+from sasgeo_bench.store.seedfile import SUFFIX as SEED
 
 MOST_ENTRIES: Final = 200_000  # names that are looked at: about a second of a disk that is awake
 MOST_DEPTH: Final = 12
@@ -174,7 +175,8 @@ def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]
     if names & _INTERPRETER or folder in {*SYSTEM, "/dev"}:
         return [], []
     base = folder.rstrip("/")
-    tells = [Telling(folder=f"{base}/{name}") for name in sorted(names & _HISTORY)]
+    telling = {name for name in names if name in _HISTORY or name.endswith(SEED)}  # a private seed draws the truths
+    tells = [Telling(folder=f"{base}/{name}") for name in sorted(telling)]
     passed = {*_HISTORY, *_PASSED_OVER}
     if names >= _OUT:
         tells += [Telling(folder=f"{base}/{name}") for name in _OF_OUT]

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.plugins import ORACLE, list_entry_points
+from sasgeo_bench.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.results import STATUSES, Status, matcher_hash
 from sasgeo_bench.run.lesson import Lesson, plan_lesson
 from sasgeo_bench.run.oracle import CARD
@@ -67,6 +67,8 @@ class RunRequest:
         Says what is one place, and how far from each other places to learn from and places that are asked must lie.
     is_oracle : bool
         Lets it learn from what it is asked: a yardstick, never ranked.
+    hidden : sequence of Path
+        Files that the matcher must not see besides truths and the like, as that of a private seed.
     """
 
     spec: str
@@ -84,6 +86,7 @@ class RunRequest:
     most_trained: int = 200
     split: Split | None = None
     is_oracle: bool = False
+    hidden: Sequence[Path] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -300,9 +303,7 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
     if reply.status != "ok" or reply.card is None:
         said = reply.message or "the plugin says nothing of itself"
         raise MatchError(said if request.spec in said else f"{request.spec}: cannot be made ({said})")
-    if reply.card.name == ORACLE:
-        message = f"{request.spec}: card: {ORACLE!r} is the name of a control of the runner, choose another one"
-        raise MatchError(message)
+    check_card_name(request.spec, reply.card.name)
     return reply.card, reply.code, reply.learns
 
 
@@ -316,7 +317,7 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would give the world away.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
-    hidden += [path for path in maps if path not in readable]
+    hidden += [*(path for path in maps if path not in readable), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
 
 
@@ -341,6 +342,9 @@ def _part(
         raise StoreError(message)
     taskdir.check_queries(task)
     root = task.resolve().parent.parent.parent
+    if taskdir.PRIVATE in about and request.out.resolve() != root:
+        message = f"{task} is of a private seed, whose answers stay beside it: say --out {task.parent.parent.parent}"
+        raise ConfigError(message)
     region = root / "regions" / about["region"]
     if not taskdir.is_of_map(about, read_manifest(region)):
         message = f"{region} was built anew since the queries of {task} were made: make them again"

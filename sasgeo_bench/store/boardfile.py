@@ -190,6 +190,24 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         raise StoreError(message) from error
 
 
+def read_scores(folder: Path) -> pd.DataFrame:
+    """Scored rows of a board, those of all contestants.
+
+    Raises
+    ------
+    StoreError
+        If they are missing or damaged.
+
+    Examples
+    --------
+    >>> read_scores(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere/scores.parquet cannot be read (No such file or directory): score it again
+    """
+    return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
+
+
 def read_pictures(folder: Path) -> dict[str, bytes]:
     """Pictures of a board, or of stored results, as they were written: name in `pictures/` -> content.
 

@@ -93,6 +93,37 @@ class _Card(_Said):
     needs: list[str] | None = None
 
 
+class PrivateSaid(_Said):
+    """A private seed: what tells that two boards are of the same one, and how many bits it has."""
+
+    commitment: Sha256
+    bits: Annotated[int, Field(ge=1)]
+
+
+class _SeedFigure(_Said):
+    suite: str
+    track: str
+    prior_group: str
+    metric: str
+    public: float
+    private: float
+    difference: float
+    lo: float
+    hi: float
+    n_public: int
+    n_private: int
+    blocks_public: int
+    blocks_private: int
+    blocks_shared: int
+    is_worse: bool
+
+
+class _OnBothSeeds(_Said):
+    verdict: Literal["run here", "reproduced", "not reproduced"]
+    why: str
+    figures: list[_SeedFigure]
+
+
 class _Entry(_Said):
     name: str
     version: str | None = None
@@ -102,6 +133,7 @@ class _Entry(_Said):
     trained_on: list[str] | None = None
     set_apart: str | None = None
     isolation: dict[str, str] | None = None
+    private: _OnBothSeeds | None = None
     learned: list[_Learned] = []
 
 
@@ -127,6 +159,8 @@ class BoardSaid(_Said):
     made_by: str | None = None
     libraries: dict[str, str] = {}
     pipeline: PipelineSaid | None = None
+    private_seed: PrivateSaid | None = None
+    private: PrivateSaid | None = None
     split: str | None = None
     draws: int | None = None
     contrasts: list[ContrastSaid] | None = None

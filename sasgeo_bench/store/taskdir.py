@@ -44,6 +44,7 @@ QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
+PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # a row group; what is held in memory at once

@@ -20,6 +20,7 @@ from sasgeo_bench.grid import Grid
 from sasgeo_bench.perturb.ageing import Ageing
 from sasgeo_bench.perturb.perception import Perception
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.privateseed import Seed
 from sasgeo_bench.query import PriorGroup, Role, Track
 from sasgeo_bench.region import Region
 from sasgeo_bench.split import Block
@@ -326,7 +327,7 @@ class Seeds:
 
     Parameters
     ----------
-    root : int
+    root : int or PrivateSeed
         The seed of the whole request.
     names : tuple of str
         Region, suite and site.
@@ -338,12 +339,13 @@ class Seeds:
     True
     """
 
-    root: int
+    root: Seed
     names: tuple[str, ...]
 
     def digest(self, *purpose: object) -> bytes:
         """SHA-256 of the seed, the names and a purpose."""
-        text = "/".join(map(str, (self.root, *self.names, *purpose)))
+        root = self.root if isinstance(self.root, int) else self.root.root
+        text = "/".join(map(str, (root, *self.names, *purpose)))
         return hashlib.sha256(text.encode()).digest()
 
     def rng(self, *purpose: object) -> np.random.Generator:

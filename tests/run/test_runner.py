@@ -226,7 +226,11 @@ def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path):
         ({"jobs": 0}, ConfigError, "--jobs must be at least 1"),
         ({"top_k": 0}, ConfigError, "--top-k must be at least 1"),
         ({"spec": "hostile:NoCard"}, MatchError, "card is a NoneType"),
-        ({"spec": "hostile:ClaimsToBeTheOracle"}, MatchError, "'oracle_pose' is the name of a control of the runner"),
+        (
+            {"spec": "hostile:ClaimsToBeTheOracle"},
+            MatchError,
+            "its card is named 'oracle_pose', as a matcher",
+        ),
         ({"spec": "no_such_matcher"}, MatchError, "there is no matcher"),
         ({"spec": "no_such_module:Class"}, MatchError, "cannot be imported"),
     ],

@@ -380,7 +380,7 @@ def rename_folder(folder):
         (lambda at: (at / "run.sh").write_text("true", encoding="utf-8"), "run.sh is no part of a submission"),
         (lambda at: (at / "predictions" / "mine.parquet").unlink(), "mine.parquet is missing"),
         (lambda at: os.truncate(at / "predictions" / "mine.parquet", 30_000_000), "has 30.0 MB, 20 MB at most"),
-        (lambda at: (at / "submission.json").write_text("[" * 100_000, encoding="utf-8"), "is no JSON"),
+        (lambda at: (at / "submission.json").write_text("[" * 100_000, encoding="utf-8"), "is nested too deep"),
         (lambda at: (at / "submission.json").write_text("[1]", encoding="utf-8"), "has schema version None"),
         (lambda at: os.truncate(at / "submission.json", 6_000_000), "has more than 5000000 bytes"),
         (lambda at: change_said(at, lambda said: said.update(schema_version=2)), "has schema version 2"),

@@ -13,7 +13,7 @@ import osmium
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.extract.read import project
+from sasgeo_bench.extract.mapped import project
 from sasgeo_bench.extract.scan import Tally, line_wkb
 
 # The prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix that say "no longer", on the keys of our classes.

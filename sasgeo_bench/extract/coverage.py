@@ -11,8 +11,6 @@ from scipy import ndimage
 
 Source = Literal["region file", "header box", "estimated", "estimated and islands"]
 
-Box = tuple[float, float, float, float]
-
 CELL_M: Final = 100.0
 CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie closer together than this
 OPEN_M: Final = 150.0  # thinner than two of these is a road or stream that was kept whole beyond the edge
@@ -47,7 +45,8 @@ def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
     """
     if len(lonlat) == 0:
         return shapely.Polygon()
-    west, south, east, north = data_box(lonlat)
+    west, south = np.percentile(lonlat, 0.1, axis=0)
+    east, north = np.percentile(lonlat, 99.9, axis=0)
     step = np.array([CELL_M / (_M_PER_DEG * np.cos(np.radians((south + north) / 2))), CELL_M / _M_PER_DEG])
     pad = int(CLOSE_M / CELL_M) + 2
     origin = np.array([west, south]) - pad * step
@@ -60,13 +59,6 @@ def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
     found = [shapely.geometry.shape(shape) for shape, _ in shapes(outline.astype(np.uint8), mask=outline)]
     scaled = shapely.transform(shapely.union_all(found), lambda points: points * step + origin)
     return shapely.simplify(scaled, float(step.mean()))
-
-
-def data_box(lonlat: NDArray[np.float64]) -> Box:
-    """West, south, east, north of coordinates of shape (N, 2), without the outermost thousandth on each side."""
-    west, south = np.percentile(lonlat, 0.1, axis=0)
-    east, north = np.percentile(lonlat, 99.9, axis=0)
-    return (float(west), float(south), float(east), float(north))
 
 
 def _disc(radius_m: float) -> NDArray[np.bool_]:
@@ -99,7 +91,7 @@ def choose_coverage(
     lonlat: NDArray[np.float64],
     *,
     stated: shapely.Geometry | None,
-    header_box: Box | None,
+    header_box: tuple[float, float, float, float] | None,
 ) -> tuple[shapely.Geometry, Source]:
     """Choose the mapped area of an extract and say where it comes from.
 

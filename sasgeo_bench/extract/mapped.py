@@ -48,7 +48,7 @@ def map_ground(
     *,
     coast: Geometries,
     gaps: Geometries,
-    frame: Box | None,
+    frame: shapely.Geometry,
 ) -> Mapped:
     """Find what of a grid an extract maps, what of that is sea, and what is unknown.
 
@@ -60,8 +60,8 @@ def map_ground(
         From `choose_coverage`: the mapped area in longitude and latitude.
     coast, gaps : ndarray of shapely.Geometry
         All coastlines of the extract, and where its ways lack nodes (`find_gaps`), in longitude and latitude.
-    frame : tuple of float or None
-        West, south, east, north, degrees: what the whole extract lies in.
+    frame : shapely.Geometry
+        The box that the whole extract lies in, in longitude and latitude.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def map_ground(
     >>> quay = shapely.LineString([(8.9, 0.0003), (9.1, 0.0003)])  # 33 m north of the southern edge, eastwards
     >>> none = np.array([], dtype=object)
     >>> box = shapely.box(8.9, -0.1, 9.1, 0.1)
-    >>> found = map_ground(grid, box, "header box", coast=np.array([quay]), gaps=none, frame=None)
+    >>> found = map_ground(grid, box, "header box", coast=np.array([quay]), gaps=none, frame=box)
     >>> round(shapely.area(found.sea).sum()), round(found.coverage.area)
     (3316, 10000)
     """
@@ -83,13 +83,14 @@ def map_ground(
     bounds = shapely.box(*grid.bounds_m)
     ground = project(shapely.intersection(area, near), grid.epsg)
     lines = project(coast[shapely.intersects(coast, near)], grid.epsg)
-    if source == "estimated" and frame is not None and len(lines):
-        whole = _islands(lines, project(shapely.intersection(shapely.box(*frame), near), grid.epsg))
+    within = project(shapely.intersection(frame, near), grid.epsg)
+    if source == "estimated" and len(lines):
+        whole = _islands(lines, within)
         ground, source = shapely.union(ground, whole), "estimated" if whole.is_empty else "estimated and islands"
     shore = find_shore(lines, ground)
     tips = project(gaps[shapely.intersects(gaps, near)], grid.epsg)
-    unknown = {CUT: ground_within_reach(tips, ground), **shore.unknown} if len(tips) else shore.unknown
-    unknown = {reason: shapely.intersection(part, bounds) for reason, part in unknown.items()}
+    lost = {CUT: ground_within_reach(tips, shapely.intersection(ground, within))} if len(tips) else {}
+    unknown = {reason: shapely.intersection(part, bounds) for reason, part in (lost | shore.unknown).items()}
     coverage = _less(shapely.intersection(ground, bounds), unknown)
     sea = shapely.get_parts(shapely.get_parts(shapely.intersection(shore.sea, bounds)))
     return Mapped(
@@ -111,7 +112,7 @@ def _less(ground: shapely.Geometry, unknown: dict[str, shapely.Geometry]) -> sha
 def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
     """Islands that lie in a frame whole, with the sea around them; nothing where any coastline in it is not whole."""
     shore = find_shore(coast, frame)
-    is_whole = ~shapely.intersects(shore.land, shapely.boundary(frame))
+    is_whole = shapely.length(shapely.intersection(shore.land, shapely.boundary(frame))) == 0
     if shore.unknown or not is_whole.any():
         return shapely.Polygon()
     islands = shapely.union_all(shore.land[is_whole])

@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import CoverageError
-from sasgeo_bench.extract.coverage import Source, choose_coverage, data_box
+from sasgeo_bench.extract.coverage import Source, choose_coverage
 from sasgeo_bench.extract.mapped import Mapped, lonlat_box, map_ground, project
 from sasgeo_bench.extract.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
 from sasgeo_bench.extract.snapshot import open_snapshot
@@ -104,7 +104,7 @@ def read_extract(
         source,
         coast=shapely.from_wkb(np.array(scan.coast, dtype=object)),
         gaps=np.array([mark for marks in scan.gaps.values() for mark in marks], dtype=object),
-        frame=snapshot.box_lonlat or (data_box(lonlat) if len(lonlat) else None),
+        frame=shapely.box(*(snapshot.box_lonlat or shapely.total_bounds(shapely.multipoints(lonlat)))),
     )
     _check_covered(path, grid_lonlat, coverage, mapped)
     near = _meets(shapely.bounds(geometry), grid_lonlat)

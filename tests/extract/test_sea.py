@@ -3,6 +3,7 @@
 
 import datetime as dt
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,7 @@ def test_a_coast_in_any_pieces_and_order_gives_the_same_sea(coast, first, second
         points = shapely.get_coordinates(ring)
         at = sorted({1 + int(share * (len(points) - 2)) for share in (first, second)})
         bounds = [0, *at, len(points) - 1]
-        cut += lines(*(points[low : high + 1] for low, high in zip(bounds[:-1], bounds[1:], strict=True) if high > low))
+        cut += lines(*(points[low : high + 1] for low, high in pairwise(bounds) if high > low))
     shuffled = [cut[index] for index in np.random.default_rng(seed).permutation(len(cut))]
     assert area(find_shore(shuffled, FRAME).sea) == pytest.approx(area(find_shore(coast, FRAME).sea))
     assert find_shore(shuffled, FRAME).unknown == {}

@@ -9,9 +9,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely.ops import substring
 
-LONGEST_M: Final = (
-    500.0  # from the last node that is there to the edge: further in, it is not the edge that cut the way
-)
+# Of the cut ways of four real extracts 99 in 100 end nearer to the edge; further in, something else took the node away.
+LONGEST_M: Final = 200.0
 
 Geometries = NDArray[np.object_]
 
@@ -64,11 +63,11 @@ def ground_within_reach(gaps: Geometries, mapped: shapely.Geometry) -> shapely.G
     tips, gap = shapely.get_coordinates(gaps, return_index=True)
     points = shapely.points(tips)
     to_edge_m = shapely.distance(points, shapely.boundary(mapped))
-    is_cut = shapely.contains(mapped, points) & (to_edge_m <= LONGEST_M)
-    is_ring = np.bincount(gap[is_cut], minlength=len(gaps)) > 1
+    is_cut = shapely.contains(mapped, points)
+    is_ring = np.bincount(gap[is_cut & (to_edge_m <= LONGEST_M)], minlength=len(gaps)) > 1
     parts = shapely.get_parts(mapped)
     between = [_up_to_edge(line, parts) for line in gaps[is_ring]]
-    discs = shapely.buffer(points[is_cut], to_edge_m[is_cut])
+    discs = shapely.buffer(points[is_cut], np.minimum(to_edge_m, LONGEST_M)[is_cut])
     return shapely.intersection(shapely.union_all([*discs, *between]), mapped)
 
 

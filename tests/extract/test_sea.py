@@ -257,7 +257,7 @@ SHORES = json.loads((Path(__file__).parents[1] / "data" / "shores.geojson").read
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("name", ["monaco", "helgoland", "torshavn", "oakland"])
+@pytest.mark.parametrize("name", ["monaco", "helgoland", "oakland", pytest.param("torshavn", marks=pytest.mark.slow)])
 def test_real_harbours_are_water_and_real_quays_are_not(name, real_extracts, tmp_path):
     spec = read_region_file(find_region_file(name))
     plan = plan_build(spec, out=tmp_path, extract_folders=[real_extracts])

@@ -18,7 +18,8 @@ import shapely
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.extract.locate import Extract, find_extract
-from sasgeo_bench.extract.read import Reading, lonlat_box, read_extract
+from sasgeo_bench.extract.mapped import lonlat_box
+from sasgeo_bench.extract.read import Reading, read_extract
 from sasgeo_bench.extract.snapshot import is_history
 from sasgeo_bench.extract.town import TownPlan, write_town
 from sasgeo_bench.features import fingerprint
@@ -190,6 +191,7 @@ def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> M
             f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights there"
         )
         raise StoreError(message) from error
+    tell(f"{name}: mapped {manifest.coverage.to_text()}")
     tell(f"{name}: built {plan.folder}")
     return manifest
 
@@ -281,6 +283,8 @@ def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, s
         hidden=record.hidden,
         notes=record.notes,
         warnings=(*record.warnings, note),
+        unknown_m2=record.coverage.unknown_m2,
+        cuts=record.coverage.cuts,
     )
     _write_unless_current(edited, record.extract, reading, tell=lambda _: None)
     return edited.folder
@@ -406,6 +410,8 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
             source=reading.coverage_source,
             share=min(1.0, reading.coverage.area / ((east - west) * (north - south))),
             wkt=shapely.to_wkt(reading.coverage, rounding_precision=2),
+            unknown_m2={reason: round(area_m2, 1) for reason, area_m2 in reading.unknown_m2.items()},
+            cuts=reading.cuts,
         ),
         counts={name: int(counts.get(name, 0)) for name in taxonomy.names},
         graph_counts={str(name): int(count) for name, count in sorted(kinds.items())}

@@ -10,6 +10,7 @@ import shapely
 
 from sasgeo_bench.errors import ShapeError
 
+SEA: Final = "coastline"  # `osm_type` of sea: no object of OSM, but ground to the right of its coastlines
 # Column -> pandas dtype; `geometry` comes last. `width_m` is the drawn width of a line, NaN for an area.
 # `is_visible` is False for what lies under ground or in a tunnel: it keeps its place in the graph, never in a layer.
 DTYPES: Final = {

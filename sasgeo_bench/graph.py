@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.angles import bearing_deg
-from sasgeo_bench.features import check_features
+from sasgeo_bench.features import SEA, check_features
 from sasgeo_bench.network import (
     LAYERS,
     RAIL,
@@ -167,7 +167,9 @@ def build_graph(
     _draw_buildings(
         draft, _sorted(features[is_seen & (names == "building").to_numpy()]), bounds_m=bounds_m, rules=rules
     )
-    _draw_areas(draft, _sorted(features[is_seen & names.isin(AREA_CLASSES).to_numpy()]))
+    # Where the middle of the sea lies tells where the extract was cut, and nothing of the place.
+    is_area = is_seen & names.isin(AREA_CLASSES).to_numpy() & (features["osm_type"] != SEA).to_numpy()
+    _draw_areas(draft, _sorted(features[is_area]))
     return draft.finish(features.crs, bounds_m)
 
 

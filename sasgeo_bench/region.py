@@ -17,7 +17,7 @@ from sasgeo_bench.grid import Grid
 from sasgeo_bench.tomlfile import Document
 
 SCHEMA_VERSION: Final = 1  # of region.json and the tables beside it
-DATA_VERSION: Final = 1  # of what a build makes of an extract: raised whenever the same input gives another region
+DATA_VERSION: Final = 2  # of what a build makes of an extract: raised whenever the same input gives another region
 ATTRIBUTION: Final = "(c) OpenStreetMap contributors, ODbL"
 LICENCE: Final = "ODbL-1.0"
 
@@ -48,11 +48,24 @@ class ExtractRecord(_Record):
 
 
 class CoverageRecord(_Record):
-    """The mapped area: where it is known from, its share of the grid, and its outline as WKT in the region's CRS."""
+    """The mapped area: where it is known from, its share of the grid, and its outline as WKT in the region's CRS.
+
+    `unknown_m2` is ground that was taken out of it, by reason (one place may have two); `cuts` are counts of what an
+    extract cut out of a larger one lacks. Both are empty in regions of data version 1, which did not look.
+    """
 
     source: Source
     share: Annotated[float, Field(ge=0, le=1)]
     wkt: str
+    unknown_m2: dict[str, Annotated[float, Field(ge=0)]] = {}
+    cuts: dict[str, Count] = {}
+
+    def to_text(self) -> str:
+        """One line for a person: how much is mapped, and what is not and why."""
+        cuts = ", ".join(f"{what} {count}" for what, count in self.cuts.items())
+        reasons = [f"{area_m2:,.0f} m2 unknown {reason}" for reason, area_m2 in self.unknown_m2.items()]
+        about = f"; cut out of a larger extract: {cuts}" if cuts else ""
+        return "; ".join((f"{self.share:.1%} of the grid ({self.source}){about}", *reasons))
 
 
 class Manifest(_Record):

@@ -43,6 +43,8 @@ class Rule(Document):
     values: list[str] = []
     besides: list[str] = []
     widths: dict[str, WidthM] = {}
+    multipolygon: Literal["outline", "filled"] = "outline"
+    keeps_width: list[str] = [ANY]
 
     @model_validator(mode="after")
     def _has_values(self) -> Self:
@@ -128,11 +130,17 @@ class Taxonomy(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """One class that an object belongs to; `width_m` is None for areas and where the host's width counts."""
+    """One class that an object belongs to; `width_m` is None for areas and where the host's width counts.
+
+    `is_outline`: the edge of an area is drawn, not the area; `is_filled`: a multipolygon of a line rule is an area;
+    `keeps_width`: a tagged width goes before `width_m`.
+    """
 
     class_name: str
     width_m: float | None
     is_outline: bool = False
+    is_filled: bool = False
+    keeps_width: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,8 +165,8 @@ def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
     Returns
     -------
     Classification
-        Labels in class order. A line rule labels areas too (filled where the object is an area of its own); whether the
-        object is a line or an area is for the reader to say. `unknown` names "key=value" of taxonomy keys without rule.
+        Labels in class order. A line rule labels areas too (filled or by their outline); whether the object is a line
+        or an area is for the reader to say. `unknown` names "key=value" of taxonomy keys without rule.
 
     Examples
     --------
@@ -178,7 +186,14 @@ def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
                 continue
             known.add(rule.key)
             target = line if rule.geometry == "line" else area
-            target.append(Label(class_name=item.name, width_m=rule.widths.get(value)))
+            target.append(
+                Label(
+                    class_name=item.name,
+                    width_m=rule.widths.get(value),
+                    is_filled=rule.multipolygon == "filled",
+                    keeps_width=not {ANY, value}.isdisjoint(rule.keeps_width),
+                )
+            )
         outline = item.outline_of
         if outline is not None and tags.get(outline.key) in outline.values:
             area.append(Label(class_name=item.name, width_m=outline.width_m, is_outline=True))

@@ -156,7 +156,7 @@ def _summary(manifest: Manifest, folder: Path) -> Table:
     table.add_row(
         "grid", f"{manifest.rows} x {manifest.cols} cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}"
     )
-    table.add_row("mapped", f"{coverage.share:.1%} of the grid ({coverage.source}); the rest is unknown, not absent")
+    table.add_row("mapped", f"{coverage.to_text()}; what is not mapped is unknown, not absent")
     table.add_row("graph", graph)
     table.add_row("preview", str(folder / "preview.png"))
     table.add_row("licence", f"{manifest.licence}, {manifest.attribution}")

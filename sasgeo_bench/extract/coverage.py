@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rasterio.features import shapes
 from scipy import ndimage
 
-Source = Literal["region file", "header box", "estimated"]
+Source = Literal["region file", "header box", "estimated", "estimated and islands"]
 
 CELL_M: Final = 100.0
 CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie closer together than this

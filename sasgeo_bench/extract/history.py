@@ -21,9 +21,11 @@ import shapely
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.extract.coverage import CLOSE_M
 from sasgeo_bench.extract.lifecycle import Lifecycle, read_lifecycle
-from sasgeo_bench.extract.read import Reading, project, read_extract
+from sasgeo_bench.extract.mapped import project
+from sasgeo_bench.extract.read import Reading, read_extract
 from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.extract.snapshot import OBJECTS, elements, is_history, open_snapshot, read_header
+from sasgeo_bench.features import SEA
 from sasgeo_bench.grid import Grid, utm_epsg
 
 MARGIN_M: Final = CLOSE_M / 2  # so far does an estimated coverage reach beyond the edge that an extract was cut along
@@ -195,7 +197,9 @@ def read_history(
             with open_snapshot(plain) as snapshot:
                 lifecycle = read_lifecycle(snapshot.path, epsg=epsg)
         area = shapely.intersection(area, _inner(reading, grid, margin_m=0.0 if is_one_file else margin_m))
-        states.append(State(source=item.path.name, on=item.on, features=reading.features, lifecycle=lifecycle))
+        # The sea is no object that somebody maps or builds; how its coastline changes is told by the coastline.
+        objects = reading.features[(reading.features["osm_type"] != SEA).to_numpy()]
+        states.append(State(source=item.path.name, on=item.on, features=objects, lifecycle=lifecycle))
         tell(_line(item, reading))
     if shapely.area(area) <= 0:
         message = (

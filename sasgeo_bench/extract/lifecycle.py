@@ -13,7 +13,7 @@ import osmium
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.extract.read import project
+from sasgeo_bench.extract.mapped import project
 from sasgeo_bench.extract.scan import Tally, line_wkb
 from sasgeo_bench.extract.snapshot import elements
 

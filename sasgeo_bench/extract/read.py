@@ -3,36 +3,36 @@
 
 import datetime as dt
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import geopandas as gpd
 import numpy as np
-import pyproj
+import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import CoverageError
 from sasgeo_bench.extract.coverage import Source, choose_coverage
+from sasgeo_bench.extract.mapped import Mapped, lonlat_box, map_ground, project
 from sasgeo_bench.extract.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
 from sasgeo_bench.extract.snapshot import open_snapshot
-from sasgeo_bench.features import make_features
+from sasgeo_bench.features import DTYPES, SEA, check_features, make_features
 from sasgeo_bench.grid import Grid
 from sasgeo_bench.taxonomy import Label, Taxonomy, load_taxonomy
 
-_WGS84: Final = 4326
-_EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projected
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium says 1970-01-01 where a file carries no timestamps
-_DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
     """What one extract says about one grid.
 
-    `coverage` lies in the grid's CRS and is cut to the grid; `drops`, `hidden` and `notes` count objects around the
-    grid by reason; `osm_timestamp` is the newest moment the extract speaks of, None where it carries no times.
+    `coverage` lies in the grid's CRS and is cut to the grid; `unknown_m2` is what was taken out of it, by reason (one
+    place may have two), and `cuts` counts what an extract cut out of a larger one lacks. `drops`, `hidden` and `notes`
+    count objects around the grid by reason; `osm_timestamp` is the newest moment the extract speaks of, None where it
+    carries no times.
     """
 
     features: gpd.GeoDataFrame
@@ -43,6 +43,8 @@ class Reading:
     hidden: dict[str, int]
     notes: dict[str, int]
     warnings: tuple[str, ...]
+    unknown_m2: dict[str, float] = field(default_factory=dict)
+    cuts: dict[str, int] = field(default_factory=dict)
 
 
 def read_extract(
@@ -97,64 +99,50 @@ def read_extract(
     beyond = shapely.from_wkb(np.array(scan.far, dtype=object))
     lonlat = shapely.get_coordinates(np.concatenate((geometry, beyond)))
     coverage, source = choose_coverage(lonlat, stated=stated_coverage, header_box=snapshot.box_lonlat)
-    _check_covered(path, grid_lonlat, coverage)
+    mapped = map_ground(
+        grid,
+        coverage,
+        source,
+        coast=shapely.from_wkb(np.array(scan.coast, dtype=object)),
+        gaps=np.array([mark for marks in scan.gaps.values() for mark in marks], dtype=object),
+        frame=shapely.box(*(snapshot.box_lonlat or shapely.total_bounds(shapely.multipoints(lonlat)))),
+    )
+    _check_covered(path, grid_lonlat, coverage, mapped)
     near = _meets(shapely.bounds(geometry), grid_lonlat)
     features = _table(scan, np.flatnonzero(near), geometry[near], grid, taxonomy)
+    features = _with_sea(features, mapped.sea, taxonomy)
     if len(features) == 0:
         message = (
             f"{path.name} holds no element of any class within {_written(grid_lonlat)}: move or enlarge the bounds"
         )
         raise CoverageError(message)
-    newest = max(row.timestamp for row in scan.rows)
+    newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
     return Reading(
         features=features,
-        coverage=shapely.intersection(project(coverage, grid.epsg), shapely.box(*grid.bounds_m)),
-        coverage_source=source,
+        coverage=mapped.coverage,
+        coverage_source=mapped.source,
         osm_timestamp=snapshot.replicated_at or (newest if newest > _EPOCH else None),
         drops=dict(scan.tally.drops.most_common()),
         hidden=dict(scan.tally.hidden.most_common()),
         notes=dict(scan.tally.notes.most_common()),
         warnings=snapshot.warnings,
+        unknown_m2=mapped.unknown_m2,
+        cuts=_cuts(scan),
     )
 
 
-def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
-    """Longitude and latitude -> easting and northing of a CRS, rounded to a millimetre; one geometry or an array.
-
-    Examples
-    --------
-    >>> project(shapely.Point(9.0, 0.0), 32632)
-    <POINT (500000 0)>
-    """
-    to_grid = pyproj.Transformer.from_crs(_WGS84, epsg, always_xy=True)
-
-    def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Coordinates of shape (N, 2), degrees -> metres."""
-        return np.column_stack(to_grid.transform(points[:, 0], points[:, 1])).round(_DECIMALS) + 0.0
-
-    return shapely.transform(geometry, projected)
+def _cuts(scan: Scan) -> dict[str, int]:
+    """Ways of a class in the whole extract that lack nodes; nothing where none does."""
+    partial = sum(bool(marks) for marks in scan.gaps.values())
+    found = {"ways that lack some nodes": partial, "ways that lack all nodes": len(scan.gaps) - partial}
+    return {what: count for what, count in found.items() if count}
 
 
-def lonlat_box(grid: Grid) -> Box:
-    """West, south, east, north of a grid, degrees: the box around its bent edges.
-
-    Examples
-    --------
-    >>> west, *_ = lonlat_box(Grid(epsg=32632, west_m=5e5, north_m=5.2e6, cell_size_m=1.0, rows=9, cols=9))
-    >>> round(west, 6)
-    9.0
-    """
-    to_lonlat = pyproj.Transformer.from_crs(grid.epsg, _WGS84, always_xy=True)
-    west, south, east, north = grid.bounds_m
-    bounds = to_lonlat.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS)
-    return (float(bounds[0]), float(bounds[1]), float(bounds[2]), float(bounds[3]))
-
-
-def _check_covered(path: Path, wanted: Box, coverage: shapely.Geometry) -> None:
+def _check_covered(path: Path, wanted: Box, coverage: shapely.Geometry, mapped: Mapped) -> None:
     if coverage.is_empty:
         message = f"{path.name} holds no element of any class: is it an extract of map data?"
         raise CoverageError(message)
-    if not shapely.intersects(coverage, shapely.box(*wanted)):
+    if mapped.coverage.is_empty and not mapped.unknown_m2:
         covered = _written(shapely.bounds(coverage))
         message = (
             f"bounds {_written(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
@@ -204,6 +192,24 @@ def _table(
     return make_features(columns, epsg=grid.epsg)
 
 
+def _with_sea(features: gpd.GeoDataFrame, sea: NDArray[np.object_], taxonomy: Taxonomy) -> gpd.GeoDataFrame:
+    """The table with a row of class water for each polygon of sea, numbered from the largest; they have no date."""
+    if len(sea) == 0:
+        return features
+    columns: dict[str, object] = {name: np.zeros(len(sea)) for name in DTYPES} | {
+        "osm_type": [SEA] * len(sea),
+        "osm_id": np.arange(len(sea)) + 1,
+        "timestamp": np.full(len(sea), "NaT", dtype="datetime64[ms]"),
+        "class": ["water"] * len(sea),
+        "is_visible": True,
+        "width_m": np.nan,
+        "geometry": sea[np.argsort(-shapely.area(sea), kind="stable")],
+    }
+    table = pd.concat([features, make_features(columns, epsg=features.crs.to_epsg())])
+    order = np.argsort([taxonomy.names.index(name) for name in table["class"]], kind="stable")
+    return check_features(table.iloc[order].reset_index(drop=True))
+
+
 def _times(rows: Sequence[ScanRow]) -> NDArray[np.datetime64]:
     """Timestamps as UTC milliseconds; NaT where the file carries none."""
     known = [row.timestamp.replace(tzinfo=None) if row.timestamp > _EPOCH else None for row in rows]
@@ -212,11 +218,9 @@ def _times(rows: Sequence[ScanRow]) -> NDArray[np.datetime64]:
 
 def _width_m(label: Label, traits: Traits) -> float:
     """Drawn width of a line: a tagged width, else that of the class, else that of the road or railway it lies on."""
-    if label.is_outline:
-        return float(label.width_m or np.nan)
-    if traits.is_area:
+    if traits.is_area and not label.is_outline:
         return float("nan")
-    if traits.width_m is not None and label.class_name not in ("field_boundary", "coastline"):
+    if traits.width_m is not None and label.keeps_width:
         return traits.width_m
     if label.width_m is not None:
         return label.width_m

@@ -7,7 +7,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 import osmium
 import shapely
 
+from sasgeo_bench.extract.cuts import find_gaps
 from sasgeo_bench.extract.snapshot import elements
 from sasgeo_bench.taxonomy import Classification, Label, Taxonomy, classify
 
@@ -24,12 +25,14 @@ DEFAULT_BRIDGE_WIDTH_M: Final = 4.0
 WIDTH_RANGE_M: Final = (0.3, 80.0)
 MIN_RING_POINTS: Final = 3
 _NO: Final = (None, "no", "false", "0")
-_AREA_MODIFIERS: Final = ("tunnel", "layer", "location", "parking")
+_AREA_MODIFIERS: Final = ("tunnel", "layer", "location", "parking", "width")
 _LINE_MODIFIERS: Final = ("tunnel", "layer", "location", "width", "lanes")
 
 # Where the first point lies in the WKB of a line and of a multipolygon's first ring, and readers of N points.
 _FIRST_POINT: Final = {2: 9, 6: 22}
 _POINT_BYTES: Final = 16
+_SEVERAL_LINES: Final = 5  # the type in the WKB of a way that lacks nodes
+_COAST: Final = ("natural", "coastline")
 _POINTS: Final = tuple(struct.Struct(f"<{2 * count}d") for count in range(40))
 
 Get = Callable[[str], str | None]
@@ -77,10 +80,13 @@ class Scan:
     """What one pass found: a row for each object, the distinct traits they share, and what was not used.
 
     `far` holds the geometry of what lies beyond the box asked for, or has no class: it still tells what is mapped.
+    `coast` holds every coastline of the file, `gaps` where a way of a class lacks nodes, by its id.
     """
 
     rows: list[ScanRow] = field(default_factory=list)
     far: list[bytes] = field(default_factory=list)
+    coast: list[bytes] = field(default_factory=list)
+    gaps: dict[int, list[shapely.Geometry]] = field(default_factory=dict)
     traits: list[Traits] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
 
@@ -113,15 +119,20 @@ class Classifier:
         return known.setdefault(values, classify(tags, self._taxonomy))
 
     def area_labels(self, get: Get, *, is_relation: bool) -> tuple[Label, ...]:
-        """Labels of an object that is an area: of area rules; of line rules only where the object says it is filled."""
+        """Labels of an object that is an area: of area rules; of line rules filled where it says so, else outlines."""
         labels = self.as_area(get).area
-        if not labels:
-            return self.as_line(get).line if is_relation or get("area") == "yes" else ()
-        if is_relation or not any(label.is_outline for label in labels):
+        if not labels and get("area") == "yes":
+            return self.as_line(get).line
+        if not is_relation and not any(label.is_outline for label in labels):
             return labels
+        line = self.as_line(get).line
         # A fenced field: the fence is the boundary, its outline is not drawn a second time.
-        drawn = {label.class_name for label in self.as_line(get).line}
-        return tuple(label for label in labels if not (label.is_outline and label.class_name in drawn))
+        drawn = {label.class_name for label in line if not (is_relation and label.is_filled)}
+        kept = tuple(label for label in labels if not (label.is_outline and label.class_name in drawn))
+        if not is_relation:
+            return kept  # a closed way is read as a line too; of a relation there is no other line
+        along = (replace(label, is_outline=not label.is_filled) for label in line)
+        return (*kept, *(label for label in along if label.is_outline or not labels))
 
     def kind(self, get: Get, labels: tuple[Label, ...], *, is_area: bool) -> int:
         """Index of the object's traits in `Scan.traits`; counts what is hidden from above."""
@@ -149,7 +160,7 @@ def _traits(tags: dict[str, str], labels: tuple[Label, ...], *, is_area: bool) -
         is_bridge=any(label.class_name == "bridge" for label in labels),
         is_tunnel=is_tunnel,
         hidden_by=_hidden_by(tags, level=level, is_tunnel=is_tunnel),
-        width_m=None if is_area else tagged_width_m(tags.get("width"), tags.get("lanes")),
+        width_m=tagged_width_m(tags.get("width"), tags.get("lanes")),
     )
 
 
@@ -323,13 +334,16 @@ def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally
 
 def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int], box: Box) -> None:  # noqa: ANN401
     """Take a way as a line where a line rule holds; remember it where an area of it must follow."""
-    wkb = line_wkb(way, scan.tally)
+    get, wkb = way.tags.get, line_wkb(way, scan.tally)
+    if (wkb is None or wkb[1] == _SEVERAL_LINES) and classifier.as_line(get).line:
+        scan.gaps[way.id] = find_gaps(way)
     if wkb is None:
         return
+    if get(_COAST[0]) == _COAST[1]:
+        scan.coast.append(wkb)
     if not reaches(wkb, box):
         scan.far.append(wkb)
         return
-    get = way.tags.get
     found = classifier.as_line(get)
     if way.is_closed():
         area_tag = get("area")
@@ -428,11 +442,13 @@ def _scan_lost(
     ways = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.EntityFilter(osmium.osm.WAY))
     for way in elements(ways.with_filter(osmium.filter.IdFilter(closed | members))):
         wkb = line_wkb(way, scan.tally)
+        get = way.tags.get
+        labels = classifier.area_labels(get, is_relation=False)
+        if (wkb is None or wkb[1] == _SEVERAL_LINES) and (labels or way.id in members):
+            scan.gaps[way.id] = find_gaps(way)
         if wkb is None:
             continue
         lines[way.id] = shapely.from_wkb(wkb)
-        get = way.tags.get
-        labels = classifier.area_labels(get, is_relation=False)
         if way.id in closed and get("area") == "no":
             scan.tally.drops["area=no on an area class"] += 1
         elif way.id in closed and labels:

@@ -58,7 +58,7 @@ TRUTH_TEXTS: Final = {
     "measured": "what was measured to have been done, name and value",
 }
 FEATURE_TEXTS: Final = {
-    "osm_type": "node, way or relation",
+    "osm_type": "node, way or relation; coastline for sea, which is no object but lies right of the coastlines",
     "osm_id": "id of the object in OpenStreetMap",
     "version": "version of the object",
     "timestamp": "when that version was made",

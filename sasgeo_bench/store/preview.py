@@ -6,10 +6,12 @@ from textwrap import wrap
 from typing import Final
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from numpy.typing import NDArray
 
@@ -30,7 +32,10 @@ _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6
 _LEAST_INCHES: Final = 4.6
 _TITLE_INCHES: Final = 0.85
-_FOOT_INCHES: Final = 0.45
+_FOOT_INCHES: Final = 0.95
+_STRIP_INCHES: Final = 0.5  # under the map, for scale and north
+_ARROW_INCHES: Final = 0.3
+_EDGE: Final = "#d81b60"
 
 
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
@@ -57,13 +62,39 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     chart.set_xticks([])
     chart.set_yticks([])
     chart.set_anchor("NW")
-    scale_bar(chart, *side_m)
-    north_arrow(chart, *side_m)
+    _draw_edge(chart, manifest)
+    m_per_inch = max(side_m[0] / width, side_m[1] / height)
+    _draw_strip(figure, total, width_m=side_m[0], m_per_inch=m_per_inch)
     _words(figure, manifest, total)
     _legend(figure, manifest, overview, left=(width + 0.45) / total[0], top=1 - _TITLE_INCHES / total[1])
     figure.savefig(
         path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
     )
+
+
+def _draw_edge(chart: Axes, manifest: Manifest) -> None:
+    """The outline of what is mapped, within the grid."""
+    west, south, east, north = manifest.bounds_m
+    frame = shapely.boundary(shapely.box(west, south, east, north))
+    edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))
+    for line in shapely.get_parts(edge):
+        at = shapely.get_coordinates(line) - (west, south)
+        chart.plot(*at.T, color=_EDGE, lw=1.0)
+    chart.set(xlim=(0, east - west), ylim=(0, north - south))
+
+
+def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:
+    """Scale and north under the map, in its scale, so that they hide nothing of it."""
+    width = width_m / m_per_inch
+    strip = figure.add_axes(
+        (0.3 / total[0], (_FOOT_INCHES - _STRIP_INCHES) / total[1], width / total[0], _STRIP_INCHES / total[1])
+    )
+    strip.axis("off")
+    strip.set_zorder(-1)  # its white ground must not hide the frame of the map
+    height_m = _STRIP_INCHES * m_per_inch
+    strip.set(xlim=(0, width_m), ylim=(0, height_m))
+    scale_bar(strip, width_m, height_m)
+    north_arrow(strip, width_m, height_m, size_m=_ARROW_INCHES * m_per_inch)
 
 
 def _cell_m(manifest: Manifest, overview: NDArray[np.uint8]) -> float:
@@ -109,9 +140,9 @@ def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
     chart.text(left + length_m / 2, bottom + thick + 0.4 * pad, text, ha="center", va="bottom", fontsize=9)
 
 
-def north_arrow(chart: Axes, width_m: float, height_m: float) -> None:
+def north_arrow(chart: Axes, width_m: float, height_m: float, *, size_m: float | None = None) -> None:
     """An arrow with an N in the upper right corner of a chart in metres."""
-    size = 0.05 * max(width_m, height_m)
+    size = size_m or 0.05 * max(width_m, height_m)
     x, y = width_m - 0.9 * size, height_m - 1.5 * size
     chart.add_patch(
         Rectangle((x - 0.55 * size, y - 0.25 * size), 1.1 * size, 1.6 * size, color="white", alpha=0.85, lw=0)
@@ -133,7 +164,8 @@ def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> No
     figure.text(0.3 / total[0], 1 - 0.16 / total[1], title[0], ha="left", va="top", fontsize=14, fontweight="bold")
     facts = (
         f"map of {manifest.extract.date}  |  {', '.join(manifest.scenes)}  |  "
-        f"cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}"
+        f"cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}  |  "
+        f"mapped: {manifest.coverage.share:.1%} ({manifest.coverage.source})"
     )
     figure.text(0.3 / total[0], 1 - 0.52 / total[1], facts, ha="left", va="top", fontsize=9, color="#444444")
     figure.text(0.3 / total[0], 0.14 / total[1], manifest.attribution, ha="left", va="bottom", fontsize=9)
@@ -142,7 +174,7 @@ def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> No
 def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, left: float, top: float) -> None:
     """Classes that are there, with their number of objects, and what the hatching means."""
     titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
-    entries = [
+    entries: list[Patch | Line2D] = [
         Patch(
             facecolor=titles[name][1],
             edgecolor="#666666",
@@ -157,6 +189,7 @@ def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, 
             facecolor=_UNMAPPED[0], edgecolor=_UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)"
         )
         entries.append(hatched)
+        entries.append(Line2D([], [], color=_EDGE, lw=1.0, label=f"edge of the map ({manifest.coverage.source})"))
     if not entries:
         figure.text(left, top, "no element of any class", fontsize=9, va="top")
         return

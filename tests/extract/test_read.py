@@ -17,7 +17,8 @@ import shapely
 from osmium.osm.mutable import Node, Way
 
 from sasgeo_bench.errors import CoverageError, ExtractError
-from sasgeo_bench.extract.read import project, read_extract
+from sasgeo_bench.extract.mapped import project
+from sasgeo_bench.extract.read import read_extract
 from sasgeo_bench.extract.scan import reaches
 from sasgeo_bench.extract.snapshot import open_snapshot
 from sasgeo_bench.features import fingerprint

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.texts import plain
 
 Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
 STATUSES: Final[tuple[Status, ...]] = get_args(Status)
@@ -53,7 +54,7 @@ def one_line(text: str) -> str:
     >>> one_line(chr(10).join(("first", "  second")))
     'first second'
     """
-    line = "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+    line = plain(" ".join(text.split()))
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 

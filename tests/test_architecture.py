@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # nothing imports it.
 HOUSE: dict[str, tuple[str, ...] | None] = {
     "errors": None,
+    "texts": None,
     "processes": None,
     "tomlfile": None,
     "angles": None,
@@ -72,6 +73,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
         *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
         *(
+            "canvas",
             "preview",
             "picture",
             "sheet",

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boards import Board
-from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, tell
+from sasgeo_bench.cli.console import Bars, ExtractFolders, Out, RegionFolders, print_table, say, tell
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.packing import board_of, request_of, score_all
@@ -112,7 +112,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     )
     board = score_all(request, tell=tell, has_cases=cases, results=results)
     show_board(board)
-    typer.echo(str(request.board))
+    say(request.board)
     tell(_how_to_publish(request.board))
     _check_controls(board)
 
@@ -156,7 +156,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         dask=dask,
     )
     if dry_run:
-        typer.echo(plan.to_text())
+        say(plan.to_text())
         return
     if sys.stderr.isatty():
         with Bars() as bars:
@@ -164,7 +164,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     else:
         board = run_pipeline(plan, tell=tell, results=results, has_cases=cases)
     show_board(board)
-    typer.echo(str(board_folder(plan)))
+    say(board_folder(plan))
     tell(_how_to_publish(board_folder(plan)))
     if not matcher:
         tell(f"next: sasgeo-bench leaderboard {pipeline} --matcher NAME adds one of yours (new-matcher begins one)")
@@ -187,7 +187,7 @@ def show_board(board: Board) -> None:
     if board.findings:
         tables.append(("Registered contrasts", finding_table(board.findings)))
     for title, short in tables:
-        typer.echo(title)
+        say(title)
         shown = Table(*map(str, short.columns), box=None, pad_edge=False)
         for row in short.itertuples(index=False):
             shown.add_row(*map(str, row))

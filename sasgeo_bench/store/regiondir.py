@@ -21,6 +21,7 @@ from sasgeo_bench.features import check_features
 from sasgeo_bench.graph import MapGraph
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, FileRecord, Manifest, Region
 from sasgeo_bench.store.layerfile import read_layers
+from sasgeo_bench.texts import json_text
 
 Table = TypeVar("Table", bound=pd.DataFrame)
 
@@ -69,7 +70,7 @@ def _attributed(table: Table) -> Table:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write `region.json`, the last file of a region: without it the folder is no region."""
-    text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
+    text = json_text(manifest.model_dump(mode="json"))
     (folder / MANIFEST).write_text(text, encoding="utf-8")
 
 

@@ -25,6 +25,7 @@ from sasgeo_bench.store.runrows import (
     with_candidates,
 )
 from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, asked_under, poses_of
+from sasgeo_bench.texts import json_text
 
 RUN: Final = "run.json"
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
@@ -452,7 +453,7 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
     scratch = folder / f".{RUN}.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        scratch.write_text(json.dumps(dict(about), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        scratch.write_text(json_text(dict(about)), encoding="utf-8")
         scratch.rename(folder / RUN)
     except OSError as error:
         _remove(scratch)

@@ -34,6 +34,7 @@ from sasgeo_bench.store.taskrows import (
     truth_of,
     truth_row,
 )
+from sasgeo_bench.texts import json_text
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
@@ -108,7 +109,7 @@ def write_task(
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json_text(content), encoding="utf-8")
 
 
 def _candidate_bytes(query: Query) -> bytes:

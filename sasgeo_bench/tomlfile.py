@@ -4,13 +4,36 @@
 import difflib
 import json
 import tomllib
-from typing import Any, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sasgeo_bench.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+_SHORT: Final = 60  # characters
+_LONGEST: Final = 300
+
+
+def _printable(text: str) -> str:
+    """Refuse what could not be shown as one line of text: breaks, controls, marks that turn the writing round."""
+    if not text.isprintable():
+        message = "must be one line of printable characters"
+        raise ValueError(message)
+    return text
+
+
+def _said(text: str) -> str:
+    if not text.strip():
+        message = "must be one line of printable characters"
+        raise ValueError(message)
+    return text
+
+
+Prose = Annotated[str, Field(max_length=2000), AfterValidator(_printable)]  # which may be empty
+Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable), AfterValidator(_said)]
+Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_printable), AfterValidator(_said)]
 
 
 class Document(BaseModel):
@@ -101,8 +124,11 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         return f"{where!r} is missing"
     if item["type"] == "list_type" and not isinstance(item["input"], dict):
         return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
-    text = item["msg"].removeprefix("Value error, ")
-    return f"{where!r}: {text}, got {item['input']!r}" if where and "got " not in text else text
+    text = str(item["msg"]).removeprefix("Value error, ")
+    if not where or "got " in text:
+        return text
+    found = repr(item["input"])
+    return f"{where!r}: {text}, got {found if len(found) <= _LONGEST else f'{found[:_LONGEST]}...'}"
 
 
 def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:

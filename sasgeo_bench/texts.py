@@ -34,6 +34,7 @@ _TEX: Final = {
 }
 _LIGATURE: Final = re.compile(r"(?<=[-`'?!,])(?=[-`',])")
 _LAST_LATIN: Final = 0x17F  # of Latin Extended-A
+_NO_GLYPH: Final = frozenset("«»ÐÞðþĄąĐđĘęĦħĮįĸĿŀŉŊŋŦŧŲųſ")  # before it, which pdfTeX stops at as well
 
 
 def plain(text: str) -> str:
@@ -111,7 +112,8 @@ def tex(text: object) -> str:
 
 
 def _tex_letter(letter: str) -> str:
-    return _TEX.get(letter) or (letter if ord(letter) <= _LAST_LATIN else f"[U+{ord(letter):04X}]")
+    is_known = ord(letter) <= _LAST_LATIN and letter not in _NO_GLYPH
+    return _TEX.get(letter) or (letter if is_known else f"[U+{ord(letter):04X}]")
 
 
 def csv_cell(value: object) -> object:

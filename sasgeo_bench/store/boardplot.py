@@ -188,11 +188,8 @@ def _classed(svg: str) -> str:
     counts = Counter(style for tag in _TAGS.findall(svg) for style in _STYLE_OF.findall(tag))
     names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
     rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
-
-    def named(found: re.Match[str]) -> str:
-        return f' class="{names[found[1]]}"' if found[1] in names else found[0]
-
-    short = _TAGS.sub(lambda tag: _STYLE_OF.sub(named, tag[0]), svg)
+    classes = {f' style="{style}"': f' class="{name}"' for style, name in names.items()}
+    short = _TAGS.sub(lambda tag: _STYLE_OF.sub(lambda one: classes.get(one[0], one[0]), tag[0]), svg)
     return short.replace("</style>", f"{rules}</style>", 1)
 
 

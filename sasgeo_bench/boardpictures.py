@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pictures of a board: regions as thumbnails, an example of each suite, and queries that went wrong."""
 
-import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,6 +29,7 @@ from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.layerfile import read_overview
 from sasgeo_bench.store.picture import WEBP, fitted, pixels_of, thumbnail
 from sasgeo_bench.store.sheet import sheet_figure
+from sasgeo_bench.texts import json_text
 
 REGION_BYTES: Final = 15_000
 SUITE_BYTES: Final = 38_000
@@ -112,8 +112,7 @@ def pictures_extra(
 
 def _with_list(files: Mapping[str, bytes], said: Mapping[str, Any]) -> dict[str, bytes]:
     content = {**said, "licence": LICENCE, "attribution": ATTRIBUTION}
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return {**files, PICTURES_SAID: text.encode()}
+    return {**files, PICTURES_SAID: json_text(content).encode()}
 
 
 def _kept(folder: Path, tell: Tell, *, has_cases: bool) -> Extra:

@@ -31,6 +31,7 @@ _MOST_CELLS: Final = 560  # of a piece of a map, along a side: more are no more 
 _ROOM: Final = 1.25  # around both places
 _LEAST_SIDES: Final = 2.4  # of a view, a piece of a map is at least
 _MOST_LINES: Final = 17
+_MOST_LETTERS: Final = 40  # of a name there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,9 +232,14 @@ def _lines(case: Case) -> list[str]:
     lines += ["", "what the integrity model saw"] if told or said_by else ["", "the answer told nothing of itself"]
     known = [(item.name, item.unit) for item in EVIDENCE if item.name in told]
     known += [(name, "") for name in sorted(told) if name not in {name for name, _ in known}]
-    lines += [f"{name}: {told[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known]
+    lines += [f"{_short(name)}: {told[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known]
     rest = len(lines) - _MOST_LINES
     return lines if rest <= 0 else [*lines[: _MOST_LINES - 1], f"and {rest + 1} more"]
+
+
+def _short(name: str) -> str:
+    """A name that does not reach into the map beside it."""
+    return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 3]}..."
 
 
 def _alias(case: Case) -> str:

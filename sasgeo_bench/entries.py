@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
-from sasgeo_bench.matcher import check_name
+from sasgeo_bench.matcher import check_identity
 from sasgeo_bench.metrics.cost import run_cost
 from sasgeo_bench.query import base_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, RUN_HERE, is_unranked
@@ -228,7 +228,7 @@ def _read_run(path: Path) -> dict[str, Any]:
         said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
     fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
     try:
-        check_name(str(said["matcher.name"]))
+        check_identity(str(said["matcher.name"]), str(said["matcher.version"]))
         run_cost(about)
         LearnedSaid.of(about)
     except (MatchError, MetricError) as error:

@@ -3,6 +3,8 @@
 
 from collections.abc import Sequence
 
+from sasgeo_bench.texts import plain
+
 
 def counted(count: int, one: str, many: str = "") -> str:
     """How many of something, as a line says it; the plural is `one` with an s unless it is given.
@@ -27,17 +29,6 @@ def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
     return f"{counted(len(names), one)} ({', '.join(names[:most])}{more})"
 
 
-def printable(text: str) -> str:
-    """Text on one line, with a question mark for each character that cannot be printed.
-
-    Examples
-    --------
-    >>> printable(f"first{chr(10)}  second{chr(7)}")
-    'first second?'
-    """
-    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
-
-
 class SasgeoError(Exception):
     """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
 
@@ -53,7 +44,7 @@ class SasgeoError(Exception):
 
     def __str__(self) -> str:
         """The text on one line."""
-        return printable(super().__str__())
+        return plain(" ".join(super().__str__().split()))
 
 
 class GridError(SasgeoError, ValueError):

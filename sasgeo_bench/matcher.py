@@ -2,6 +2,7 @@
 """The door: what a matcher is, what it says of itself, and what it answers."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -12,10 +13,12 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.query import Head, Query, Track, Truth
 from sasgeo_bench.region import Region
+from sasgeo_bench.texts import NAME, VERSION
 
 Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_SAID: Final = 4000  # characters of a field of a card
+MOST_SHOWN: Final = 80  # of a wrong one
 MOST_LEARNED_BYTES: Final = 2**20  # of what a matcher has learnt, as UTF-8
 SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
 
@@ -29,7 +32,7 @@ class MatcherCard:
     name : str
         Lower-case letters, digits, hyphens and underscores.
     version : str
-        Raised whenever answers change.
+        Letters, digits, dots, hyphens, underscores and plus signs; raised whenever answers change.
     title : str
         One line for people.
     source : str
@@ -50,7 +53,7 @@ class MatcherCard:
     Raises
     ------
     MatchError
-        If a field is empty or says what is not known.
+        If a field is empty, too long or not printable, or says what is not known.
 
     Examples
     --------
@@ -73,7 +76,7 @@ class MatcherCard:
     def __post_init__(self) -> None:
         """Refuse a card that does not say what a reader of the board needs."""
         check_said(self)
-        check_name(self.name)
+        check_identity(self.name, self.version)
         for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
             wrong = next((item for item in getattr(self, name) if item not in known), None)
             if wrong is not None:
@@ -82,6 +85,8 @@ class MatcherCard:
         if not self.tracks:
             message = "card: tracks is empty, name retrieval, localization or both"
             raise MatchError(message)
+        for place in self.trained_on:
+            _check_line("trained_on", place)
 
 
 def check_said(card: object) -> None:
@@ -91,16 +96,42 @@ def check_said(card: object) -> None:
         if not isinstance(value, str) or not value.strip():
             message = f"card: {name} is empty, say it in one line"
             raise MatchError(message)
-        if not value.isprintable() or len(value) > MOST_SAID:
-            message = f"card: {name} must be one line of at most {MOST_SAID} printable characters"
-            raise MatchError(message)
+        _check_line(name, value)
+    _check_line("limits", getattr(card, "limits"))  # noqa: B009 - of either kind of card
 
 
-def check_name(name: str) -> None:
-    """Refuse a name that could not be a folder's or a flag's."""
-    if not all(letter.isascii() and (letter.islower() or letter.isdigit() or letter in "-_") for letter in name):
-        message = f"card: name {name!r} may hold lower-case letters, digits, hyphens and underscores only"
+def _check_line(name: str, value: object) -> None:
+    if not isinstance(value, str) or not value.isprintable() or len(value) > MOST_SAID:
+        message = f"card: {name} must be one line of at most {MOST_SAID} printable characters"
         raise MatchError(message)
+
+
+def check_identity(name: str, version: str) -> None:
+    """Refuse a name or a version that could not be part of a folder's name, a flag or a cell of any table.
+
+    Raises
+    ------
+    MatchError
+        Saying what it may hold.
+
+    Examples
+    --------
+    >>> check_identity("mine", "1.0.0rc1+cpu")
+    >>> check_identity("mine", "=1+1")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: card: version '=1+1' may hold letters, digits, dots, hyphens, underscores and plus
+    signs only, a letter or digit first, 60 at most
+    """
+    for what, value, pattern, letters in (
+        ("name", name, NAME, "lower-case letters, digits, hyphens and underscores"),
+        ("version", version, VERSION, "letters, digits, dots, hyphens, underscores and plus signs"),
+    ):
+        if not re.fullmatch(pattern, value):
+            message = (
+                f"card: {what} {value[:MOST_SHOWN]!r} may hold {letters} only, a letter or digit first, 60 at most"
+            )
+            raise MatchError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

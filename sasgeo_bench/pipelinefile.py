@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from sasgeo_bench.query import CONTROLS, PriorGroup, Track
-from sasgeo_bench.tomlfile import Document
+from sasgeo_bench.tomlfile import Document, Line, Prose, Short
 
 PAPER_SUITE: Final = "paper-poc"
 CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
@@ -23,11 +23,11 @@ class ContrastSpec(Document):
     first: str
     second: str
     suites: Annotated[list[str], Field(min_length=1)]
-    kinds: list[str] = []
+    kinds: list[Short] = []
     metric: Literal["primary", "aurc"] = "primary"
     track: Literal["localization", "retrieval"] = "localization"
     min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
-    why: str = ""
+    why: Prose = ""
 
 
 class TaskSpec(Document):
@@ -43,7 +43,7 @@ class TaskSpec(Document):
     prior: str | None = None
     matchers: list[str] = []
     views_cells: list[Annotated[int, Field(gt=0)]] = []
-    kinds: list[str] = []
+    kinds: list[Short] = []
     tracks: list[Track] = []
 
 
@@ -87,7 +87,7 @@ class PipelineFile(Document):
     """
 
     id: Name
-    title: str
+    title: Line
     split: str | None = None
     regions: list[str] = []
     seed: int = 0

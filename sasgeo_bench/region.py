@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field
 from sasgeo_bench.extract.coverage import Source
 from sasgeo_bench.graph import MapGraph
 from sasgeo_bench.grid import Grid
+from sasgeo_bench.texts import FOLDER
 from sasgeo_bench.tomlfile import Document
 
 SCHEMA_VERSION: Final = 1  # of region.json and the tables beside it
@@ -78,7 +79,7 @@ class Manifest(_Record):
     schema_version: int
     data_version: int
     package_version: str
-    id: str
+    id: Annotated[str, Field(pattern=FOLDER)]
     title: str
     scenes: tuple[str, ...]
     epsg: int

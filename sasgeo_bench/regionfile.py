@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 from sasgeo_bench.errors import ConfigError, GridError
 from sasgeo_bench.extract.locate import Extract
 from sasgeo_bench.grid import Grid, utm_epsg
-from sasgeo_bench.tomlfile import Document
+from sasgeo_bench.tomlfile import Document, Line
 
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_AREA_KM2: Final = 100_000.0
@@ -46,7 +46,7 @@ class RegionFile(Document):
     """
 
     id: Identifier
-    title: Annotated[str, StringConstraints(min_length=1)]
+    title: Line
     scenes: Annotated[list[Scene], Field(min_length=1)]
     center_lonlat: tuple[float, float] | None = Field(default=None, strict=False)
     size_m: tuple[float, float] | None = Field(default=None, strict=False)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matcher import check_name, check_said
+from sasgeo_bench.matcher import check_identity, check_said
 from sasgeo_bench.results import Prediction, one_line
 
 
@@ -47,7 +47,7 @@ class RejectorCard:
     def __post_init__(self) -> None:
         """Refuse a card that does not say what a reader of the board needs."""
         check_said(self)
-        check_name(self.name)
+        check_identity(self.name, self.version)
 
 
 @runtime_checkable

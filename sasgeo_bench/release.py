@@ -2,6 +2,7 @@
 """Regions and tasks -> a dataset release that others load: what is refused, and the order of the steps."""
 
 import datetime as dt
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -39,6 +40,7 @@ from sasgeo_bench.store.releasedir import (
 from sasgeo_bench.store.stacfile import write_stac
 from sasgeo_bench.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.tasks import built_anew, is_of_region
+from sasgeo_bench.texts import FOLDER
 
 HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
 _EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": "rio-cogeo"}
@@ -213,6 +215,10 @@ def _no_queries(suite: str, regions: Sequence[str], out: Path) -> StoreError:
 
 def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
     about, parts = taskdir.read_task(folder), count_parts(folder)
+    odd = next((name for name in (folder.name, *parts) if not re.fullmatch(FOLDER, name)), None)
+    if odd is not None:
+        message = f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
+        raise StoreError(message)
     told = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
     truth = request.out / "truth" / str(about["suite"]) / str(about["region"])
     return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, told=told)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
 from sasgeo_bench.bounds import MOST_MESSAGE
-from sasgeo_bench.errors import printable
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.texts import plain
 
 Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
 STATUSES: Final[tuple[Status, ...]] = get_args(Status)
@@ -58,7 +58,7 @@ def one_line(text: str) -> str:
     >>> one_line(chr(10).join(("first", "  second")))
     'first second'
     """
-    line = printable(text)
+    line = plain(" ".join(text.split()))
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 

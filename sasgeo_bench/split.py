@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.grid import Grid
-from sasgeo_bench.tomlfile import Document
+from sasgeo_bench.tomlfile import Document, Line
 
 Part = Literal["train", "calibration", "test"]
 PARTS: Final[tuple[Part, ...]] = ("train", "calibration", "test")
@@ -60,7 +60,7 @@ class SplitFile(Document):
     """
 
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
-    title: str
+    title: Line
     kind: Literal["holdout", "crossfit"]
     buffer_m: Annotated[float, Field(ge=0, le=1e6)]
     block_m: Annotated[float, Field(ge=100, le=20_000)] = 1000.0

@@ -4,27 +4,19 @@
 from collections.abc import Mapping
 from typing import Annotated, Final
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import BeforeValidator, Field
 
 from sasgeo_bench.matcher import Need
 from sasgeo_bench.split import HALVES, Half
-from sasgeo_bench.tomlfile import Document
+from sasgeo_bench.texts import FOLDER, NAME, VERSION
+from sasgeo_bench.tomlfile import Document, Line, Short
 
 SCHEMA_VERSION: Final = 1
 NONE: Final = "none"  # what `trained_on` says of a method that has learnt nothing from any place of the split
 MOST_PLACES: Final = 1000
-_LONGEST: Final = 300  # characters of a line
-_SHORT: Final = 60
+_SHORT: Final = 60  # characters
 
 _HALVES_SAID: Final = '{ a = ["munich"], b = ["porto"] }'
-
-
-def _one_line(text: str) -> str:
-    """Refuse what could not be shown as one line of text: breaks, controls, marks that turn the writing round."""
-    if not text.strip() or not text.isprintable():
-        message = f"must be one line of printable characters, got {text[:_SHORT]!r}"
-        raise ValueError(message)
-    return text
 
 
 def _trained(said: object) -> object:
@@ -43,13 +35,12 @@ def _trained(said: object) -> object:
     return said
 
 
-Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}$")]
+Name = Annotated[str, Field(pattern=NAME)]
+Version = Annotated[str, Field(pattern=VERSION)]
 Identifier = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a board or a split
-Folder = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9+@._-]{0,199}$")]
+Folder = Annotated[str, Field(pattern=FOLDER)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, Field(ge=0)]
-Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_one_line)]
-Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_one_line)]
 Address = Annotated[str, Field(pattern=r"^https://[A-Za-z0-9][A-Za-z0-9.:/_~%?=&#@+-]{0,250}$")]
 TrainedOn = Annotated[str | list[str] | dict[str, list[str]], BeforeValidator(_trained)]
 
@@ -60,7 +51,8 @@ class Card(Document):
     Parameters
     ----------
     name, version : str
-        Of the row: lower-case letters, digits, hyphens and underscores; the version is raised whenever answers change.
+        Of the row: lower-case letters, digits, hyphens and underscores; of the version, raised whenever answers change,
+        capitals, dots and plus signs too.
     title, source, ours, licence : str
         One line for people; paper, page or "original"; what of it is the author's own; SPDX name of the code's licence.
     trained_on : "none", list of str, or a list for each half
@@ -82,7 +74,7 @@ class Card(Document):
     """
 
     name: Name
-    version: Short
+    version: Version
     title: Line
     source: Line
     ours: Line

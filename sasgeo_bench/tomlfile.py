@@ -4,14 +4,36 @@
 import difflib
 import json
 import tomllib
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sasgeo_bench.errors import ConfigError
 
-_MOST_QUOTED: Final = 200  # characters
 Model = TypeVar("Model", bound=BaseModel)
+
+_SHORT: Final = 60  # characters
+_LONGEST: Final = 300
+
+
+def _printable(text: str) -> str:
+    """Refuse what could not be shown as one line of text: breaks, controls, marks that turn the writing round."""
+    if not text.isprintable():
+        message = "must be one line of printable characters"
+        raise ValueError(message)
+    return text
+
+
+def _said(text: str) -> str:
+    if not text.strip():
+        message = "must be one line of printable characters"
+        raise ValueError(message)
+    return text
+
+
+Prose = Annotated[str, Field(max_length=2000), AfterValidator(_printable)]  # which may be empty
+Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable), AfterValidator(_said)]
+Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_printable), AfterValidator(_said)]
 
 
 class Document(BaseModel):
@@ -102,14 +124,14 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         return f"{where!r} is missing"
     if item["type"] == "list_type" and not isinstance(item["input"], dict):
         return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
-    text = item["msg"].removeprefix("Value error, ")
+    text = str(item["msg"]).removeprefix("Value error, ")
     return f"{where!r}: {text}, got {_short(item['input'])}" if where and "got " not in text else text
 
 
 def _short(value: object) -> str:
     """A value as it is quoted: a table or text may be as long as the file."""
     text = repr(value)
-    return text if len(text) <= _MOST_QUOTED else f"{text[: _MOST_QUOTED - 3]}..."
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # Rooms may be listed before they are built. The package's __init__ stands last: it gathers the public names, and
 # nothing imports it.
 HOUSE: dict[str, tuple[str, ...] | None] = {
+    "texts": None,
     "errors": None,
     "processes": None,
     "progress": None,
@@ -79,6 +80,7 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
         *("rundir", "submissiondir", "fileset", "packabout", "boardfile", "packrows", "packdir", "packfile"),
         *("svgfile", "sitedir", "pluginfiles", "seedfile"),
         *(
+            "canvas",
             "preview",
             "picture",
             "sheet",

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.ageing.measure import measure_ageing
-from sasgeo_bench.cli.console import Out, read_box, read_day, tell
+from sasgeo_bench.cli.console import Out, read_box, read_day, say, tell
 from sasgeo_bench.extract.history import MARGIN_M, date_extracts, read_history
 from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
 from sasgeo_bench.store.ratebookfile import write_ratebook
@@ -31,7 +31,7 @@ def measure_ageing_command(
     history = read_history(dated, bounds=box, margin_m=margin_m, tell=tell)
     name = place or extract[0].name.split(".")[0].split("-")[0]
     for path in write_ageing(out, measure_ageing(history, place=name)):
-        typer.echo(path)
+        say(path)
 
 
 def compare_ageing_command(
@@ -44,6 +44,6 @@ def compare_ageing_command(
 ) -> None:
     """Put the measured rates of several places beside each other, class by class."""
     places, controls = ([read_ageing(item) for item in items] for items in (folder, control or ()))
-    typer.echo(write_summary(out, places, controls))
+    say(write_summary(out, places, controls))
     if rates is not None:
-        typer.echo(write_ratebook(rates, places))
+        say(write_ratebook(rates, places))

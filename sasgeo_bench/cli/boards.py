@@ -17,6 +17,7 @@ from sasgeo_bench.cli.console import (
     SeedFile,
     print_table,
     private_seed,
+    say,
     shown_progress,
     tell,
 )
@@ -131,7 +132,7 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     with shown_progress() as progress:
         board = score_all(request, tell=tell, progress=progress, has_cases=cases, results=results)
     show_board(board)
-    typer.echo(str(request.board))
+    say(request.board)
     tell(_how_to_publish(request.board))
     _check_controls(board)
 
@@ -178,7 +179,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         private=private_seed(seed_file),
     )
     if dry_run:
-        typer.echo(plan.to_text())
+        say(plan.to_text())
         return
     if plan.private is not None and (results is not None or private is not None):
         check_public(seed_said(plan.private), str(board_folder(plan)))
@@ -187,7 +188,7 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
     with shown_progress() as progress:
         board = run_pipeline(plan, tell=tell, progress=progress, results=results, has_cases=cases, private=private)
     show_board(board)
-    typer.echo(str(board_folder(plan)))
+    say(board_folder(plan))
     if plan.private is not None:
         tell(f"next: sasgeo-bench score --predictions docs/results/{spec.id} --private {board_folder(plan)}")
         _check_controls(board)
@@ -214,7 +215,7 @@ def show_board(board: Board) -> None:
     if board.findings:
         tables.append(("Registered contrasts", finding_table(board.findings)))
     for title, short in tables:
-        typer.echo(title)
+        say(title)
         shown = Table(*map(str, short.columns), box=None, pad_edge=False)
         for row in short.itertuples(index=False):
             shown.add_row(*map(str, row))

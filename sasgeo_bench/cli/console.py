@@ -7,23 +7,34 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Final, Self
+from typing import Annotated, Any, Final, Self
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.extract.scan import Box
 from sasgeo_bench.privateseed import LEAST_BITS, REPRODUCING_BITS, PrivateSeed
 from sasgeo_bench.request import PRIVATE_ROOT
 from sasgeo_bench.store.seedfile import VARIABLE, take_seed
+from sasgeo_bench.texts import plain, plain_lines
 
 EXIT_USER: Final = 2
 PIPE_WIDTH: Final = 200
 
-errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+
+class _PlainConsole(Console):
+    """A console that shows every text as it is: no markup, no names of emoji, no characters that steer a terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:  # noqa: ANN401 - whatever rich asks for
+        """Any text on its way to the terminal, cells of tables among them."""
+        return super().render_str(plain_lines(text), **{**options, "markup": False, "emoji": False})
+
+
+errors = _PlainConsole(stderr=True, soft_wrap=True, highlight=False)
 
 Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
 RegionFolders = Annotated[
@@ -93,7 +104,12 @@ def read_box(text: str | None) -> Box | None:
 
 def tell(line: str) -> None:
     """Print one line to stderr."""
-    errors.print(line, markup=False)
+    errors.print(plain(line))
+
+
+def say(result: object) -> None:
+    """Print a result to stdout: a path, or some lines."""
+    typer.echo(plain_lines(str(result)))
 
 
 class Bars:
@@ -101,7 +117,7 @@ class Bars:
 
     def __init__(self) -> None:
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"),
@@ -123,7 +139,7 @@ class Bars:
 
     def begin(self, label: str, total: int) -> None:
         """Add a bar."""
-        self._tasks[label] = self._bars.add_task(label, total=total, rate="")
+        self._tasks[label] = self._bars.add_task(plain(label), total=total, rate="")
 
     def advance(self, label: str, count: int) -> None:
         """Move a bar on."""
@@ -145,7 +161,7 @@ def shown_progress() -> Iterator[Bars | None]:
 
 def print_table(table: Table) -> None:
     """Print to stdout: as wide as the terminal there, unwrapped into a file or pipe."""
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH, markup=False)
+    console = _PlainConsole(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
     with console.capture() as captured:
         console.print(table)
     typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()) + "\n")

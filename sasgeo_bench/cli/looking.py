@@ -7,7 +7,7 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, tell
+from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, say, tell
 from sasgeo_bench.duplicates import constellations, search_split
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.panels import panels
@@ -110,7 +110,7 @@ def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> N
     path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
-    typer.echo(f"contact sheet: {path}")
+    say(f"contact sheet: {path}")
 
 
 def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
@@ -119,7 +119,7 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
         query_id, picture = picture_of(cases, query)
         path = out / "sheets" / f"{cases.entry.name.replace(' ', '-')}-{query_id}.png"
         write_png(path, case_pixels(picture))
-        typer.echo(f"picture: {path}")
+        say(f"picture: {path}")
         return
     found = cases.failures()
     counts = count_cases(found)
@@ -130,7 +130,7 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
         table.add_row(name, str(count), ", ".join(query_id[:SHOWN_LETTERS] for query_id in listed))
     stressed, total = int((cases.scores["role"] == STRESS).sum()), len(cases.scores)
     only = f", {stressed} of them under stress: boards count these first, and controls apart" if stressed else ""
-    typer.echo(f"{cases.entry.name}: {len(found)} failures in {counted(total, 'query', 'queries')}{only}")
+    say(f"{cases.entry.name}: {len(found)} failures in {counted(total, 'query', 'queries')}{only}")
     print_table(table)
 
 
@@ -138,11 +138,11 @@ def _inspect_split(target: str, out: Path, folders: list[Path]) -> None:
     """Print the places of a split and draw their map."""
     grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
     split = make_split(read_split_file(find_split_file(target)), grids)
-    typer.echo(split.to_text())
+    say(split.to_text())
     path = out / "sheets" / f"split-{split.spec.id}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_split_map(path, split)
-    typer.echo(f"map of parts: {path}")
+    say(f"map of parts: {path}")
 
 
 def _summary(manifest: Manifest, folder: Path) -> Table:
@@ -200,10 +200,10 @@ def verify_command(
         folder = Path(target) if Path(target).is_dir() else out / "regions" / target
         faults, good = differing_files(folder), "all files are as the manifest says"
     for line in faults:
-        typer.echo(line)
+        say(line)
     if faults:
         raise typer.Exit(EXIT_USER)
-    typer.echo(f"{target}: {good}")
+    say(f"{target}: {good}")
 
 
 def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[str], str]:

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, print_table, tell
+from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
 from sasgeo_bench.plugins import MATCHERS, ORACLE, REJECTORS, list_entry_points
 from sasgeo_bench.scaffold import plugin_files
 from sasgeo_bench.store.pluginfiles import write_plugin
@@ -49,7 +49,7 @@ def new_matcher_command(
     target = folder or Path(name)
     write_plugin(target, files)
     install = f"{_pip()} install -e {shlex.quote(str(target))}"
-    typer.echo(f"{target}: {len(files)} files; next: {install} && sasgeo-bench check-matcher {name}")
+    say(f"{target}: {len(files)} files; next: {install} && sasgeo-bench check-matcher {name}")
     tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/adding-a-matcher.md walks the path)")
 
 

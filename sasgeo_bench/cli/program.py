@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.ageing import compare_ageing_command, measure_ageing_command
 from sasgeo_bench.cli.boards import leaderboard_command, score_command
-from sasgeo_bench.cli.console import EXIT_USER, ExtractFolders, Out, errors, print_table
+from sasgeo_bench.cli.console import EXIT_USER, ExtractFolders, Out, print_table, tell
 from sasgeo_bench.cli.looking import inspect_command, verify_command
 from sasgeo_bench.cli.matchers import (
     check_matcher_command,
@@ -85,7 +85,7 @@ def _warn(
 ) -> None:
     """Print a warning as one line, without where it came from."""
     del category, filename, lineno, file, line
-    errors.print(f"sasgeo-bench: warning: {one_line(str(message))}", markup=False)
+    tell(f"sasgeo-bench: warning: {one_line(str(message))}")
 
 
 def _cut(text: str) -> str:
@@ -100,13 +100,13 @@ def main() -> None:
     try:
         app()
     except SasgeoError as error:
-        errors.print(f"sasgeo-bench: {_cut(str(error))}", markup=False)
+        tell(f"sasgeo-bench: {_cut(str(error))}")
         sys.exit(EXIT_USER)
     except OSError as error:  # whatever nobody has put in words of their own, as of a name that is too long
         said = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
-        errors.print(f"sasgeo-bench: {one_line(said)}", markup=False)
+        tell(f"sasgeo-bench: {one_line(said)}")
         sys.exit(EXIT_USER)
     except SystemExit as leaving:
         if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word
-            errors.print("sasgeo-bench: interrupted; what was finished is kept, nothing is half-written: run it again")
+            tell("sasgeo-bench: interrupted; what was finished is kept, nothing is half-written: run it again")
         raise

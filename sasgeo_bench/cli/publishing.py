@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import Out, tell
+from sasgeo_bench.cli.console import Out, say, tell
 from sasgeo_bench.packing import board_of
 from sasgeo_bench.publish import publish
 from sasgeo_bench.submissions import with_submissions
@@ -31,4 +31,4 @@ def publish_command(
         with_submissions(stored, submissions, board, tell=tell)
     written = publish(board, into, tell=tell)
     tell(written.to_text())
-    typer.echo(str(written.folder / "index.html"))
+    say(written.folder / "index.html")

@@ -8,7 +8,16 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import ExtractFolders, Out, OwnRegionFolders, SeedFile, print_table, private_seed, tell
+from sasgeo_bench.cli.console import (
+    ExtractFolders,
+    Out,
+    OwnRegionFolders,
+    SeedFile,
+    print_table,
+    private_seed,
+    say,
+    tell,
+)
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.processes import spread
 from sasgeo_bench.query import PriorGroup
@@ -73,7 +82,7 @@ def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its 
             per_site = len(find_suite(item.suite).variants) * len(find_suite(item.suite).card.tracks)
             folder = item.out / "tasks" / item.suite / item.region.id
             most = f"at most {item.count} sites, {item.count * per_site} queries"
-            typer.echo(f"{item.suite} on {item.region.id}: {most}, {folder}")
+            say(f"{item.suite} on {item.region.id}: {most}, {folder}")
         return
     by_region: dict[str, list[Request]] = {}
     for item in requests:

@@ -15,6 +15,7 @@ from sasgeo_bench.cli.console import (
     RegionFolders,
     print_table,
     read_date,
+    say,
     tell,
 )
 from sasgeo_bench.processes import spread
@@ -41,7 +42,7 @@ def build_region_command(
     day = read_date(date)
     plans = [_plan(name, out=out, date=day, extracts=extracts, regions=regions) for name in region]
     if dry_run:
-        typer.echo("\n".join(plan.to_text() for plan in plans))
+        say("\n".join(plan.to_text() for plan in plans))
         return
     for _ in spread(_build, plans, jobs=jobs):
         pass

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import Out, read_date, tell
+from sasgeo_bench.cli.console import Out, read_date, say, tell
 from sasgeo_bench.errors import counted
 from sasgeo_bench.release import ReleaseRequest, make_release
 
@@ -40,4 +40,4 @@ def release_command(  # noqa: PLR0913 - a command has as many flags as its users
     release = make_release(request, tell=tell)
     maps, queries = counted(len(release.maps), "map"), counted(release.queries, "query", "queries")
     suites_said = counted(len(release.suites), "suite")
-    typer.echo(f"{request.into}: {maps}, {queries} of {suites_said}, {release.bytes / 1e6:.1f} MB")
+    say(f"{request.into}: {maps}, {queries} of {suites_said}, {release.bytes / 1e6:.1f} MB")

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import Out, shown_progress, tell
+from sasgeo_bench.cli.console import Out, say, shown_progress, tell
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.run.runner import run
@@ -84,7 +84,7 @@ def run_command(  # noqa: PLR0913 - a command has as many flags as its users nee
     )
     plan = plan_run(request)
     if dry_run:
-        typer.echo(plan.to_text())
+        say(plan.to_text())
         return
     _carry_out(plan)
 
@@ -100,7 +100,7 @@ def _carry_out(plan: RunPlan) -> None:
     for status, message in sorted(report.messages.items()):
         tell(f"  {status}, the first of {report.counts[status]}: {message}")
     for folder in report.folders:
-        typer.echo(str(folder))
+        say(folder)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -132,4 +132,4 @@ def merge_command(
     """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
     asked = {name: said for task in tasks or () for name, said in read_asked(task).items()}
     count = merge_runs(runs, into, asked=asked if tasks else None)
-    typer.echo(f"{into}: {counted(count, 'prediction')}")
+    say(f"{into}: {counted(count, 'prediction')}")

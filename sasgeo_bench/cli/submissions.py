@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import EXIT_USER, tell
+from sasgeo_bench.cli.console import EXIT_USER, say, tell
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.packing import laid_tasks
 from sasgeo_bench.store.submissiondir import is_submission
@@ -50,7 +50,7 @@ def submit_command(
         )
         raise ConfigError(message)
     folder = make_submission(SubmitRequest(predictions=predictions, card=card, board=board, into=into), tell=tell)
-    typer.echo(str(folder))
+    say(str(folder))
     tell(f"next: validate --predictions {folder} --for {board}; then open a pull request with the folder")
 
 
@@ -70,7 +70,7 @@ def validate_command(
         _show(validate(predictions, folders), predictions)
         aside = set_aside(predictions, folders)
     rest = f"{counted(aside, 'answer')} to other queries set aside" if aside else "and nothing else"
-    typer.echo(f"{predictions}: answers every query of {counted(len(folders), 'task')}, {rest}")
+    say(f"{predictions}: answers every query of {counted(len(folders), 'task')}, {rest}")
 
 
 def _show(faults: Iterable[Violation], predictions: Path) -> None:
@@ -80,10 +80,10 @@ def _show(faults: Iterable[Violation], predictions: Path) -> None:
         count += 1
         missing += violation.is_missing_row
         if missing <= MOST_MISSING or not violation.is_missing_row:
-            typer.echo(violation.to_text())
+            say(violation.to_text())
     if missing > MOST_MISSING:
         more = counted(missing - MOST_MISSING, "more query", "more queries")
-        typer.echo(f"{predictions.name}, query_id: found no row for {more}, expected one for every query")
+        say(f"{predictions.name}, query_id: found no row for {more}, expected one for every query")
     if count:
         tell(f"{predictions}: {counted(count, 'violation')}")
         raise typer.Exit(EXIT_USER)
@@ -96,7 +96,7 @@ def _validate_submission(folder: Path, tasks: list[Path]) -> None:
     missing = len(found)
     misses = f", {counted(missing, 'query', 'queries')} without a row count as misses" if missing else ""
     against = "" if tasks else "; its rows were held against no queries (--for names the stored results of its board)"
-    typer.echo(
+    say(
         f"{folder}: a sound submission of {said.card.name} {said.card.version} to {said.board}, "
         f"{counted(len(said.tasks), 'task')}{misses}{against}"
     )

@@ -10,7 +10,7 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import Out, print_table
+from sasgeo_bench.cli.console import Out, print_table, say
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.lookalike import SIDE_M, find_lookalike, sheet_of
 from sasgeo_bench.region import Region
@@ -80,11 +80,11 @@ def weights_command(
         for name, (known, arm) in arms.items()
     }
     for column, title, factor, digits in (WORTH, *(GAINS if learnt else ()), INFORMATION):
-        typer.echo(title)
+        say(title)
         print_table(_table(side_by_side(tables, column) * factor, digits))
     if place is not None:
         for path in _drawn(place, *list(arms.values())[-1], ages=ages or [0.0], season=season, out=out):
-            typer.echo(f"map of weights: {path}")
+            say(f"map of weights: {path}")
 
 
 def lookalike_command(
@@ -108,7 +108,7 @@ def lookalike_command(
     path = out / "sheets" / f"lookalike-{mapped.manifest.id}-{mapped.manifest.extract.date}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     draw_lookalike(path, sheet_of(found, mapped, known, arm))
-    typer.echo(f"lookalike: {path}")
+    say(f"lookalike: {path}")
 
 
 def read_learnt(path: Path | None) -> Learnt | None:

@@ -18,7 +18,7 @@ import pooch
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.tomlfile import Document
+from sasgeo_bench.tomlfile import Document, Line
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 _SILENT_S: Final = 30.0  # between two parts of a download
@@ -48,7 +48,7 @@ class Extract(Document):
     ()
     """
 
-    file: Annotated[str, StringConstraints(min_length=1)]
+    file: Line
     date: dt.date
     sha256: Annotated[tuple[Sha256, ...], Field(strict=False)] = ()
     urls: Annotated[tuple[str, ...], Field(strict=False)] = ()

@@ -26,6 +26,7 @@ from sasgeo_bench.report.sitesource import Case, SiteSource
 from sasgeo_bench.report.sitetable import file_stem
 from sasgeo_bench.report.sitewords import MARKS, MEANINGS, NOTE
 from sasgeo_bench.report.text import control_lines, training_lines, warnings_of
+from sasgeo_bench.texts import plain
 
 ASSETS: Final = ("site.css", "site.js")
 FAILURES: Final = (  # in the order they are shown; others follow
@@ -124,9 +125,15 @@ def _environment() -> Environment:
     return Environment(
         loader=PackageLoader("sasgeo_bench.report"),
         autoescape=True,
+        finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def _shown(value: object) -> object:
+    """What a page is given, without characters that a browser would not show or that turn the writing round."""
+    return plain(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
 def _render(templates: Environment, template: str, page: str, values: Mapping[str, Any]) -> str:

@@ -19,6 +19,7 @@ from sasgeo_bench.report.reproduction import SEEDS_NOTE, seed_lines, seed_table
 from sasgeo_bench.report.rows import ALL_SUITES, RUN_HERE, is_apart, is_unranked
 from sasgeo_bench.report.steps import GROUP
 from sasgeo_bench.report.strata import ALL, CONTROL, STRESS
+from sasgeo_bench.texts import markdown, markdown_item
 
 _INTEGRITY: Final = (
     "aurc",
@@ -318,12 +319,12 @@ def board_markdown(
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
         "",
-        f"Made by {about['made_by']}. Split: {about['split'] or 'none'}. Data: {ATTRIBUTION}.",
+        f"Made by {markdown(about['made_by'])}. Split: {markdown(about['split'] or 'none')}. Data: {ATTRIBUTION}.",
         "",
         _NOTE.format(draws=about["draws"]),
         "",
         *(
-            f"- {line}"
+            f"- {markdown_item(line)}"
             for line in (*control_lines(verdicts), *seed_lines(about), *warnings_of(board), *training_lines(about))
         ),
         "",
@@ -336,9 +337,9 @@ def board_markdown(
     if falsifiers:
         lines += ["## Falsifiers", "", _FALSIFIERS_NOTE, "", *markdown_table(falsifier_table(falsifiers)), ""]
     for title, table in tables_of(board):
-        lines += [f"## {title}", "", *markdown_table(table), ""]
+        lines += [f"## {markdown(title)}", "", *markdown_table(table), ""]
     for title, table in step_tables(steps) if steps is not None else ():
-        lines += [f"## {title}", "", *markdown_table(table), ""]
+        lines += [f"## {markdown(title)}", "", *markdown_table(table), ""]
     if verdicts:
         lines += ["## Controls", "", _CONTROLS_NOTE, "", *markdown_table(control_table(verdicts)), ""]
     lines += ["## How to read", "", *(f"- **{term}**: {meaning}." for term, meaning in _TERMS.items()), ""]
@@ -435,21 +436,17 @@ def falsifier_table(found: Sequence[Falsifier]) -> pd.DataFrame:
 
 
 def markdown_table(table: pd.DataFrame) -> Iterator[str]:
-    r"""Lines of a table; what a cell holds can neither end it nor begin a tag.
+    r"""Lines of a table of plain texts; see `texts.markdown`.
 
     Examples
     --------
     >>> list(markdown_table(pd.DataFrame({"matcher": ["mine 1|2"]})))[-1]
     '| mine 1\\|2 |'
     """
-    yield "| " + " | ".join(map(_cell_text, table.columns)) + " |"
+    yield "| " + " | ".join(map(markdown, table.columns)) + " |"
     yield "|" + "---|" * len(table.columns)
     for row in table.itertuples(index=False):
-        yield "| " + " | ".join(map(_cell_text, row)) + " |"
-
-
-def _cell_text(value: object) -> str:
-    return str(value).replace("|", r"\|").replace("<", "&lt;")
+        yield "| " + " | ".join(map(markdown, row)) + " |"
 
 
 def summary(board: pd.DataFrame, *, names: Sequence[str] = ()) -> Iterator[tuple[str, pd.DataFrame]]:

@@ -18,6 +18,7 @@ from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.ageingplot import draw_ageing
 from sasgeo_bench.store.parquetfile import read_frame, write_frame
 from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench.texts import markdown, markdown_item
 
 TABLE: Final = "ageing.parquet"
 TEXT: Final = "ageing.md"
@@ -135,10 +136,10 @@ def ageing_text(ageing: Ageing) -> str:
     table = ageing.table
     rates = _rate_table(table, by="class")
     spans = table[table["span"] != "pooled"]
-    sources = "\n".join(f"- {source}" for source in ageing.sources)
+    sources = "\n".join(f"- {markdown_item(source)}" for source in ageing.sources)
     return "\n\n".join(
         (
-            f"# {ageing.place}: how the map aged",
+            f"# {markdown(ageing.place)}: how the map aged",
             _READING,
             f"{ageing.area_km2:,.1f} km2 that all of these map:\n\n{sources}",
             "## Rates over all intervals",
@@ -328,5 +329,5 @@ def _bounded(percent: float) -> str:
 
 
 def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
+    lines = [map(markdown, head), ["---"] * len(head), *(map(markdown, row) for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -15,6 +15,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from sasgeo_bench.ageing.measure import Ageing
 from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.taxonomy import load_taxonomy
 
 _RANGE: Final = (0.01, 100.0)  # %/year: what is less is drawn at the left edge, what is more at the right one
@@ -50,7 +51,7 @@ def draw_ageing(path: Path, ageing: Ageing) -> None:
     names = list(dict.fromkeys(ageing.table["class"]))
     height = _ROW_INCHES * len(names) + _FRAME_INCHES
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_INCHES, height), facecolor="white")
+        figure = PlainFigure(figsize=(_WIDTH_INCHES, height), facecolor="white")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 3, sharey=True, width_ratios=[1, 1, 0.8])
         low, high = 1.3 / height, 1 - _TOP_INCHES / height

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boards on disk: `leaderboard.parquet` is the master, all others say the same for other readers."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +25,7 @@ from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.packabout import BoardSaid, parse_said
 from sasgeo_bench.store.parquetfile import read_frame, read_schema, write_frame
 from sasgeo_bench.store.regiondir import fresh_folder, locked
+from sasgeo_bench.texts import csv_cell, json_text
 
 LEADERBOARD: Final = "leaderboard"
 PROTECTION: Final = "protection"
@@ -107,8 +107,8 @@ def write_board(
             for part in (Extra(tables=tables, texts=texts), *extras):
                 _write_part(scratch, part, said)
             for name in (one for one in _AS_CSV if one in tables):
-                tables[name].to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
-            (scratch / BOARD).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+                tables[name].map(csv_cell).to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
+            (scratch / BOARD).write_text(json_text(content), encoding="utf-8")
     except SasgeoError:
         raise
     except OSError as error:

@@ -15,10 +15,10 @@ from typing import Any, Final
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.store.canvas import PlainFigure
 
 # Okabe and Ito's colours without the yellow, which is too pale on white; dashes and marks differ, too.
 _COLOURS: Final = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -27,6 +27,7 @@ _MARKS: Final = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "h")
 GREY: Final = "#555555"
 FAINT: Final = "#dddddd"
 _DPI: Final = 110
+_TAGS: Final = re.compile(r"<[^>]+>")  # texts between them hold no bracket, and are not touched
 _NUMBERS: Final = re.compile(r' (?:d|x|y|x1|x2|y1|y2|points)="[^"]*"')
 _GROUP_NAMES: Final = re.compile(r' id="[A-Za-z2.]+_\d+"')  # nothing refers to them; what is referred to has a hash
 _STYLE_OF: Final = re.compile(r' style="([^"]*)"')
@@ -131,7 +132,7 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
     bottom = 0.62 + _LINE_INCHES * len(note) + 0.3
     height = top + about.rows * high + (about.rows - 1) * about.row_gap_inches + bottom
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+        figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
         figure.text(0.12 / width, 1 - 0.1 / height, "\n".join(title), fontsize=10.5, weight="bold", va="top")
         figure.text(
@@ -175,16 +176,20 @@ def _rounded(svg: str) -> str:
 
     Half of what is drawn with says no more.
     """
-    plain = _INDENTS.sub("\n", _GROUP_NAMES.sub("", svg))
-    return _classed(_NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), plain))
+    return _classed(_TAGS.sub(lambda tag: _short(tag[0]), _INDENTS.sub("\n", svg)))
+
+
+def _short(tag: str) -> str:
+    return _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), _GROUP_NAMES.sub("", tag))
 
 
 def _classed(svg: str) -> str:
     """Styles that stand more than once as classes, numbered as they first stand."""
-    counts = Counter(_STYLE_OF.findall(svg))
+    counts = Counter(style for tag in _TAGS.findall(svg) for style in _STYLE_OF.findall(tag))
     names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
     rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
-    short = _STYLE_OF.sub(lambda found: f' class="{names[found[1]]}"' if found[1] in names else found[0], svg)
+    classes = {f' style="{style}"': f' class="{name}"' for style, name in names.items()}
+    short = _TAGS.sub(lambda tag: _STYLE_OF.sub(lambda one: classes.get(one[0], one[0]), tag[0]), svg)
     return short.replace("</style>", f"{rules}</style>", 1)
 
 

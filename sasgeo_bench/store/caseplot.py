@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import Evidence, footprint
 from sasgeo_bench.pose import Pose
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.store.picture import pixels_of
 from sasgeo_bench.store.preview import scale_bar
 from sasgeo_bench.store.sheet import HIDDEN, paint
@@ -86,7 +87,7 @@ class CasePicture:
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
     """Draw a query and its answer; pixels as of `picture.pixels_of`, the same for the same case."""
-    figure = Figure(figsize=(_WIDTH, _HEIGHT), dpi=_DPI, facecolor="white")
+    figure = PlainFigure(figsize=(_WIDTH, _HEIGHT), dpi=_DPI, facecolor="white")
     _text(figure, 0.12, _HEIGHT - 0.1, case.title, size=10.5, weight="bold")
     _text(figure, 0.12, 0.17, f"Map: {case.attribution}", size=7)
     top = _HEIGHT - 0.62

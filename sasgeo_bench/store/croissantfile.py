@@ -2,7 +2,6 @@
 """`croissant.json`: a release as Croissant 1.1 metadata; record sets are queries, truths, and the tables of maps."""
 
 import datetime as dt
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from sasgeo_bench.store.columntexts import FEATURE_TEXTS, QUERY_TEXTS, TRUTH_TEX
 from sasgeo_bench.store.parquetfile import read_schema
 from sasgeo_bench.store.releasedir import LICENCE_URL, TRUTHS, Release
 from sasgeo_bench.store.taskrows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
+from sasgeo_bench.texts import json_text
 
 if TYPE_CHECKING:
     import mlcroissant as mlc
@@ -90,9 +90,7 @@ def write_croissant(folder: Path, release: Release) -> None:
         distribution=[*_file_objects(release), *map(_file_set, tables)],
         record_sets=[_record_set(table) for table in tables],
     )
-    (folder / CROISSANT).write_text(
-        json.dumps(metadata.to_json(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
+    (folder / CROISSANT).write_text(json_text(metadata.to_json()), encoding="utf-8")
 
 
 def cite_as(release: Release) -> str:

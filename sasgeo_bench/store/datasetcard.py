@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`README.md` of a release: the dataset card, whose head tells the `datasets` library where each suite lies."""
 
-import json
 from collections.abc import Iterator
 from typing import Final
 
@@ -10,6 +9,7 @@ from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.store.columntexts import QUERY_TEXTS, TRUTH_TEXTS, shown
 from sasgeo_bench.store.croissantfile import cite_as
 from sasgeo_bench.store.releasedir import COPYRIGHT_URL, LICENCE_URL, TRUTHS, Release, ReleaseTask, places_of
+from sasgeo_bench.texts import markdown, quoted
 
 CARD: Final = "README.md"
 _FIRST_SUITE: Final = "clean"  # what is loaded where no configuration is named
@@ -47,23 +47,23 @@ def _head(release: Release) -> Iterator[str]:
     size = next((name for most, name in _SIZES if release.queries < most), "n>1M")
     yield "license: odbl"
     yield "pretty_name: sasgeo-bench"
-    yield f"attribution: {json.dumps(ATTRIBUTION)}"
+    yield f"attribution: {quoted(ATTRIBUTION)}"
     yield "tags: [geospatial, OpenStreetMap, UAV, map-localization]"
-    yield f"size_categories: [{json.dumps(size)}]"
+    yield f"size_categories: [{quoted(size)}]"
     yield "configs:"
     first = _FIRST_SUITE if _FIRST_SUITE in release.suites else release.suites[0]
     for suite in release.suites:
         for kind, name in (("queries", suite), ("truth", f"{suite}-{TRUTHS}")):
             tables = release.tables_of(suite, kind=kind)
             if tables:
-                yield f"- config_name: {name}"
+                yield f"- config_name: {quoted(name)}"
                 if name == first:
                     yield "  default: true"
                 yield "  data_files:"
                 for part, paths in tables.items():
-                    yield f"  - split: {part}"
+                    yield f"  - split: {quoted(part)}"
                     yield "    path:"
-                    yield from (f"    - {json.dumps(path)}" for path in paths)
+                    yield from (f"    - {quoted(path)}" for path in paths)
 
 
 def _opening(release: Release) -> str:
@@ -116,7 +116,7 @@ def _suites(release: Release) -> str:
             own = [task for task in tasks if part in task.parts]
             told = f"`{suite}-{TRUTHS}`" if any(part in task.told for task in own) else "kept back"
             count = sum(task.parts[part] for task in own)
-            title = tasks[0].about["title"]
+            title = markdown(tasks[0].about["title"])
             lines.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {told} |")
     return "\n".join(lines)
 
@@ -127,7 +127,7 @@ def _regions(release: Release) -> str:
         "## Maps and places",
         "",
         (
-            f"Split `{split.id}` ({split.title}): places that are used for different purposes keep at least "
+            f"Split `{split.id}` ({markdown(split.title)}): places that are used for different purposes keep at least "
             f"{split.buffer_m:g} m apart."
         ),
         "",
@@ -149,7 +149,7 @@ def _regions(release: Release) -> str:
     for item in release.maps:
         about = item.manifest
         size = f"{about.cols} x {about.rows} cells of {about.cell_size_m:g} m"
-        lines.append(f"| `{item.name}` | {about.title} | {about.extract.date} | {size} | EPSG:{about.epsg} |")
+        lines.append(f"| `{item.name}` | {markdown(about.title)} | {about.extract.date} | {size} | EPSG:{about.epsg} |")
     lines += ["", "`name@date` is an older map of a place, `name+suite` one that a suite has edited."]
     return "\n".join(lines)
 

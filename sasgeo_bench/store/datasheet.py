@@ -7,6 +7,7 @@ from typing import Final
 from sasgeo_bench.errors import counted
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.store.releasedir import COPYRIGHT_URL, LICENCE_URL, Release
+from sasgeo_bench.texts import markdown, markdown_code
 
 DATASHEET: Final = "datasheet.md"
 _M2_PER_KM2: Final = 1e6
@@ -84,8 +85,8 @@ drawn at random among those that are mapped and not empty.
 **Is anything missing?** {_mapped_line(release)} Outside the mapped area cells are 255, never absent. What is not
 visible from above is left out and counted, as is every object that could not be used: {_left_out_line(release)}.
 
-**Are there recommended splits?** Split `{release.split.id}`: {release.split.title}. Whole places are kept apart, by
-{release.split.buffer_m:g} m at least.
+**Are there recommended splits?** Split `{release.split.id}`: {markdown(release.split.title)}.
+Whole places are kept apart, by {release.split.buffer_m:g} m at least.
 
 **Are there errors, noise or redundancy?** The errors of the detector are put in on purpose, as many for each class as
 published detectors make. The maps have the errors and gaps of OpenStreetMap. All queries of one site show one place:
@@ -125,7 +126,7 @@ def _class_table(objects: Counter[str]) -> str:
     lines = [
         "| Class | Objects in all maps |",
         "|---|---|",
-        *(f"| `{name}` | {count:,} |" for name, count in objects.items()),
+        *(f"| {markdown_code(name)} | {count:,} |" for name, count in objects.items()),
     ]
     return "\n".join(lines)
 
@@ -147,7 +148,7 @@ def _left_out_line(release: Release) -> str:
 
 def _collection(release: Release) -> str:
     files = {item.manifest.extract.file: item.manifest.extract.sha256 for item in release.maps}
-    lines = [f"| `{name}` | `{files[name]}` |" for name in sorted(files)]
+    lines = [f"| {markdown_code(name)} | {markdown_code(files[name])} |" for name in sorted(files)]
     table = "\n".join(("| Extract | SHA-256 |", "|---|---|", *lines))
     return f"""\
 ## Collection

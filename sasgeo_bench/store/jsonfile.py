@@ -6,7 +6,8 @@ import math
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.errors import StoreError, printable
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.texts import plain
 
 MOST_BYTES: Final = 50_000_000
 _MOST_DIGITS: Final = 40  # a seed of 128 bits has 39
@@ -61,7 +62,7 @@ def read_json(path: Path, *, mend: str, most_bytes: int = MOST_BYTES) -> Any:  #
     try:
         return parse_json(_read(path, most_bytes))
     except (OSError, ValueError) as error:
-        text = printable(getattr(error, "strerror", None) or str(error))[:_MOST_QUOTED]
+        text = plain(getattr(error, "strerror", None) or str(error))[:_MOST_QUOTED]
         message = f"{path} is damaged ({text}): {mend}"
         raise StoreError(message) from error
 

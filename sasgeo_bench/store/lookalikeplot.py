@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.store.preview import scale_bar
 from sasgeo_bench.store.sheet import paint
 from sasgeo_bench.store.weightplot import colour_bar, picture_of, words
@@ -92,7 +93,7 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
     rows = _told(sheet.scores)
     below = 0.5 + _ROW * max(len(rows) + 3, 13)  # colour bar, table, attribution
     height = 0.98 + _SIDE + below
-    figure = Figure(figsize=(_WIDTH, height), dpi=_DPI, facecolor="white")
+    figure = PlainFigure(figsize=(_WIDTH, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     words(figure, sheet.title, sheet.facts)
     pictures: tuple[NDArray[np.generic], ...] = (

@@ -8,9 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store.jsonfile import parse_json
+from sasgeo_bench.texts import FOLDER
 
 Model = TypeVar("Model", bound=BaseModel)
-Plain = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9+@._-]{0,199}$")]  # of what may become a folder
+Plain = Annotated[str, Field(pattern=FOLDER)]  # of what may become a folder
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _MOST_DRAWS: Final = 1_000_000
 

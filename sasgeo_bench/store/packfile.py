@@ -42,9 +42,9 @@ from sasgeo_bench.store.parquetfile import read_table, write_table
 from sasgeo_bench.store.regiondir import MANIFEST, fresh_folder, locked
 from sasgeo_bench.store.runrows import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.store.taskrows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under
+from sasgeo_bench.texts import FOLDER, json_text
 
 MOST_BYTES: Final = 20_000_000
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of what becomes a folder: never a way out
 _LEVEL: Final = 19
 _PAGE_BYTES: Final = 2**24  # what is alike is told once in a page: few pages, small files
 _TEXTS: Final = ("query_id", "track", "suite", "part", "region", "prior_group", "status", "message")
@@ -182,7 +182,7 @@ def _write_settings(folder: Path, said: Mapping[str, Any], dropped: str) -> None
         "attribution": ATTRIBUTION,
         "files": hashes_of(folder, [name for name in list_files(folder) if name != PACK]),
     }
-    (folder / PACK).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / PACK).write_text(json_text(content), encoding="utf-8")
 
 
 def _check_size(folder: Path, total: int, predictions: int, most: int) -> None:
@@ -252,7 +252,7 @@ def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
     rows = []
     for name, listed in runs.items():
         for run in listed:
-            about = json.dumps(dict(run.about), ensure_ascii=False)
+            about = json.dumps(dict(run.about))
             rows.append({"contestant": name, "rows": len(run.predictions), "about": about})
             if run.learned is not None and run.learned.is_file():
                 place = folder / LEARNED / _file_of(run.about)
@@ -390,7 +390,7 @@ def _parts_of(table: pa.Table) -> dict[int, pa.Table]:
 
 
 def _folder_name(name: str) -> str:
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(FOLDER, name):
         message = f"{name!r} is no name of a folder"
         raise ValueError(message)
     return name

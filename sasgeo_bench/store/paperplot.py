@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import UNKNOWN, Evidence
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.store.sheet import HIDDEN, Panel, paint
 from sasgeo_bench.taxonomy import load_taxonomy
 
@@ -45,7 +46,7 @@ _STYLE: Final[dict[Any, Any]] = {
 def _page(path: Path, width: float, height: float, title: str, note: str, data: str) -> Iterator[Figure]:
     """A figure with its title above, a note and where its data are from below; written when the block ends."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+        figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
         figure.text(0.15 / width, 1 - 0.12 / height, title, fontsize=11, weight="bold", va="top")
         figure.text(0.15 / width, 0.27 / height, note, fontsize=7.5, color=_GREY, va="bottom", linespacing=1.35)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.region import Manifest
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.store.preview import paint_overview
 
 WEBP: Final = ".webp"
@@ -96,7 +97,7 @@ def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uin
     rows, cols = overview.shape[1:]
     scale = _THUMB_INCHES / max(rows, cols)
     width, height = max(cols * scale, 1.6), rows * scale + _FOOT_INCHES
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+    figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
     chart = figure.add_axes((0, _FOOT_INCHES / height, cols * scale / width, rows * scale / height))
     chart.imshow(paint_overview(manifest, overview), interpolation="antialiased", aspect="auto")
     chart.set_axis_off()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.layers import OUTSIDE, PRESENT
 from sasgeo_bench.region import Manifest
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.taxonomy import load_taxonomy
 
 # Painted in this order: land first, then what lies on it, then what runs over it.
@@ -54,7 +55,7 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     scale = _MAP_INCHES / max(rows, cols)
     width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
     total = (width + _LEGEND_INCHES + 0.6, height + _TITLE_INCHES + _FOOT_INCHES)
-    figure = Figure(figsize=total, dpi=_DPI, facecolor="white")
+    figure = PlainFigure(figsize=total, dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     chart = figure.add_axes((0.3 / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))
     side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))

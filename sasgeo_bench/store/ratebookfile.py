@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ratebook.toml`: measured yearly rates of all places; one comes with the package."""
 
-import json
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
@@ -15,14 +14,15 @@ from sasgeo_bench.ageing.ratebook import RateBook
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.store.ageingfile import check_names, replace_file
+from sasgeo_bench.texts import quoted
 from sasgeo_bench.tomlfile import parse_toml
 
 PACKAGED: Final = "ratebook.toml"
 _HEAD: Final = f"""\
 # Yearly rates by place and class, written by `sasgeo-bench compare-ageing --rates`; not to be edited.
 # {ATTRIBUTION}
-attribution = {json.dumps(ATTRIBUTION)}
-licence = {json.dumps(LICENCE)}
+attribution = {quoted(ATTRIBUTION)}
+licence = {quoted(LICENCE)}
 """
 _COUNTS: Final = ("n_from", "n_to")
 _RATES: Final = ("vanish_per_year", "appear_per_year")
@@ -48,9 +48,9 @@ def ratebook_text(places: Sequence[Ageing]) -> str:
         files = dict.fromkeys(source.rpartition(" of ")[0] for source in place.sources)
         lines = [
             "[[place]]",
-            f"name = {json.dumps(place.place)}",
+            f"name = {quoted(place.place)}",
             f"area_km2 = {place.area_km2!r}",
-            f"extracts = [{', '.join(map(json.dumps, files))}]",
+            f"extracts = [{', '.join(map(quoted, files))}]",
         ]
         pooled, whole = (place.table[place.table["span"] == span].set_index("class") for span in ("pooled", "whole"))
         parts.append("\n".join(lines) + "\n")

@@ -2,7 +2,6 @@
 """A region on disk: `region.json` and the files it names; written whole or not at all."""
 
 import hashlib
-import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -23,6 +22,7 @@ from sasgeo_bench.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, FileRecord
 from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.layerfile import read_layers
 from sasgeo_bench.store.parquetfile import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
+from sasgeo_bench.texts import json_text
 from sasgeo_bench.tomlfile import check_document
 
 Table = TypeVar("Table", bound=pd.DataFrame)
@@ -74,7 +74,7 @@ def _attributed(table: Table) -> Table:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write `region.json`, the last file of a region: without it the folder is no region."""
-    text = json.dumps(manifest.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
+    text = json_text(manifest.model_dump(mode="json"))
     (folder / MANIFEST).write_text(text, encoding="utf-8")
 
 

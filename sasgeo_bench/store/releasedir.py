@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A dataset release on disk: maps, tasks and truths as others load them, with their hashes; whole or not at all."""
 
-import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -21,6 +20,7 @@ from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.parquetfile import open_table, read_table, table_writer
 from sasgeo_bench.store.regiondir import MANIFEST, file_record, fresh_folder, locked
 from sasgeo_bench.store.taskrows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA
+from sasgeo_bench.texts import json_text
 
 INDEX: Final = "release.json"
 SUMS: Final = "SHA256SUMS"
@@ -308,7 +308,7 @@ def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBat
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     said = {**content, "licence": LICENCE, "attribution": ATTRIBUTION}
-    path.write_text(json.dumps(said, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json_text(said), encoding="utf-8")
 
 
 def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predictions on disk: parts that are only ever added, and `run.json`; a file of the same shape is a submission."""
 
-import json
 import os
 import re
 import time
@@ -26,6 +25,7 @@ from sasgeo_bench.store.runrows import (
     row_faults,
 )
 from sasgeo_bench.store.taskrows import ASKED, asked_under
+from sasgeo_bench.texts import json_text
 
 RUN: Final = "run.json"
 _MEND: Final = "write it again, or remove it where it is a part of a run"
@@ -412,7 +412,7 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
     scratch = folder / f".{RUN}.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        scratch.write_text(json.dumps(dict(about), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        scratch.write_text(json_text(dict(about)), encoding="utf-8")
         scratch.rename(folder / RUN)
     except OSError as error:
         _remove(scratch)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.query import Query, Truth
 from sasgeo_bench.region import ATTRIBUTION
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.store.preview import PAINT_ORDER
 from sasgeo_bench.taxonomy import load_taxonomy
 
@@ -90,7 +91,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     columns = (*_COLUMNS, "perceived vectors") if has_vectors else _COLUMNS
     width, height = _WORDS_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
-    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     legend = (
         "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"

@@ -3,7 +3,6 @@
 
 import gzip
 import html
-import json
 import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from sasgeo_bench.store.packdir import is_pack, read_settings
 from sasgeo_bench.store.parquetfile import read_frame
 from sasgeo_bench.store.regiondir import fresh_folder, locked
 from sasgeo_bench.store.svgfile import svg_fault
+from sasgeo_bench.texts import json_text
 
 PICTURES: Final = "pictures"
 FILES: Final = "files"
@@ -324,7 +324,7 @@ def write_site(
     files |= {f"{FILES}/{name}": data for name, (data, _) in board.downloads.items()}
     pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
     content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION, "files": sorted({*files, *pictures})}
-    files[MANIFEST] = (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
+    files[MANIFEST] = json_text(content).encode()
     try:
         with fresh_folder(target) as scratch:
             for name, data in files.items():

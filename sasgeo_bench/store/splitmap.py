@@ -8,12 +8,12 @@ import numpy as np
 import pyproj
 import shapely
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
 from sasgeo_bench.region import ATTRIBUTION
 from sasgeo_bench.split import HALVES, Block, Split
+from sasgeo_bench.store.canvas import PlainFigure
 
 # Blue, orange and green of Okabe and Ito, told apart by colour-blind readers.
 COLOURS: Final = {"train": "#0072b2", "calibration": "#e69f00", "test": "#009e73", "a": "#0072b2", "b": "#e69f00"}
@@ -34,7 +34,7 @@ def write_split_map(path: Path, split: Split) -> None:
     places = list(split.blocks)
     rows = -(-len(places) // _COLUMNS)
     width, height = 2.3 * _COLUMNS, 2.4 * rows + 1.1
-    figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
+    figure = PlainFigure(figsize=(width, height), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     for at, place in enumerate(places):
         row, col = divmod(at, _COLUMNS)

@@ -5,7 +5,6 @@ All that is cheap to look at is looked at before anything is read: names, links,
 the table.
 """
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from sasgeo_bench.store.regiondir import file_record, fresh_folder, locked
 from sasgeo_bench.store.runrows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.store.taskrows import ASKED
 from sasgeo_bench.submissionfile import SCHEMA_VERSION, Card, FileSaid, Submission
+from sasgeo_bench.texts import json_text
 from sasgeo_bench.tomlfile import check_document, parse_toml
 
 SAID: Final = "submission.json"
@@ -120,7 +120,7 @@ def write_submission(
             record = file_record(scratch / name)
             _check_bytes(folder, record.bytes)
             whole = said.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
-            text = json.dumps(whole.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n"
+            text = json_text(whole.model_dump(mode="json"))
             (scratch / SAID).write_text(text, encoding="utf-8")
     except SasgeoError:
         raise

@@ -2,7 +2,6 @@
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
 import hashlib
-import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -35,10 +34,11 @@ from sasgeo_bench.store.taskrows import (
     truth_of,
     truth_row,
 )
+from sasgeo_bench.texts import FOLDER, json_text
 from sasgeo_bench.tomlfile import Document, check_document
 
 Count = Annotated[int, Field(ge=0)]
-Folder = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9+@._-]*$")]  # never a way out
+Folder = Annotated[str, Field(pattern=FOLDER)]  # never a way out
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
@@ -162,7 +162,7 @@ def write_task(
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json_text(content), encoding="utf-8")
 
 
 def _candidate_bytes(query: Query) -> bytes:

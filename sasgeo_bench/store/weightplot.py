@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.region import Manifest
+from sasgeo_bench.store.canvas import PlainFigure
 from sasgeo_bench.store.preview import north_arrow, scale_bar
 from sasgeo_bench.store.sheet import GROUND, HIDDEN, paint
 from sasgeo_bench.taxonomy import load_taxonomy
@@ -112,7 +113,7 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
     scale = _MAP_INCHES / max(side_m)
     wide, high = max(side_m[0] * scale, 2.2), max(side_m[1] * scale, _LEAST_INCHES)
     total = (2 * wide + _LEGEND_INCHES + 0.75, high + 1.75)
-    figure = Figure(figsize=total, dpi=_DPI, facecolor="white")
+    figure = PlainFigure(figsize=total, dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     place = Evidence(classes=about.classes, cells=shrunk(sheet.layers), cell_size_m=about.cell_size_m * factor)
     charts = [

@@ -10,6 +10,7 @@ import pytest
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.tables import leaderboard
 from tests.handmade import about_of, asked
+from tests.test_texts import NASTY
 
 TEX = next(filter(None, map(shutil.which, ("pdflatex", "lualatex", "xelatex", "tectonic"))), None)
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -43,11 +44,13 @@ def test_a_board_compiles_whatever_its_matchers_are_called(tmp_path: Path) -> No
         "plain",
         r"<script>alert(1)</script> & 100 % #1 $x$ {y} ~ ^ \end{table}",
         "café §2",
+        "".join(map(chr, range(0xA1, 0x180))),
+        *(text[:200] for text in NASTY if text.isprintable()),
         "匹配器 🛰",
         "[2] x",
         "*",
     )
-    board = leaderboard({name: asked(0.5) for name in names}, draws=200)
+    board = leaderboard({name: asked(0.5, count=8) for name in names}, draws=100)
     assert paper_of(board_latex(board, about_of([])), tmp_path).is_file()
 
 

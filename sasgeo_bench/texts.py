@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text from outside as data: a function for each kind of file that it is written to, so that nothing there parses it.
+
+Figures, the terminal and pages have theirs where they are made: `store/canvas.py`, `cli/console.py`, `report/site.py`.
+"""
+
+import json
+import re
+from typing import Any, Final
+
+# Of what becomes a folder or a key: methods and their versions, then maps and tasks too. None can begin a flag, a
+# formula, a hidden file or a list.
+NAME: Final = r"^[a-z0-9][a-z0-9_-]{0,59}$"
+VERSION: Final = r"^[A-Za-z0-9][A-Za-z0-9._+-]{0,59}$"
+FOLDER: Final = r"^[A-Za-z0-9][A-Za-z0-9+@._-]{0,199}$"
+
+_NUMBER: Final = re.compile(r"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?")
+_FORMULA: Final = tuple("=+-@'\uff1d\uff0b\uff0d\uff20")  # wide forms too; the apostrophe so that it can be taken off
+_PLAIN_NAME: Final = re.compile(r"[A-Za-z0-9@+./][A-Za-z0-9@+._/-]*")
+_INLINE: Final = re.compile(  # marks of emphasis, code, tables, tags and mathematics; links and what is made one
+    r"[\\`*|~$]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])|\](?=[(\[:])|(?<=:)//|(?i:(?<=www)\.)|#(?=#*$)"
+)
+_BLOCK: Final = re.compile(r"\d{0,9}(?P<mark>[-+.)](?=\s|$)|#(?=#{0,5}(?:\s|$))|>|(?:[-=]\s*){3,}$|\[(?=[ xX]\]))")
+_TEX: Final = {
+    **{letter: rf"\{letter}" for letter in "_%&#${}"},
+    "<": "$<$",
+    ">": "$>$",
+    "|": "$|$",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\\": r"\textbackslash{}",
+    '"': r"{\char34}",  # which is no letter alone where a language makes a command of it
+    "†": r"$^\dagger$",
+}
+_LIGATURE: Final = re.compile(r"(?<=[-`'?!,])(?=[-`',])")
+_LAST_LATIN: Final = 0x17F  # of Latin Extended-A
+_NO_GLYPH: Final = frozenset("«»ÐÞðþĄąĐđĘęĦħĮįĸĿŀŉŊŋŦŧŲųſ")  # before it, which pdfTeX stops at as well
+
+
+def plain(text: str) -> str:
+    r"""One line of printable characters: breaks become spaces, controls and marks that turn the writing round "?".
+
+    Examples
+    --------
+    >>> plain("red: \x1b[31m\nnext \u202egpj.exe")
+    'red: ?[31m next ?gpj.exe'
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in text)
+
+
+def plain_lines(text: str) -> str:
+    r"""Lines of printable characters; only a line feed ends one.
+
+    Examples
+    --------
+    >>> plain_lines("first\nsecond\x07")
+    'first\nsecond?'
+    """
+    return "\n".join(map(plain, text.split("\n")))
+
+
+def markdown(text: object) -> str:
+    r"""Text within a line or a table cell of Markdown, with nothing in it that is a mark there.
+
+    Examples
+    --------
+    >>> markdown("a|b <i> [x](https://x.org) success_25m")
+    'a\\|b &lt;i> [x\\](https:\\//x.org) success_25m'
+    """
+    line = plain(str(text)).strip()
+    return _INLINE.sub(lambda mark: f"\\{mark[0]}", line).replace("&", "&amp;").replace("<", "&lt;")
+
+
+def markdown_item(text: object) -> str:
+    r"""Text of a list item of Markdown, which begins no other block there.
+
+    Examples
+    --------
+    >>> markdown_item("1. first"), markdown_item("# second")
+    ('1\\. first', '\\# second')
+    """
+    found = markdown(text)
+    head = _BLOCK.match(found)
+    at = 0 if head is None else head.start("mark")
+    return found if head is None else f"{found[:at]}\\{found[at:]}"
+
+
+def markdown_code(name: str) -> str:
+    r"""A name as Markdown shows code; whatever is more than a name as `markdown` shows it.
+
+    Examples
+    --------
+    >>> markdown_code("vaduz@2021-10-28"), markdown_code("a`b")
+    ('`vaduz@2021-10-28`', 'a\\`b')
+    """
+    return f"`{name}`" if _PLAIN_NAME.fullmatch(name) else markdown(name)
+
+
+def tex(text: object) -> str:
+    r"""Text as LaTeX sets it letter by letter; those that pdfTeX has no glyph of by number, for it stops at them.
+
+    Examples
+    --------
+    >>> tex(r"100 % of a_b, \input{x}")
+    '100 \\% of a\\_b, \\textbackslash{}input\\{x\\}'
+    """
+    letters = _LIGATURE.sub("\0", plain(str(text)))
+    said = "".join("{}" if letter == "\0" else _tex_letter(letter) for letter in letters)
+    return "{}" + said if said.startswith(("[", "*")) else said  # which belong to the end of the row before, else
+
+
+def _tex_letter(letter: str) -> str:
+    is_known = ord(letter) <= _LAST_LATIN and letter not in _NO_GLYPH
+    return _TEX.get(letter) or (letter if is_known else f"[U+{ord(letter):04X}]")
+
+
+def csv_cell(value: object) -> object:
+    """A cell that a spreadsheet takes for text where it is one: what would begin a formula gets an apostrophe.
+
+    Examples
+    --------
+    >>> csv_cell("=1+1"), csv_cell("-0.5"), csv_cell(-0.5)
+    ("'=1+1", '-0.5', -0.5)
+    """
+    if not isinstance(value, str):
+        return value
+    line = plain(value)
+    is_formula = line.lstrip().startswith(_FORMULA) and not _NUMBER.fullmatch(line)
+    return f"'{line}" if is_formula else line
+
+
+def quoted(text: str) -> str:
+    r"""Text in double quotes as TOML and YAML read them.
+
+    Examples
+    --------
+    >>> quoted('a: "b"')
+    '"a: \\"b\\""'
+    """
+    return json.dumps(plain(text), ensure_ascii=False)
+
+
+def json_text(content: Any) -> str:  # noqa: ANN401 - whatever JSON can say
+    r"""A JSON document of printable characters and line feeds, with the same data.
+
+    Examples
+    --------
+    >>> json_text({"name": "\x9b31m"})
+    '{\n  "name": "\\u009b31m"\n}\n'
+    """
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    if not text.replace("\n", "").isprintable():
+        text = "".join(letter if letter.isprintable() or letter == "\n" else _json_letter(letter) for letter in text)
+    return f"{text}\n"
+
+
+def _json_letter(letter: str) -> str:
+    """An escape of JSON; half of a pair alone is no character, and readers refuse it."""
+    return "?" if "\ud800" <= letter <= "\udfff" else json.dumps(letter)[1:-1]

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes a folder, a flag, a key or a title: refused in one line where it is made or read."""
+
+import json
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.errors import ConfigError, MatchError
+from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench.pipelinefile import ContrastSpec, PipelineFile
+from sasgeo_bench.plugins import MATCHERS, REJECTORS
+from sasgeo_bench.rejector import RejectorCard
+from sasgeo_bench.split import SplitFile
+from sasgeo_bench.store.catalog import list_pipeline_files, read_pipeline_file
+from sasgeo_bench.submissionfile import Card
+from sasgeo_bench.texts import NAME, VERSION
+from sasgeo_bench.tomlfile import check_document
+from tests.test_texts import NASTY
+
+ROOT = Path(__file__).parents[1]
+SAID = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
+WRONG = tuple(text for text in NASTY if not re.fullmatch(VERSION, text))
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_no_card_has_such_a_name_or_version(text):
+    for name in ("name", "version"):
+        with pytest.raises(MatchError, match=f"card: {name} ") as matcher:
+            MatcherCard(**SAID | {name: text}, tracks=("localization",))
+        with pytest.raises(MatchError, match=f"card: {name} "):
+            RejectorCard(**SAID | {name: text})
+        with pytest.raises(ConfigError, match=name) as submitted:
+            check_document(SAID | {"trained_on": "none", name: text}, Card, source="card.toml")
+        for fault in (matcher, submitted):
+            assert str(fault.value).isprintable()
+            assert len(str(fault.value)) < 500
+
+
+@pytest.mark.parametrize("name", ["title", "source", "ours", "licence", "limits"])
+@pytest.mark.parametrize("text", ["a\nb", "\x1b[31m", "\u202ex", "\ud800", "x" * 5000])
+def test_a_card_is_in_lines_of_printable_characters(name, text):
+    for card, more in ((MatcherCard, {"tracks": ("localization",)}), (RejectorCard, {})):
+        with pytest.raises(MatchError, match=f"card: {name} must be one line of at most 4000 printable characters"):
+            card(**SAID | {name: text}, **more)
+    with pytest.raises(MatchError, match="card: trained_on must be one line"):
+        MatcherCard(**SAID, tracks=("localization",), trained_on=(text,))
+
+
+@pytest.mark.parametrize("text", ["", "\u202ex", "a\x1b[31mb", "x" * 301])
+def test_titles_of_files_are_lines_of_printable_characters(text):
+    halves = {"vaduz": "a", "eschen": "a", "monaco": "b", "porto": "b"}
+    places = [{"name": name, "regions": [name], "half": half} for name, half in halves.items()]
+    task = [{"suites": ["clean"], "sites": 1}]
+    for model, said in (
+        (SplitFile, {"id": "mine", "kind": "crossfit", "buffer_m": 0.0, "place": places}),
+        (PipelineFile, {"id": "mine", "split": "crossfit", "matchers": ["random"], "task": task}),
+    ):
+        check_document(said | {"title": r"cost $\nosuchthing$ | <b>"}, model, source="a.toml")
+        with pytest.raises(ConfigError, match="title"):
+            check_document(said | {"title": text}, model, source="a.toml")
+    contrast = {"name": "a", "first": "b", "second": "c", "suites": ["clean"]}
+    for key, wrong in (("why", "a\x1bb"), ("kinds", [text])):
+        with pytest.raises(ConfigError, match=key):
+            check_document(contrast | {key: wrong}, ContrastSpec, source="a.toml")
+
+
+def test_every_shipped_and_stored_name_and_version_is_one():
+    shipped = [point.name for group in (MATCHERS, REJECTORS) for point in entry_points(group=group)]
+    for path in list_pipeline_files().values():
+        spec = read_pipeline_file(path)
+        shipped += [*spec.matchers, *spec.rejectors]
+    cards = []
+    for path in ROOT.glob("docs/results/*/board.json"):
+        said = json.loads(path.read_text(encoding="utf-8"))
+        cards += [entry["card"] for entry in said["entries"] if entry["card"]] + said["rejectors"]
+    assert len(cards) > 20
+    for name in {*shipped, *(card["name"] for card in cards)}:
+        assert re.fullmatch(NAME, name), name
+    for version in {card["version"] for card in cards}:
+        assert re.fullmatch(VERSION, version), version

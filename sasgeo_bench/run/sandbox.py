@@ -44,7 +44,7 @@ class Policy:
     readable : sequence of str
         Folders and files besides the system's that it may read.
     scratch : str
-        An empty folder, the only one it may write.
+        An empty folder, resolved, the only one it may write.
     hidden : sequence of str
         Folders and files it must not see, wherever they lie.
     memory_bytes, file_bytes, scratch_bytes : int
@@ -105,6 +105,9 @@ def enter(policy: Policy) -> Isolation:
     Isolation
         What the system offered.
     """
+    if os.path.realpath(policy.scratch) != policy.scratch:  # mounts are known by their resolved paths
+        message = f"{policy.scratch} leads elsewhere, expected a resolved folder"
+        raise OSError(message)
     hidden = outermost(policy.hidden)
     spaces = _enter_namespaces()
     is_apart = bool(spaces & CLONE_NEWPID)
@@ -280,6 +283,7 @@ class _Keeper:
         """Wait for a child and end as it did; by its signal, or by its signal's number and 128."""
 
         def end(number: int, frame: FrameType | None) -> NoReturn:
+            """Kill first, then end as a shell says it."""
             del frame
             self._kill(child)
             os._exit(_BY_SIGNAL + number)

@@ -67,11 +67,6 @@ def receive(
     return found, blob
 
 
-def is_waiting(channel: socket.socket, deadline: float) -> bool:
-    """Whether anything has come, waiting until a deadline of `time.monotonic` at most."""
-    return bool(select.select([channel], [], [], max(0.0, deadline - time.monotonic()))[0])
-
-
 def _exactly(channel: socket.socket, count: int, deadline: float | None) -> bytes:
     parts = []
     while count:

@@ -306,6 +306,27 @@ def test_code_is_found_by_the_links_that_lead_to_it(tmp_path, stack, mode):
     assert json.loads(printed) == ["xx", None, None]
 
 
+WRITES = """
+import sys
+for path in sys.argv[1:]:
+    try:
+        open(path, "ab").write(b"y")
+    except OSError:
+        continue
+    print(path)
+"""
+
+
+@needs("all", "no Landlock")
+@pytest.mark.parametrize("readable", ["", "shown"], ids=["scratch within the code", "apart"])
+def test_folders_of_any_name_are_read_only_but_for_the_scratch_folder(tmp_path, stack, mode, readable):
+    place = Place(tmp_path / "ä b\\040c", stack)
+    paths = [place.scratch / "made", place.shown / "harmless", place.shown / "made", place.elsewhere / "secret"]
+    _, printed = shut_in(place, MODES[mode], ["-c", WRITES, *paths], readable=str(place.shown.parent / readable))
+    assert printed.splitlines() == [str(place.scratch / "made")]
+    assert list(place.scratch.iterdir()) == []
+
+
 @needs("no Landlock")
 def test_the_root_holds_what_is_needed_alone(tmp_path, stack, mode):
     place = Place(tmp_path, stack)

@@ -243,7 +243,8 @@ def _write(path: str, text: str) -> bool:
 
 def _drop_powers() -> None:
     """Give back what root or a namespace of users brought: whoever may mount could take covers off again."""
-    kernel.prctl(kernel.PR_SET_NO_NEW_PRIVS, 1)
+    if not kernel.prctl(kernel.PR_SET_NO_NEW_PRIVS, 1):
+        return  # no Linux
     header, none = struct.pack("Ii", _CAPABILITIES, 0), bytes(24)
     if kernel.libc().capset(header, none) != 0:
         raise kernel.last_error()
@@ -331,7 +332,8 @@ def _kill(number: int) -> None:
 def _below(root: int) -> list[int]:
     """Numbers of the processes that came from one, as /proc shows them."""
     parents: dict[int, int] = {}
-    for name in os.listdir("/proc"):  # noqa: PTH208 - no pathlib before the door is shut
+    names = os.listdir("/proc") if os.path.isdir("/proc") else []  # noqa: PTH112, PTH208 - no pathlib yet
+    for name in names:
         try:
             with open(f"/proc/{name}/stat", "rb") as file:  # noqa: PTH123
                 parents[int(name)] = int(file.read().rpartition(b")")[2].split()[1])

@@ -260,6 +260,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
         (("--match-s", "nan"), "--match-s must be seconds between 0 and 604800, got nan"),
         (("--prepare-s", "0"), "--prepare-s must be seconds between 0 and 604800, got 0"),
         (("--memory-mb", "1"), "--memory-mb must lie between 64 and 4000000, got 1"),
+        (("--scratch-mb", "0"), "--scratch-mb must lie between 1 and 4000000, got 0"),
         (
             ("--again", "late"),
             "--again must be one of ok, timeout, crash, invalid, refused, not applicable, got 'late'",

@@ -50,8 +50,8 @@ class Group:
         processes : int
             Processes and threads at once.
         """
-        name = f"{_PREFIX}{_runner()}-{next(_numbers)}"
         for version, parents in _places():
+            name = f"{_PREFIX}{_runner()}-{next(_numbers)}"
             for folder in dict.fromkeys(parents):
                 _sweep(folder)
             group = cls(version=version, memory=parents[0] / name, pids=parents[1] / name)

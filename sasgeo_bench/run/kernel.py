@@ -44,6 +44,6 @@ def mount(source: str, target: str, kind: str | None, flags: int, data: str = ""
     OSError
         If the kernel refuses.
     """
-    given = (source.encode(), os.fsencode(target), kind.encode() if kind else None)
+    given = (os.fsencode(source), os.fsencode(target), kind.encode() if kind else None)
     if libc().mount(*given, ctypes.c_ulong(flags), data.encode() or None) != 0:
         raise last_error()

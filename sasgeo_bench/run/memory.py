@@ -100,6 +100,7 @@ class _Shared:
 
     @property
     def bytes(self) -> int:
+        """All of it, each once."""
         return sum(self.sizes.values()) + self.scratch_bytes
 
 

@@ -48,7 +48,7 @@ def enter_root(scratch: str, *, shown: Iterable[str], hidden: Sequence[str], scr
     Parameters
     ----------
     scratch : str
-        An empty folder: at its path lies the only folder that can be written, in memory.
+        An empty folder, resolved: at its path lies the only folder that can be written, in memory.
     shown : iterable of str
         Folders and files besides the system's.
     hidden : sequence of str

@@ -44,7 +44,7 @@ class Policy:
     readable : sequence of str
         Folders and files besides the system's that it may read.
     scratch : str
-        An empty folder, the only one it may write.
+        An empty folder, resolved, the only one it may write.
     hidden : sequence of str
         Folders and files it must not see, wherever they lie.
     memory_bytes, file_bytes, scratch_bytes : int
@@ -105,6 +105,9 @@ def enter(policy: Policy) -> Isolation:
     Isolation
         What the system offered.
     """
+    if os.path.realpath(policy.scratch) != policy.scratch:  # mounts are known by their resolved paths
+        message = f"{policy.scratch} leads elsewhere, expected a resolved folder"
+        raise OSError(message)
     hidden = outermost(policy.hidden)
     spaces = _enter_namespaces()
     is_apart = bool(spaces & CLONE_NEWPID)
@@ -240,7 +243,8 @@ def _write(path: str, text: str) -> bool:
 
 def _drop_powers() -> None:
     """Give back what root or a namespace of users brought: whoever may mount could take covers off again."""
-    kernel.prctl(kernel.PR_SET_NO_NEW_PRIVS, 1)
+    if not kernel.prctl(kernel.PR_SET_NO_NEW_PRIVS, 1):
+        return  # no Linux
     header, none = struct.pack("Ii", _CAPABILITIES, 0), bytes(24)
     if kernel.libc().capset(header, none) != 0:
         raise kernel.last_error()
@@ -280,6 +284,7 @@ class _Keeper:
         """Wait for a child and end as it did; by its signal, or by its signal's number and 128."""
 
         def end(number: int, frame: FrameType | None) -> NoReturn:
+            """Kill first, then end as a shell says it."""
             del frame
             self._kill(child)
             os._exit(_BY_SIGNAL + number)
@@ -327,7 +332,8 @@ def _kill(number: int) -> None:
 def _below(root: int) -> list[int]:
     """Numbers of the processes that came from one, as /proc shows them."""
     parents: dict[int, int] = {}
-    for name in os.listdir("/proc"):  # noqa: PTH208 - no pathlib before the door is shut
+    names = os.listdir("/proc") if os.path.isdir("/proc") else []  # noqa: PTH112, PTH208 - no pathlib yet
+    for name in names:
         try:
             with open(f"/proc/{name}/stat", "rb") as file:  # noqa: PTH123
                 parents[int(name)] = int(file.read().rpartition(b")")[2].split()[1])

@@ -104,11 +104,6 @@ def _refused(name: str) -> float:
     raise ValueError(message)
 
 
-def is_waiting(channel: socket.socket, deadline: float) -> bool:
-    """Whether anything has come, waiting until a deadline of `time.monotonic` at most."""
-    return bool(select.select([channel], [], [], max(0.0, deadline - time.monotonic()))[0])
-
-
 def _exactly(channel: socket.socket, count: int, deadline: float | None) -> bytes:
     parts = []
     while count:

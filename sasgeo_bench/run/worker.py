@@ -180,7 +180,7 @@ class Worker:
             return self._channel
         self.end()
         ours, theirs = socket.socketpair()
-        self._scratch = Path(tempfile.mkdtemp(prefix="sasgeo-matcher-"))
+        self._scratch = Path(tempfile.mkdtemp(prefix="sasgeo-matcher-")).resolve()
         command = _command(theirs.fileno(), is_shut_in=self.reach.is_shut_in)
         self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
             command,

@@ -49,6 +49,12 @@ def change_by_descriptor():
         os.fchmod(file.fileno(), 0o600)
 
 
+def change_program():
+    """Give our own program the mode it has: where this gets through, it is the real one."""
+    path = Path("/proc/self/exe")
+    path.chmod(path.stat().st_mode & 0o7777)
+
+
 def set_flags():
     with VICTIM.open("rb") as file:
         flags = bytearray(8)
@@ -148,8 +154,8 @@ ATTACKS = {
     "change a mode": lambda: VICTIM.chmod(0o644),
     "change the mode of a folder": lambda: SHOWN.chmod(0o755),
     "change a mode by descriptor": change_by_descriptor,
-    "change the mode of what came along": lambda: os.fchmod(0, 0o644),
-    "change the mode of our own program": lambda: Path("/proc/self/exe").chmod(0o755),
+    "change the mode of what came along": lambda: os.fchmod(0, 0o640),
+    "change the mode of our own program": change_program,
     "change an owner": lambda: os.chown(VICTIM, os.getuid(), os.getgid()),
     "change times": lambda: os.utime(VICTIM, (1, 1)),
     "set an attribute": lambda: os.setxattr(VICTIM, "user.x", b"x"),

@@ -24,6 +24,11 @@ def fill(file, count=TAKEN):
     HELD.append(file)
 
 
+def answer(channel, words):
+    """Answer what was asked first."""
+    wire.send(channel, {"status": "refused", "message": words, "nonce": ASKED.get("nonce")})
+
+
 def sleep():
     """Wait for the end."""
     while True:
@@ -85,7 +90,7 @@ def shares(channel):
             os.write(tell, b"x")
             sleep()
         os.read(ready, 1)
-    wire.send(channel, {"status": "ok"})
+    answer(channel, "ready")
     sleep()
 
 
@@ -102,7 +107,7 @@ def daemon(channel, lock):
         os._exit(0)
     os.wait()
     os.read(ready, 1)
-    wire.send(channel, {"status": "ok"})
+    answer(channel, "ready")
     sleep()
 
 
@@ -116,7 +121,7 @@ def forks(channel):
             count += 1
     except OSError:
         pass
-    wire.send(channel, {"status": "refused", "message": str(count)})
+    answer(channel, str(count))
     sleep()
 
 
@@ -124,6 +129,6 @@ if __name__ == "__main__":
     link = socket.socket(fileno=int(sys.argv[-1]))
     start, _ = wire.receive(link)
     os.chdir(start["scratch"])
-    wire.receive(link)
+    ASKED, _ = wire.receive(link)
     name, *arguments = start["spec"].split()
     globals()[name](link, *arguments)

@@ -82,7 +82,7 @@ def test_memory_counts_wherever_it_is_hidden(taker, spec, lacking, has_group):
 @pytest.mark.parametrize(("lacking", "has_group"), in_mode(MODES))
 def test_memory_that_several_processes_share_counts_once(taker, lacking, has_group):
     with taker("shares", lacking, has_group) as honest:
-        assert honest.load().status == "ok"
+        assert honest.load().message == "ready"
         assert not honest._memory.look()
         assert 150 * 2**20 < honest.peak_bytes < MOST
 
@@ -90,7 +90,7 @@ def test_memory_that_several_processes_share_counts_once(taker, lacking, has_gro
 @pytest.mark.parametrize(("lacking", "has_group"), in_mode(KEEPS))
 def test_a_daemon_does_not_outlive_its_run(taker, lock, lacking, has_group):
     with taker(f"daemon {lock}", lacking, has_group) as hostile, lock.open("rb") as file:
-        assert hostile.load().status == "ok"
+        assert hostile.load().message == "ready"
         with pytest.raises(BlockingIOError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         hostile.end()
@@ -113,7 +113,7 @@ worker._ANSWERS = (sys.argv[1],)
 worker.PROGRAM = worker.PROGRAM.replace("from", sys.argv[2] + "from", 1)
 reach = worker.Reach(readable=[Path(sys.argv[1]).parent, Path(sys.argv[3]).parent], hidden=[])
 hostile = worker.Worker(spec=f"daemon {sys.argv[3]}", reach=reach, limits=worker.Limits())
-print(hostile.load().status, flush=True)
+print(hostile.load().message, flush=True)
 time.sleep(1000)
 """
 
@@ -122,7 +122,7 @@ time.sleep(1000)
 def test_nothing_is_left_where_the_runner_is_killed(lock, lacking):
     command = [sys.executable, "-c", RUNNER, str(Path(__file__).with_name("takers.py")), lacking, str(lock)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as runner, lock.open("rb") as file:  # noqa: S603 - ours
-        assert runner.stdout.readline() == b"ok\n"
+        assert runner.stdout.readline() == b"ready\n"
         with pytest.raises(BlockingIOError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         runner.kill()

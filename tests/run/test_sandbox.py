@@ -5,6 +5,7 @@ import contextlib
 import ctypes
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.run import landlock, sandbox
+from sasgeo_bench.run import landlock, root, sandbox, seccomp
 
 HAS_SPACES = subprocess.run(["unshare", "-Urm", "true"], capture_output=True, check=False).returncode == 0  # noqa: S607
 HAS_LANDLOCK = sandbox.landlock_version() >= landlock.SCOPE_SINCE
@@ -68,6 +69,7 @@ GETS_THROUGH = {
     "change a mode": UNFILTERED,
     "change the mode of a folder": UNFILTERED,
     "change a mode by descriptor": UNFILTERED,
+    "change the mode of what came along": UNFILTERED,
     "change an owner": UNFILTERED,
     "change times": UNFILTERED,
     "set an attribute": UNFILTERED,
@@ -92,7 +94,7 @@ GETS_THROUGH = {
 # What nothing at all refuses depends on the machine: some refuse to trace others, or are run by nobody special.
 BY_MACHINE = {
     *("trace another process", "read the memory of another process", "change the kernel's settings"),
-    *("change the mode of what came along", "change the mode of our own program"),
+    "change the mode of our own program",
 }
 # What does not work within, by mode, and is no attack: where /dev/shm is the system's, and where modes are refused.
 LOST = {
@@ -136,7 +138,7 @@ class Place:
             folder.mkdir(parents=True)
         for path in (
             *(self.shown / name for name in ("truth/answers", "truths.parquet", "victim", "removed", "harmless")),
-            self.elsewhere / "secret",
+            *(self.elsewhere / name for name in ("secret", "input")),
         ):
             path.write_bytes(b"xx")
         sleeper = [
@@ -219,14 +221,15 @@ def shut_in(place, lacking, command, *, readable=None):
     }
     package = str(Path(sandbox.__file__).parents[2])
     arguments = [package, json.dumps(lacking), json.dumps(policy), *map(str, command)]
-    done = subprocess.run(  # noqa: S603 - ours
-        [sys.executable, "-I", "-S", "-c", PROGRAM, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        stdin=subprocess.DEVNULL,
-        env={"PATH": "/usr/bin:/bin", "TMPDIR": str(place.scratch), "HOME": str(place.scratch)},
-    )
+    with (place.elsewhere / "input").open("rb") as given:
+        done = subprocess.run(  # noqa: S603 - ours
+            [sys.executable, "-I", "-S", "-c", PROGRAM, *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            stdin=given,
+            env={"PATH": "/usr/bin:/bin", "TMPDIR": str(place.scratch), "HOME": str(place.scratch)},
+        )
     assert done.returncode == 0, done.stderr
     said, *printed = done.stdout.splitlines()
     return json.loads(said), "\n".join(printed)
@@ -264,3 +267,101 @@ def test_every_attack_gets_as_far_as_is_said_and_nothing_harmless_is_lost(tmp_pa
     truth, network, processes = SAID[mode]
     assert (said["truth"], said["network"], said["processes"]) == (truth, network, processes)
     assert said["scratch"] == (ON_DISC if mode in GETS_THROUGH["fill the disc"] else IN_MEMORY)
+
+
+def needs(*modes):
+    """Modes that can be made here."""
+    return pytest.mark.parametrize("mode", [mode for mode in modes if can_be_made(mode)])
+
+
+READS = """
+import json, sys
+found = []
+for path in sys.argv[1:]:
+    try:
+        found.append(open(path, "rb").read().decode())
+    except OSError:
+        found.append(None)
+print(json.dumps(found))
+"""
+
+
+@needs("all", "no /proc", "no namespaces")
+def test_whoever_works_in_the_root_of_all_folders_does_not_read_what_others_do_either(tmp_path, stack, mode):
+    place = Place(tmp_path, stack)
+    paths = [place.shown / "truth/answers", f"/proc/{place.other.pid}/cmdline", place.elsewhere / "secret"]
+    _, printed = shut_in(place, MODES[mode], ["-c", READS, *paths], readable="/")
+    assert json.loads(printed) == [None, None, "xx" if mode == "no namespaces" else None]
+
+
+@needs("all", "no namespaces")
+def test_code_is_found_by_the_links_that_lead_to_it(tmp_path, stack, mode):
+    place = Place(tmp_path, stack)
+    (place.elsewhere / "deep").mkdir()
+    (place.elsewhere / "deep/code").symlink_to("../../shown")
+    (tmp_path / "first").symlink_to(place.elsewhere)
+    link = tmp_path / "first/deep/code"
+    names = ("harmless", "truth/answers", "../secret")
+    _, printed = shut_in(place, MODES[mode], ["-c", READS, *(link / name for name in names)], readable=str(link))
+    assert json.loads(printed) == ["xx", None, None]
+
+
+WRITES = """
+import sys
+for path in sys.argv[1:]:
+    try:
+        open(path, "ab").write(b"y")
+    except OSError:
+        continue
+    print(path)
+"""
+
+
+@needs("all", "no Landlock")
+@pytest.mark.parametrize("readable", ["", "shown"], ids=["scratch within the code", "apart"])
+def test_folders_of_any_name_are_read_only_but_for_the_scratch_folder(tmp_path, stack, mode, readable):
+    place = Place(tmp_path / "ä b\\040c", stack)
+    paths = [place.scratch / "made", place.shown / "harmless", place.shown / "made", place.elsewhere / "secret"]
+    _, printed = shut_in(place, MODES[mode], ["-c", WRITES, *paths], readable=str(place.shown.parent / readable))
+    assert printed.splitlines() == [str(place.scratch / "made")]
+    assert list(place.scratch.iterdir()) == []
+
+
+@needs("no Landlock")
+def test_the_root_holds_what_is_needed_alone(tmp_path, stack, mode):
+    place = Place(tmp_path, stack)
+    code = {sys.prefix, sys.base_prefix, os.path.realpath(sys.executable), str(HERE), str(tmp_path)}
+    listing = "import json, os; print(json.dumps([os.listdir(path) for path in ('/', '/dev')]))"
+    _, printed = shut_in(place, MODES[mode], ["-c", listing])
+    found, devices = json.loads(printed)
+    system = {path.split("/")[1] for path in (*root.SYSTEM, *code, "/dev")}
+    assert set(found) <= system
+    assert (
+        {Path(path).name for path in root.DEVICES}
+        < set(devices)
+        <= {
+            *(Path(path).name for path in root.DEVICES),
+            *("shm", "fd", "stdin", "stdout", "stderr"),
+        }
+    )
+
+
+def test_what_a_link_leads_to_beside_something_hidden_is_not_read(tmp_path):
+    inside, elsewhere = tmp_path / "inside", tmp_path / "elsewhere"
+    (inside / "truth").mkdir(parents=True)
+    elsewhere.mkdir()
+    (inside / "link").symlink_to(elsewhere)
+    found = [path for path, _ in landlock.around(str(inside), [str(inside / "truth")])]
+    assert found == [str(inside)]
+
+
+def test_numbers_of_refused_calls_are_those_of_this_system():
+    header = Path("/usr/include/x86_64-linux-gnu/asm/unistd_64.h")
+    if os.uname().machine != "x86_64" or not header.is_file():
+        pytest.skip("no list of this system's calls is installed")
+    known = dict(re.findall(r"#define __NR_(\w+) (\d+)", header.read_text(encoding="utf-8")))
+    refused = [call.split() for call in ", ".join((*seccomp.DANGEROUS, *seccomp.METADATA)).split(", ")]
+    assert {name: known[name] for name, _, _ in refused if name in known} == {
+        name: number for name, number, _ in refused if name in known
+    }
+    assert len([name for name, _, _ in refused if name in known]) > 50

@@ -174,4 +174,5 @@ def test_other_maps_are_hidden_and_all_of_them_where_only_the_card_is_read(pair,
     reach = answers.reach_of(plan.request, (plan.parts[0].region,))
     assert regions / COPY in reach.hidden
     assert regions / TOWN not in reach.hidden
+    assert place / "out" / "tasks" in reach.hidden  # a query comes to whom it is asked
     assert {regions / COPY, regions / TOWN} <= set(answers.reach_of(plan.request, ()).hidden)

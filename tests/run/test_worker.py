@@ -110,7 +110,12 @@ def test_truths_of_other_runs_beside_the_code_are_out_of_reach_too(place, task, 
 
 TELLS = (
     *("results/base/pack.json", "results/base/predictions/a.parquet", "results/base/more/deep/a.parquet"),
-    *("kept/truths.parquet", "copied/clean/vaduz/truth.parquet", "copied/clean/vaduz/truth.json"),
+    *(
+        "kept/truths.parquet",
+        "asked/clean/vaduz/queries.parquet",
+        "copied/clean/vaduz/truth.parquet",
+        "copied/clean/vaduz/truth.json",
+    ),
     *("data/truth/clean/vaduz/truth-test.parquet", "answered/part-1-2.parquet", ".git/objects/ab/cd"),
 )
 FOLDERS_THAT_TELL = (

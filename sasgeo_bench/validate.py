@@ -10,7 +10,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import MatchError, PoseError, StoreError, counted
 from sasgeo_bench.matcher import MOST_CANDIDATES, Match, check_match
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import TASK_VERSION, Head, PriorGroup
+from sasgeo_bench.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.results import STATUSES
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
@@ -129,7 +129,7 @@ def submission_faults(
         If a file cannot be read, or a task is of another version.
     """
     yield from _said_faults(said, board, places)
-    if tasks is None or said.task_version != TASK_VERSION:
+    if tasks is None or said.task_version not in TASK_VERSIONS:
         return
     named = {(item.suite, item.region) for item in said.tasks}
     mine = [task for task in tasks if _name_of(task) in named]
@@ -157,7 +157,7 @@ def submission_faults(
 
 def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
     """What a submission says of itself that does not fit a board."""
-    if said.task_version != TASK_VERSION:
+    if said.task_version not in TASK_VERSIONS:
         yield Violation(
             file=SAID,
             row=-1,

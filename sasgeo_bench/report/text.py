@@ -310,8 +310,9 @@ def board_markdown(
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
     steps: pd.DataFrame | None = None,
+    ages: pd.DataFrame | None = None,
 ) -> str:
-    """The board as a document; `steps` are those of `steps.steps_frame`."""
+    """The board as a document; `steps` are those of `steps.steps_frame`, `ages` of `plottables.ages_frame`."""
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
         "",
@@ -328,7 +329,7 @@ def board_markdown(
         lines += ["## Falsifiers", "", _FALSIFIERS_NOTE, "", *markdown_table(falsifier_table(falsifiers)), ""]
     for title, table in tables_of(board):
         lines += [f"## {title}", "", *markdown_table(table), ""]
-    for title, table in step_tables(steps) if steps is not None else ():
+    for title, table in step_tables(steps, ages) if steps is not None else ():
         lines += [f"## {title}", "", *markdown_table(table), ""]
     if verdicts:
         lines += ["## Controls", "", _CONTROLS_NOTE, "", *markdown_table(control_table(verdicts)), ""]
@@ -336,19 +337,22 @@ def board_markdown(
     return "\n".join(lines)
 
 
-def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+def step_tables(steps: pd.DataFrame, ages: pd.DataFrame | None = None) -> Iterator[tuple[str, pd.DataFrame]]:
     """Success along each ladder of strengths, each with its title: a matcher a line, a step a column.
 
     Parameters
     ----------
     steps : pandas.DataFrame
         From `steps.steps_frame`.
+    ages : pandas.DataFrame, optional
+        From `plottables.ages_frame`: steps that are ages of a map are named by the ages that their maps have.
 
     Yields
     ------
     tuple of str, pandas.DataFrame
         Figures with intervals; strength 0 is the control.
     """
+    named = _names_of_ages(ages)
     for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
         suite, track, prior_group, kind, unit = map(str, key)
         most = part.groupby(["view_cells", "strength"], sort=True)["n"].max().reset_index()
@@ -357,7 +361,9 @@ def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         for matcher, mine in part.groupby("matcher", sort=True):
             at = {(row["view_cells"], row["strength"]): row for _, row in mine.iterrows()}
             cells = {
-                f"{strength:g}, {size} cells, n = {n}": figure_text(at[size, strength])
+                f"{named.get((*key[:3], strength, size), f'{strength:g}')}, {size} cells, n = {n}": figure_text(
+                    at[size, strength]
+                )
                 if (size, strength) in at
                 else "-"
                 for size, strength, n in counts
@@ -365,6 +371,17 @@ def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             rows.append({"matcher": str(matcher), **cells, "_key": -mine["value"].mean()})
         table = pd.DataFrame(rows).sort_values(["_key", "matcher"], kind="stable").drop(columns="_key")
         yield f"{suite}, {track}, prior group {prior_group}, step by step: {kind} ({unit})", table
+
+
+def _names_of_ages(ages: pd.DataFrame | None) -> dict[tuple[Any, ...], str]:
+    """By suite, track, prior group, strength and size of view: from which to which age the maps of a step are."""
+    if ages is None:
+        return {}
+    columns = [ages[name] for name in (*GROUP, "strength", "view_cells", "age_least", "age_most")]
+    spans = {tuple(key): (f"{least:.1f}", f"{most:.1f}") for *key, least, most in zip(*columns, strict=True)}
+    return {
+        key: f"{least} years" if least == most else f"{least} to {most} years" for key, (least, most) in spans.items()
+    }
 
 
 _FALSIFIERS_NOTE: Final = (

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.evidence import CELLS_PER_BYTE
-from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
+from sasgeo_bench.query import TASK_VERSION, TASK_VERSIONS, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.store.regiondir import file_record, sha256_of
 from sasgeo_bench.store.taskrows import (
@@ -44,6 +44,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9+@._-]*")  # of a suite or a re
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
 _SAID: Final = ("suite", "title", "region", "map_fingerprint", "counts", "files")  # what readers of `task.json` rely on
+_READ: Final = " and ".join(map(str, TASK_VERSIONS))  # versions of tasks that are read
 
 
 def write_task(
@@ -165,15 +166,15 @@ def read_task(folder: Path) -> dict[str, Any]:
         message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: make the queries again"
         raise StoreError(message)
     version = content.get("task_version")
-    if not missing and version != TASK_VERSION:
-        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
+    if not missing and version not in TASK_VERSIONS:
+        message = f"{path} has task version {version!r}, this version reads {_READ}: make the queries again"
         raise StoreError(message)
     if missing:
         message = f"{path} is damaged (it does not say {', '.join(missing)}): make the queries again"
         raise StoreError(message)
     version = content.get("task_version")
-    if version != TASK_VERSION:
-        message = f"{path} has task version {version!r}, this version reads {TASK_VERSION}: make the queries again"
+    if version not in TASK_VERSIONS:
+        message = f"{path} has task version {version!r}, this version reads {_READ}: make the queries again"
         raise StoreError(message)
     return dict(content)
 
@@ -275,10 +276,9 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
         raise StoreError(message)
     with _named(truth_folder / TRUTH):
         version = (pq.read_schema(truth_folder / TRUTH).metadata or {}).get(b"task_version", b"none").decode()
-    if version != str(TASK_VERSION):
+    if version not in map(str, TASK_VERSIONS):
         message = (
-            f"{truth_folder} holds truths of task version {version}, this version reads {TASK_VERSION}: "
-            "make the queries again"
+            f"{truth_folder} holds truths of task version {version}, this version reads {_READ}: make the queries again"
         )
         raise StoreError(message)
 

@@ -2,6 +2,7 @@
 """Contact sheets and maps of splits: the colours say what they must, the pictures have the size they should."""
 
 import datetime as dt
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,13 +20,16 @@ from sasgeo_bench.split import make_split
 from sasgeo_bench.store.catalog import find_split_file, list_region_files, read_region_file, read_split_file
 from sasgeo_bench.store.sheet import (
     AGREE,
+    DECOY,
     GROUND,
     HIDDEN,
     ONLY_MAPPED,
     ONLY_SEEN,
+    TWIN,
     Panel,
     paint,
     paint_difference,
+    sheet_figure,
     write_sheet,
 )
 from sasgeo_bench.store.splitmap import COLOURS, colour_of, write_split_map
@@ -115,6 +119,19 @@ def test_a_sheet_has_a_row_for_each_query_and_a_column_more_for_vectors(rows, ha
     height, width, _ = cv2.imread(str(path)).shape
     assert width == pytest.approx(100 * (2.6 + 2.1 * (5 if has_vectors else 4)), abs=1)
     assert height == pytest.approx(100 * (1.2 + 2.2 * rows), abs=1)
+
+
+def test_a_sheet_names_what_its_last_map_is_of():
+    names = [axes.get_title() for axes in sheet_figure("Some", [replace(panel(), rival=TWIN), panel()]).axes]
+    assert names[3] == f"{TWIN} / {DECOY}"
+    assert sheet_figure("Some", [panel()]).axes[3].get_title() == DECOY
+
+
+def test_a_sheet_says_how_old_a_map_is_and_not_how_old_it_was_to_be():
+    aged = panel(role="stress", kind="S1", strength=5.0, strength_unit="years", measured={"age_years": 3.58})
+    words = " ".join(text.get_text() for text in sheet_figure("Some", [aged]).texts)
+    assert "map 3.6 years old (step 5)" in words
+    assert "5 (years)" not in words
 
 
 def test_a_sheet_shows_a_query_without_a_place_and_is_the_same_each_time(tmp_path):

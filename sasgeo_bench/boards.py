@@ -26,7 +26,7 @@ from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, ver
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.report.latex import board_latex
-from sasgeo_bench.report.plottables import ages_frame
+from sasgeo_bench.report.plottables import age_names, ages_frame
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
@@ -421,7 +421,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
                 board.falsifiers,
                 board.verdicts,
                 steps,
-                ages_frame(steps, queries, board.measured),
+                age_names(ages_frame(steps, queries, board.measured)),
             ),
             "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },

@@ -310,9 +310,9 @@ def board_markdown(
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
     steps: pd.DataFrame | None = None,
-    ages: pd.DataFrame | None = None,
+    ages: Mapping[tuple[Any, ...], str] | None = None,
 ) -> str:
-    """The board as a document; `steps` are those of `steps.steps_frame`, `ages` of `plottables.ages_frame`."""
+    """The board as a document; `steps` are those of `steps.steps_frame`, `ages` of `plottables.age_names`."""
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
         "",
@@ -337,22 +337,24 @@ def board_markdown(
     return "\n".join(lines)
 
 
-def step_tables(steps: pd.DataFrame, ages: pd.DataFrame | None = None) -> Iterator[tuple[str, pd.DataFrame]]:
+def step_tables(
+    steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None
+) -> Iterator[tuple[str, pd.DataFrame]]:
     """Success along each ladder of strengths, each with its title: a matcher a line, a step a column.
 
     Parameters
     ----------
     steps : pandas.DataFrame
         From `steps.steps_frame`.
-    ages : pandas.DataFrame, optional
-        From `plottables.ages_frame`: steps that are ages of a map are named by the ages that their maps have.
+    ages : mapping, optional
+        From `plottables.age_names`: steps that are ages of a map are named by the ages that their maps have.
 
     Yields
     ------
     tuple of str, pandas.DataFrame
         Figures with intervals; strength 0 is the control.
     """
-    named = _names_of_ages(ages)
+    named = ages or {}
     for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
         suite, track, prior_group, kind, unit = map(str, key)
         most = part.groupby(["view_cells", "strength"], sort=True)["n"].max().reset_index()
@@ -371,17 +373,6 @@ def step_tables(steps: pd.DataFrame, ages: pd.DataFrame | None = None) -> Iterat
             rows.append({"matcher": str(matcher), **cells, "_key": -mine["value"].mean()})
         table = pd.DataFrame(rows).sort_values(["_key", "matcher"], kind="stable").drop(columns="_key")
         yield f"{suite}, {track}, prior group {prior_group}, step by step: {kind} ({unit})", table
-
-
-def _names_of_ages(ages: pd.DataFrame | None) -> dict[tuple[Any, ...], str]:
-    """By suite, track, prior group, strength and size of view: from which to which age the maps of a step are."""
-    if ages is None:
-        return {}
-    columns = [ages[name] for name in (*GROUP, "strength", "view_cells", "age_least", "age_most")]
-    spans = {tuple(key): (f"{least:.1f}", f"{most:.1f}") for *key, least, most in zip(*columns, strict=True)}
-    return {
-        key: f"{least} years" if least == most else f"{least} to {most} years" for key, (least, most) in spans.items()
-    }
 
 
 _FALSIFIERS_NOTE: Final = (

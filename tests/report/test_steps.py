@@ -4,7 +4,7 @@
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.report.plottables import ages_frame
+from sasgeo_bench.report.plottables import age_names, ages_frame
 from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.strata import strata
 from sasgeo_bench.report.tables import leaderboard
@@ -45,7 +45,7 @@ def test_steps_that_are_ages_of_a_map_are_named_by_the_ages_that_maps_have():
         name: {"age_years": years[strength][one]}
         for name, strength, one in zip(queries["query_id"], queries["strength"], at, strict=True)
     }
-    ((_, table),) = step_tables(steps, ages_frame(steps, queries, measured))
+    ((_, table),) = step_tables(steps, age_names(ages_frame(steps, queries, measured)))
     names = ("0.0 years", "1.9 to 2.2 years", "3.6 to 6.0 years")
     assert list(table.columns) == ["matcher", *(f"{name}, 192 cells, n = 40" for name in names)]
 

@@ -18,7 +18,7 @@ from sasgeo_bench.panels import panels
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.query import CONTROLS, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.report.cases import MOST_CASES, OPERATING, find_cases, operating_rejector, sample_cases
+from sasgeo_bench.report.cases import COLUMNS, MOST_CASES, OPERATING, find_cases, operating_rejector, sample_cases
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.report.plottables import shown_matchers
 from sasgeo_bench.results import one_line
@@ -38,6 +38,7 @@ MOST_BYTES: Final = 3_000_000  # of all pictures of a board
 _THUMB_CELLS: Final = 1100  # a level of the layers that is not much finer than a thumbnail
 _SHEET_DPI: Final = 72
 _EACH: Final = 4  # cases of one class and matcher
+_CLASSED: Final = ("matcher", "query_id", "failure")  # of a case
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.@+]+")
 
 
@@ -86,7 +87,8 @@ def pictures_extra(
     contrasts : sequence of Contrast
         Those that were registered.
     kept : Path, optional
-        Stored results that the board is made of: they hold no views, so that their pictures are taken as they are.
+        Stored results that the board is made of: they hold no views, so that their pictures are taken as they are, but
+        for cases whose class of failure is another one now.
     has_cases : bool
         Whether queries that went wrong are shown, with their truths.
 
@@ -96,7 +98,7 @@ def pictures_extra(
         Without a picture where there is none.
     """
     if kept is not None:
-        return _kept(kept, tell, has_cases=has_cases)
+        return _kept(kept, tell, _failures(board, contrasts) if has_cases else None)
     found = _Found()
     asked = [about for about in board.tasks if about["suite"] != CONTROLS]
     _add_regions(found, asked, root)
@@ -115,22 +117,26 @@ def _with_list(files: Mapping[str, bytes], said: Mapping[str, Any]) -> dict[str,
     return {**files, PICTURES_SAID: json_text(content).encode()}
 
 
-def _kept(folder: Path, tell: Tell, *, has_cases: bool) -> Extra:
-    """Pictures of stored results as they are, without cases where none are wanted."""
+def _kept(folder: Path, tell: Tell, failures: pd.DataFrame | None) -> Extra:
+    """Pictures of stored results as they are; of cases, where some are wanted, those that are still of their class."""
     files = read_pictures(folder)
     if PICTURES_SAID not in files:
         tell(f"no pictures: {folder} holds none, and no views to draw them of")
         return Extra()
     tell(f"pictures are those that {folder} holds: there are no views to draw them anew")
-    if has_cases:
-        return Extra(pictures=files)
+    named = () if failures is None else zip(*(failures[name] for name in _CLASSED), strict=True)
+    classed = {tuple(map(str, names)) for names in named}
     try:
         said = parse_json(files[PICTURES_SAID])
-        said["cases"] = []
-    except (ValueError, TypeError) as error:
+        cases = list(said["cases"])
+        said["cases"] = [one for one in cases if tuple(str(one[name]) for name in _CLASSED) in classed]
+        lost = {str(one["file"]) for one in cases} - {str(one["file"]) for one in said["cases"]}
+    except (ValueError, TypeError, KeyError) as error:
         message = f"{folder / PICTURES / PICTURES_SAID} is damaged: remove the folder, or fetch it again"
         raise StoreError(message) from error
-    left = {name: data for name, data in files.items() if not name.startswith("cases/") and name != PICTURES_SAID}
+    if lost and failures is not None:
+        tell(f"left out: {counted(len(lost), 'picture')} of cases whose class of failure is another one now")
+    left = {name: data for name, data in files.items() if name not in lost and name != PICTURES_SAID}
     return Extra(pictures=_with_list(left, said))
 
 
@@ -179,7 +185,7 @@ def _add_suites(found: _Found, asked: Sequence[Mapping[str, Any]], board: Board,
         rank = -sum(weight for role, weight in (("stress", 2), ("control", 1)) if role in roles)
         best[suite] = min(best.get(suite, (1, "", about)), (rank, region, about), key=lambda item: item[:2])
     for suite, (_, region, about) in sorted(best.items()):
-        alt = f"Example of {suite} on {region}: view, map at the true place, difference, hardest decoy"
+        alt = f"Example of {suite} on {region}: view, map at the true place, difference, twin or hardest decoy"
         found.add("suites", suite, partial(_example, about, root), {"suite": suite, "alt": alt})
 
 
@@ -211,16 +217,9 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
 
 
 def _add_cases(found: _Found, board: Board, contrasts: Sequence[Contrast], root: Path) -> None:
-    shown = [name for name in shown_matchers(board.table, contrasts) if name in board.scores]
-    frames = []
-    for name in shown:
-        rejector = operating_rejector(board.judged, name, contrasts)
-        judged = None if rejector is None else board.judged[name, rejector]
-        frames.append(find_cases(board.scores[name], name, judged))
-    if not frames:
-        return
-    chosen = sample_cases(pd.concat(frames, ignore_index=True), each=_EACH, most=MOST_CASES)
-    words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in shown}
+    failures = _failures(board, contrasts)
+    chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
+    words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
     about = {(str(item["suite"]), str(item["region"])): item for item in board.tasks}
     drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
     for case in _cases(drawn, board, words, root, found):
@@ -238,6 +237,17 @@ def _add_cases(found: _Found, board: Board, contrasts: Sequence[Contrast], root:
         )
     order = {key: at for at, key in enumerate(drawn)}
     found.said["cases"].sort(key=lambda one: order[one["query_id"], one["matcher"]])
+
+
+def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
+    """Every failure of the matchers that a board shows, with its class."""
+    frames = [pd.DataFrame(columns=list(COLUMNS))]
+    for name in shown_matchers(board.table, contrasts):
+        if name in board.scores:
+            rejector = operating_rejector(board.judged, name, contrasts)
+            judged = None if rejector is None else board.judged[name, rejector]
+            frames.append(find_cases(board.scores[name], name, judged))
+    return pd.concat(frames, ignore_index=True)
 
 
 def _drawn(case: Case, region: Path, about: Mapping[str, Any]) -> bytes:

@@ -28,6 +28,7 @@ from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, ver
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.report.latex import board_latex
+from sasgeo_bench.report.plottables import age_names, ages_frame
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
@@ -411,7 +412,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
     seed = seed_of(board.tasks)
     return {
         "scorer_version": SCORER_VERSION,
-        "task_version": TASK_VERSION,
+        "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
         "data_version": DATA_VERSION,
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "libraries": _libraries(),
@@ -456,6 +457,8 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
 def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
     about = _about(request, board, cards)
     scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
+    queries = queries_of(board.scores)
+    steps = steps_frame(board.table, queries, sorted(board.scores))
     write_board(
         request.board,
         tables={
@@ -473,7 +476,8 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
                 board.findings,
                 board.falsifiers,
                 board.verdicts,
-                steps_frame(board.table, queries_of(board.scores), sorted(board.scores)),
+                steps,
+                age_names(ages_frame(steps, queries, board.measured)),
             ),
             "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
         },

@@ -25,6 +25,7 @@ from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.caseplot import CasePicture, MapPart
 from sasgeo_bench.store.layerfile import read_layers
 from sasgeo_bench.store.preview import paint_overview
+from sasgeo_bench.store.sheet import strength_text
 from sasgeo_bench.tasks import built_anew
 
 _MOST_CELLS: Final = 560  # of a piece of a map, along a side: more are no more to see
@@ -205,7 +206,7 @@ def _seen_at(pose: Pose | None, case: Case, bits: LayerBits, grid: Grid, manifes
 
 def _title(case: Case) -> str:
     truth, query = case.truth, case.query
-    what = truth.kind if truth.role == "control" else f"{truth.kind}, strength {truth.strength:g}"
+    what = truth.kind if truth.role == "control" else f"{truth.kind}, {strength_text(truth)}"
     return (
         f"{case.failure or 'no failure'}: {case.matcher} on {query.suite} / {query.region} ({what}; {query.track})\n"
         f"query {query.query_id}"

@@ -10,13 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.evidence import PRESENT
 from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
+from sasgeo_bench.query import TWIN_EAST, TWIN_NORTH, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.split import Block, Split
-from sasgeo_bench.suites.base import EVERYTHING, Choice, Draft, Scene, Seeds, Site, State, Suite, Variant, changed_share
+from sasgeo_bench.suites.base import (
+    DRAWN_CLASSES,
+    EVERYTHING,
+    Choice,
+    Draft,
+    Scene,
+    Seeds,
+    Site,
+    State,
+    Suite,
+    Variant,
+    changed_share,
+)
 from sasgeo_bench.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, least_apart_m, mine
 
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
+LEAST_DRAWN: Final = 0.01  # of a view's cells: a map that shows less at the truth leaves nothing to find it by
+UNANSWERABLE: Final = "unanswerable"  # measured: 1 where the searched map shows less than that
 LEAST_CANDIDATES: Final = 4  # the truth among them: where fewer places keep their distance there is no retrieval
 _SAMPLES: Final = 256
 _GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # a turn that never comes back to itself: evenly spread points
@@ -70,12 +85,21 @@ class Drawer:
     def _site_seeds(self, site: Site) -> Seeds:
         return self.seeds.under("site", site.index)
 
-    def can_draw(self, job: Job) -> bool:
-        """Whether there are enough candidates: with a handful of candidates a retrieval query decides nothing."""
+    def why_not(self, job: Job) -> str | None:
+        """Why a query is not asked, or None: next to nothing is drawn at its site, or there are few candidates.
+
+        Sites were chosen by what is drawn in the suite's main view: of a smaller view at the same place it may be next
+        to nothing. What counts is the map without a stress, so that stresses are left out with their control. With a
+        handful of candidates a retrieval query decides nothing.
+        """
+        is_smaller = job.variant.side_m < self.suite.main_side_m
+        if is_smaller and drawn_share(self.scene.map, job.site.pose, job.variant) < LEAST_DRAWN:
+            return f"less than {LEAST_DRAWN:.0%} of the map is drawn there"
         if job.track != "retrieval":
-            return True
+            return None
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))
-        return len(self._decoys(state, job)) >= LEAST_CANDIDATES
+        is_choice = len(self._decoys(state, job)) >= LEAST_CANDIDATES
+        return None if is_choice else f"fewer than {LEAST_CANDIDATES} candidates"
 
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""
@@ -155,8 +179,20 @@ class Drawer:
             alias_index=decoys.alias_index if draft.has_pose and draft.pose is None else None,
             block=site.block,
             scene=",".join(self.scene.scenes),
-            measured=draft.measured,
+            measured=draft.measured
+            | self._twin(site, draft)
+            | _unanswerable(draft, state, draft.pose or site.pose, variant),
         )
+
+    def _twin(self, site: Site, draft: Draft) -> dict[str, float]:
+        """How far east and north of the site its first twin lies, where there is one: what a sheet shows beside it."""
+        twins = self.scene.twins.get(site.index, ())
+        if not (twins and draft.has_twins and draft.has_pose) or draft.pose is not None:
+            return {}
+        return {
+            TWIN_EAST: round(twins[0][0] - site.pose.easting_m, 2),
+            TWIN_NORTH: round(twins[0][1] - site.pose.northing_m, 2),
+        }
 
     def _mined(self, state: State, site: Site, side_m: float) -> Decoys:
         center_m = (site.pose.easting_m, site.pose.northing_m)
@@ -194,6 +230,19 @@ class Drawer:
         own = None if draft.is_removed else truth
         decoys_m = points[: total - (own is not None)]
         return candidates(own, decoys_m, yaw_deg=yaw_deg, jitter_m=_JITTER_M, rng=rng)
+
+
+def drawn_share(state: State, pose: Pose, variant: Variant) -> float:
+    """Share of the cells of a view in which a map shows a road, a building, water or another drawn thing."""
+    view = state.view(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+    layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
+    return float((view.cells[layers] == PRESENT).any(axis=0).mean())
+
+
+def _unanswerable(draft: Draft, state: State, pose: Pose, variant: Variant) -> dict[str, float]:
+    """A mark on queries at places of which the searched map shows next to nothing."""
+    is_blank = draft.has_pose and drawn_share(state, pose, variant) < LEAST_DRAWN
+    return {UNANSWERABLE: 1.0} if is_blank else {}
 
 
 def _clusters(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries of a task as panels of a contact sheet: the view, what the map shows at the truth, and the hardest decoy."""
+"""Queries of a task as panels of a contact sheet: the view, what the map shows at the truth, and at its rival."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -10,9 +10,9 @@ import numpy as np
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query, Truth
+from sasgeo_bench.query import TWIN_EAST, TWIN_NORTH, Query, Truth
 from sasgeo_bench.store import regiondir, taskdir
-from sasgeo_bench.store.sheet import Panel
+from sasgeo_bench.store.sheet import TWIN, Panel
 from sasgeo_bench.suites.base import DRAWN_CLASSES, State, changed_share
 from sasgeo_bench.suites.mining import describe, mine
 from sasgeo_bench.tasks import built_anew
@@ -102,7 +102,7 @@ def _others(query: Query, truth: Truth) -> tuple[Pose, ...]:
 
 
 def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple[Pose, ...]]) -> Panel:
-    """What the map shows at the truth, and at the candidate that overlaps most with it.
+    """What the map shows at the truth, and at its twin; without a twin, at the candidate that overlaps most with it.
 
     A query without candidates takes those of another one at the same place, or what is mined where there is none.
     """
@@ -115,6 +115,11 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
         return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
 
     at_truth = view(truth.pose)
+    if TWIN_EAST in truth.measured:
+        easting_m = truth.pose.easting_m + truth.measured[TWIN_EAST]
+        northing_m = truth.pose.northing_m + truth.measured[TWIN_NORTH]
+        twin = view(replace(truth.pose, easting_m=easting_m, northing_m=northing_m))
+        return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=twin, rival=TWIN)
     near = _others(query, truth) or rivals.get(truth.pose, ())
     places = [(pose.easting_m, pose.northing_m) for pose in near]
     if not places:

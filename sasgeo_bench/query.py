@@ -11,7 +11,9 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.evidence import Evidence
 from sasgeo_bench.pose import Pose, Prior
 
-TASK_VERSION: Final = 1  # of queries.parquet and truth.parquet: raised whenever the same request gives other queries
+TWIN_EAST, TWIN_NORTH = "twin_east_m", "twin_north_m"  # measured: from a site to its copy
+TASK_VERSION: Final = 2  # of queries.parquet and truth.parquet: raised whenever the same request gives other queries
+TASK_VERSIONS: Final = (1, TASK_VERSION)  # those that are read: their files are alike, and answers belong to queries
 
 Track = Literal["retrieval", "localization"]
 Role = Literal["control", "stress", "falsifier"]

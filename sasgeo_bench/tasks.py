@@ -4,6 +4,7 @@
 import datetime as dt
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
@@ -16,8 +17,8 @@ import numpy as np
 
 from sasgeo_bench.ageing.ratebook import pool_rates
 from sasgeo_bench.build import build_edited, build_region, plan_build
-from sasgeo_bench.draw import LEAST_CANDIDATES, Drawer, Job
-from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
+from sasgeo_bench.draw import Drawer, Job
+from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.graph import build_graph
 from sasgeo_bench.layers import burn_layers, make_paint
@@ -279,8 +280,9 @@ def _edited(
         split=request.split,
         choice=request.choice,
     )
-    if not any(trial.can_draw(job) for job in trial.jobs(edit.sites)):
-        raise _too_small(request, suite)
+    reasons = Counter(map(trial.why_not, trial.jobs(edit.sites)))
+    if None not in reasons:
+        raise _nothing_to_ask(request, suite, reasons)
     plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
     world = scene.world
     if edit.world_pastes is not None:
@@ -295,8 +297,10 @@ def _edited(
     return replace(scene, map=edited, world=world, twins=edit.twins), edit.sites
 
 
-def _too_small(request: Request, suite: Suite) -> ConfigError:
-    return ConfigError(f"{request.region.id} is too small for suite {suite.card.name!r}: no decoys far enough away")
+def _nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]) -> ConfigError:
+    """An error that says why no query of a suite is asked of a region: mostly, for there may be several reasons."""
+    reason = reasons.most_common(1)[0][0]
+    return ConfigError(f"{request.region.id} is too small or too empty for suite {suite.card.name!r}: {reason}")
 
 
 def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
@@ -317,13 +321,15 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
 def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
     """Write one task for every map that is searched."""
     jobs = drawer.jobs(sites)
-    left = [job for job in jobs if drawer.can_draw(job)]
-    if len(left) < len(jobs):
-        where = f"{drawer.suite.card.name} on {request.region.id}"
-        tell(f"{where}: {len(jobs) - len(left)} retrieval queries left out, fewer than {LEAST_CANDIDATES} candidates")
+    why = {job.query_id: drawer.why_not(job) for job in jobs}
+    left = [job for job in jobs if why[job.query_id] is None]
+    reasons = Counter(why.values())
+    for reason in sorted(filter(None, reasons)):
+        said = f"{drawer.suite.card.name} on {request.region.id}"
+        tell(f"{said}: {counted(reasons[reason], 'query', 'queries')} left out, {reason}")
     by_map: dict[str, list[Job]] = {}
     if not left:
-        raise _too_small(request, drawer.suite)
+        raise _nothing_to_ask(request, drawer.suite, reasons)
     for job in left:
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name

@@ -13,7 +13,7 @@ from sasgeo_bench.bounds import MOST_CANDIDATES
 from sasgeo_bench.errors import MatchError, StoreError, counted
 from sasgeo_bench.matcher import Match, check_match
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import TASK_VERSION, Head, PriorGroup
+from sasgeo_bench.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
 from sasgeo_bench.store.runrows import differing_columns, prediction_of, row_faults
@@ -132,7 +132,7 @@ def submission_faults(
         If a file cannot be read, or a task is of another version.
     """
     yield from _said_faults(said, board, places)
-    if tasks is None or said.task_version != TASK_VERSION:
+    if tasks is None or said.task_version not in TASK_VERSIONS:
         return
     named = {(item.suite, item.region) for item in said.tasks}
     mine = [task for task in tasks if _name_of(task) in named]
@@ -162,7 +162,7 @@ def submission_faults(
 
 def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
     """What a submission says of itself that does not fit a board."""
-    if said.task_version != TASK_VERSION:
+    if said.task_version not in TASK_VERSIONS:
         yield Violation(
             file=SAID,
             row=-1,

@@ -58,6 +58,16 @@ SAID = [
     ("max", "green", "pooled", "vanish_per_year", 2),
     ("set by hand", "bridge", "", "vanish_per_year", 2),
     ("min", "bridge", "pooled", "vanish_per_year", 2),
+    *(
+        ("liechtenstein", "building", span, column, 1)
+        for span in (REDRAW, "whole")
+        for column in ("appeared_number_share", "appeared_share")
+    ),
+    *(
+        (place, "building", "whole", column, 1)
+        for place in ("faroe", "monaco")
+        for column in ("appeared_number_share", "appeared_share")
+    ),
 ]
 
 

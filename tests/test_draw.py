@@ -243,7 +243,7 @@ def sites(wide):
 @pytest.fixture(scope="module")
 def drawn(wide, sites):
     """Queries with their truths, one for each site and view that has decoys enough."""
-    return [wide.draw(job) for job in wide.jobs(sites) if wide.can_draw(job)]
+    return [wide.draw(job) for job in wide.jobs(sites) if wide.why_not(job) is None]
 
 
 def points_of(query):
@@ -403,7 +403,7 @@ def test_there_are_as_many_candidates_with_the_truth_and_twins_as_without_them(w
         jobs = {
             kind: Job(query_id="q", site=site, variant=variant, track="retrieval") for kind, variant in kinds.items()
         }
-        if not drawer.can_draw(jobs["no"]):
+        if drawer.why_not(jobs["no"]):
             continue
         answers = {kind: drawer.draw(job) for kind, job in jobs.items()}
         (count,) = {len(query.candidates) for query, _ in answers.values()}
@@ -423,7 +423,7 @@ def test_in_a_cluster_of_neighbours_any_of_them_may_be_the_true_one(wide, sites)
     offsets = []
     for site in sites:
         job = Job(query_id="q", site=site, variant=variant, track="retrieval")
-        if drawer.can_draw(job):
+        if drawer.why_not(job) is None:
             query, truth = drawer.draw(job)
             points = points_of(query)
             assert len(points) % 5 == 0

@@ -96,6 +96,23 @@ def test_stored_pictures_are_kept_without_cases_where_none_are_wanted(kept, tmp_
         pictures_extra(kept[0], tell=lines.append, root=tmp_path, kept=bare, has_cases=False)
 
 
+def test_a_stored_picture_of_a_case_whose_class_is_another_one_now_is_left_out(kept, tmp_path):
+    lines = []
+    board, _, folder, _ = kept
+    older = shutil.copytree(folder, tmp_path / "older")
+    said = json.loads((older / "pictures" / "pictures.json").read_text(encoding="utf-8"))
+    first, *rest = said["cases"]
+    assert rest
+    (older / "pictures" / "pictures.json").write_text(
+        json.dumps(said | {"cases": [first | {"failure": "aged"}, *rest]}), encoding="utf-8"
+    )
+    files = pictures_extra(board, tell=lines.append, root=tmp_path, kept=older).pictures
+    assert json.loads(files["pictures.json"])["cases"] == rest
+    assert first["file"] not in files
+    assert rest[0]["file"] in files
+    assert lines[-1] == "left out: 1 picture of cases whose class of failure is another one now"
+
+
 def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     board, plan, folder, lines = kept
     names = {path.name for path in folder.iterdir()}

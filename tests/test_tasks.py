@@ -288,7 +288,9 @@ def test_a_region_that_cannot_carry_a_suite_is_told_what_it_lacks(own_out):
 
 
 def test_a_region_too_small_for_decoys_is_refused_before_its_map_is_edited(own_out):
-    with pytest.raises(ConfigError, match="town-riverside is too small for suite 'alias': no decoys far enough away"):
+    with pytest.raises(
+        ConfigError, match="town-riverside is too small or too empty for suite 'alias': fewer than 4 candidates"
+    ):
         make(own_out, "alias")
     assert content(own_out) == {}
     assert not (own_out / "regions/town-riverside+alias").exists()

@@ -94,6 +94,25 @@ def ages_frame(steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str
     return steps.merge(found.rename(columns=names), on=[*GROUP, "strength", "view_cells"], how="inner")
 
 
+def age_names(ages: pd.DataFrame) -> dict[tuple[Any, ...], str]:
+    """From which to which age the maps of each step are, by suite, track, prior group, strength and size of view.
+
+    Parameters
+    ----------
+    ages : pandas.DataFrame
+        From `ages_frame`.
+
+    Examples
+    --------
+    >>> step = {"suite": "real-age", "track": "localization", "prior_group": "r500-weak-s3", "strength": 5.0}
+    >>> list(age_names(pd.DataFrame([step | {"view_cells": 192, "age_least": 3.58, "age_most": 6.0}])).values())
+    ['3.6 to 6.0 years']
+    """
+    columns = [ages[name] for name in (*GROUP, "strength", "view_cells", "age_least", "age_most")]
+    spans = {tuple(key): (f"{least:.1f}", f"{most:.1f}") for *key, least, most in zip(*columns, strict=True)}
+    return {key: f"{' to '.join(dict.fromkeys(ends))} years" for key, ends in spans.items()}
+
+
 def stress_frame(table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
     """The figure that matchers are ranked by on the stresses of each suite: rows of the leaderboard."""
     rows = table[(table["rejector"] == "") & table["matcher"].isin(list(shown)) & table["value"].notna()]

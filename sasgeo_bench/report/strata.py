@@ -22,6 +22,9 @@ _EDGES: Final = {  # fixed, so that boards can be compared
 }
 
 
+_MAPPING: Final = ("real-age",)  # suites whose maps differ mostly by how much was mapped, not by what was built
+
+
 def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
     """Names and masks, shape (N,), of every part of one suite that holds a query.
 
@@ -81,10 +84,14 @@ def control_name(view_cells: int) -> str:
 
 def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:
     """Bins of what was measured, without the controls."""
+    is_mapping = (
+        scores["suite"].isin(_MAPPING).to_numpy(bool) if "suite" in scores else np.zeros(len(scores), dtype=bool)
+    )
     for column, edges in _EDGES.items():
+        name = f"{column} (mostly mapping)" if column == "changed_share" and is_mapping.all() else column
         values = scores[column].to_numpy(float)
         for low, high in pairwise(edges):
             is_last = high == edges[-1]
             inside = counted & (values >= low) & ((values <= high) if is_last else (values < high))
             if inside.any():
-                yield f"{column} {low:g}-{high:g}", inside
+                yield f"{name} {low:g}-{high:g}", inside

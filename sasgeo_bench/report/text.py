@@ -314,8 +314,9 @@ def board_markdown(
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
     steps: pd.DataFrame | None = None,
+    ages: Mapping[tuple[Any, ...], str] | None = None,
 ) -> str:
-    """The board as a document; `steps` are those of `steps.steps_frame`."""
+    """The board as a document; `steps` are those of `steps.steps_frame`, `ages` of `plottables.age_names`."""
     lines = [
         f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
         "",
@@ -338,7 +339,7 @@ def board_markdown(
         lines += ["## Falsifiers", "", _FALSIFIERS_NOTE, "", *markdown_table(falsifier_table(falsifiers)), ""]
     for title, table in tables_of(board):
         lines += [f"## {markdown(title)}", "", *markdown_table(table), ""]
-    for title, table in step_tables(steps) if steps is not None else ():
+    for title, table in step_tables(steps, ages) if steps is not None else ():
         lines += [f"## {markdown(title)}", "", *markdown_table(table), ""]
     if verdicts:
         lines += ["## Controls", "", _CONTROLS_NOTE, "", *markdown_table(control_table(verdicts)), ""]
@@ -346,19 +347,24 @@ def board_markdown(
     return "\n".join(lines)
 
 
-def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+def step_tables(
+    steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None
+) -> Iterator[tuple[str, pd.DataFrame]]:
     """Success along each ladder of strengths, each with its title: a matcher a line, a step a column.
 
     Parameters
     ----------
     steps : pandas.DataFrame
         From `steps.steps_frame`.
+    ages : mapping, optional
+        From `plottables.age_names`: steps that are ages of a map are named by the ages that their maps have.
 
     Yields
     ------
     tuple of str, pandas.DataFrame
         Figures with intervals; strength 0 is the control.
     """
+    named = ages or {}
     for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
         suite, track, prior_group, kind, unit = map(str, key)
         most = part.groupby(["view_cells", "strength"], sort=True)["n"].max().reset_index()
@@ -367,7 +373,9 @@ def step_tables(steps: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         for matcher, mine in part.groupby("matcher", sort=True):
             at = {(row["view_cells"], row["strength"]): row for _, row in mine.iterrows()}
             cells = {
-                f"{strength:g}, {size} cells, n = {n}": figure_text(at[size, strength])
+                f"{named.get((*key[:3], strength, size), f'{strength:g}')}, {size} cells, n = {n}": figure_text(
+                    at[size, strength]
+                )
                 if (size, strength) in at
                 else "-"
                 for size, strength, n in counts

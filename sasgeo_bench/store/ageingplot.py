@@ -159,7 +159,7 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
     figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=6, frameon=False)
     note = (
         "What appears may be mapping that catches up. Rates beyond the scale lie on its edges. "
-        "Amount: ground or length; by number and by id: share of the things."
+        "Amount: ground or length; number and id: things."
     )
     figure.text(0.015, 0.33 / height, note, fontsize=8.5, color="#444444", va="top")
     figure.text(0.985, 0.33 / height, ATTRIBUTION, fontsize=8.5, va="top", ha="right")

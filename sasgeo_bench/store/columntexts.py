@@ -50,7 +50,7 @@ TRUTH_TEXTS: Final = {
     "strength": "step of the suite's ladder, in strength_unit; 0 for controls",
     "strength_unit": "unit of the strength",
     "unknown_share": "share of unknown cells",
-    "changed_share": "of what view or map show, the share that only one of them does",
+    "changed_share": "of what view or map show, the share that only one of them does; in real-age mostly mapping",
     "feature_density": "share of the place's map with a road, building or other drawn thing",
     "alias_index": "likeness of the likest other place, 0 to 1; null where the view was not taken at the site",
     "block": "evaluation block, region/row-column; resample by it, never by single queries",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contact sheets: of some queries of a task the view, the map at the true place, what differs, the likest decoy."""
+"""Contact sheets: of some queries the view, the map at the true place, what differs, and its twin or likest decoy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +27,9 @@ HIDDEN: Final = "#9e9e9e"
 ONLY_SEEN: Final = "#c2185b"
 ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
-_COLUMNS: Final = ("view", "map at the true place", "view against map", "hardest decoy")
+TWIN: Final = "map at the twin"
+DECOY: Final = "map at the hardest decoy"
+_COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _WORDS_INCHES: Final = 3.0  # the column of words, in letters that stay readable where the sheet is shown smaller
 _LETTERS: Final = 36  # in a line of it
@@ -36,12 +38,16 @@ _DPI: Final = 100
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """One row of a sheet: a query, its truth, and what the map shows there; None where there is no such place."""
+    """One row of a sheet: a query, its truth, and what the map shows there and at a rival; None for no such place.
+
+    `rival` names what that other place is: the twin that a suite made of the true place, or a decoy that is like it.
+    """
 
     query: Query
     truth: Truth
     at_truth: Evidence | None
     at_decoy: Evidence | None
+    rival: str = DECOY
 
 
 def paint(evidence: Evidence) -> NDArray[np.float64]:
@@ -89,7 +95,8 @@ def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
 def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Figure:
     """A contact sheet as a figure; see `write_sheet`."""
     has_vectors = any(panel.query.vectors is not None for panel in panels)
-    columns = (*_COLUMNS, "perceived vectors") if has_vectors else _COLUMNS
+    rivals = list(dict.fromkeys(panel.rival for panel in panels)) or [DECOY]
+    columns = (*_COLUMNS, " / ".join(rivals), *(("perceived vectors",) if has_vectors else ()))
     width, height = _WORDS_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
     figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
@@ -158,6 +165,21 @@ def _draw_vectors(chart: Axes, query: Query) -> None:
     chart.set_aspect("equal")
 
 
+def strength_text(truth: Truth) -> str:
+    """The step of a query; of an older map the age that it has, for its date is only the nearest there is to the step.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> strength_text(SimpleNamespace(strength=5.0, strength_unit="years", measured={"age_years": 3.58}))
+    'map 3.6 years old (step 5)'
+    """
+    age_years = truth.measured.get("age_years")
+    if age_years is None:
+        return f"strength {truth.strength:g} ({truth.strength_unit})"
+    return f"map {age_years:.1f} years old (step {truth.strength:g})"
+
+
 def _words(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
@@ -165,7 +187,7 @@ def _words(panel: Panel) -> tuple[str, ...]:
     measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items())
     return (
         f"{truth.role}: {truth.kind}",
-        f"strength {truth.strength:g} ({truth.strength_unit})",
+        strength_text(truth),
         f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
         f"priors {query.prior_group}; {len(query.candidates)} candidates"
         + (f", {len(query.vectors)} vectors" if query.vectors is not None else ""),

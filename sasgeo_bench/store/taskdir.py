@@ -14,7 +14,7 @@ from pydantic import Field
 
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.evidence import CELLS_PER_BYTE
-from sasgeo_bench.query import TASK_VERSION, Head, Query, Truth
+from sasgeo_bench.query import TASK_VERSION, TASK_VERSIONS, Head, Query, Truth
 from sasgeo_bench.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.store.jsonfile import read_json
 from sasgeo_bench.store.parquetfile import open_table, read_schema, read_table, table_writer
@@ -49,6 +49,7 @@ SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # a row group; what is held in memory at once
 _MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
+_READ: Final = " and ".join(map(str, TASK_VERSIONS))  # versions of tasks that are read
 
 
 class TaskFile(Document):
@@ -95,6 +96,7 @@ class TaskSaid(Document):
     counts: dict[str, Count]
     prior_groups: list[str] | None = None
     candidates_sha256: str | None = None
+    private_seed: dict[str, str | int] | None = None  # its commitment and bits
     files: TaskFiles
     licence: str | None = None
     attribution: str | None = None
@@ -203,10 +205,10 @@ def read_task(folder: Path) -> dict[str, Any]:
         raise StoreError(message)
     content = read_json(path, mend=_MEND)
     said = content if isinstance(content, dict) else {}
-    for name, known in (("schema_version", SCHEMA_VERSION), ("task_version", TASK_VERSION)):
-        if name in said and said[name] != known:
-            noun = name.replace("_", " ")
-            message = f"{path} has {noun} {said[name]!r}, this version reads {known}: {_MEND}"
+    for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):
+        if name in said and said[name] not in known:
+            noun, versions = name.replace("_", " "), " and ".join(map(str, known))
+            message = f"{path} has {noun} {said[name]!r}, this version reads {versions}: {_MEND}"
             raise StoreError(message)
     try:
         check_document(content, TaskSaid, source=TASK)
@@ -313,10 +315,9 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
         raise StoreError(message)
     metadata = read_schema(truth_folder / TRUTH, mend=_MEND).metadata or {}
     version = metadata.get(b"task_version", b"none").decode(errors="replace")
-    if version != str(TASK_VERSION):
+    if version not in map(str, TASK_VERSIONS):
         message = (
-            f"{truth_folder} holds truths of task version {version}, this version reads {TASK_VERSION}: "
-            "make the queries again"
+            f"{truth_folder} holds truths of task version {version}, this version reads {_READ}: make the queries again"
         )
         raise StoreError(message)
 

@@ -85,10 +85,11 @@ SUITE: Final = RealAgeSuite(
         name="real-age",
         version=1,
         title="Real ageing (S1)",
-        what="The map is that of an extract 2, 5 or 10 years older than the world that is seen.",
+        what="The map is that of an extract about 2, 5 or 10 years older than the world that is seen; the nearest date "
+        "there is stands for each. Most of what differs was mapped since, not built.",
         separates="Stability from uniform weights: stable classes should carry what volatile ones lost.",
         falsifier="The same views against the map of the same day.",
-        strength_unit="years between map and world",
+        strength_unit="years between map and world, about: age_years is what they are",
         needs=("older maps",),
     ),
     variants=(*controls(views=(96, 192, 384)), *ladder("S1", AGES_YEARS, small=AGES_YEARS, large=(10.0,))),

@@ -2,6 +2,7 @@
 """Contact sheets and maps of splits: the colours say what they must, the pictures have the size they should."""
 
 import datetime as dt
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -20,10 +21,12 @@ from sasgeo_bench.split import make_split
 from sasgeo_bench.store.catalog import find_split_file, list_region_files, read_region_file, read_split_file
 from sasgeo_bench.store.sheet import (
     AGREE,
+    DECOY,
     GROUND,
     HIDDEN,
     ONLY_MAPPED,
     ONLY_SEEN,
+    TWIN,
     Panel,
     paint,
     paint_difference,
@@ -123,6 +126,19 @@ def test_the_words_of_a_sheet_are_large_enough_to_read_and_end_before_the_pictur
     assert words.get_fontsize() >= 10
     assert words.get_window_extent(draw).x1 < min(chart.get_window_extent(draw).x0 for chart in figure.axes)
     assert words.get_window_extent(draw).y0 > 0
+
+
+def test_a_sheet_names_what_its_last_map_is_of():
+    names = [axes.get_title() for axes in sheet_figure("Some", [replace(panel(), rival=TWIN), panel()]).axes]
+    assert names[3] == f"{TWIN} / {DECOY}"
+    assert sheet_figure("Some", [panel()]).axes[3].get_title() == DECOY
+
+
+def test_a_sheet_says_how_old_a_map_is_and_not_how_old_it_was_to_be():
+    aged = panel(role="stress", kind="S1", strength=5.0, strength_unit="years", measured={"age_years": 3.58})
+    words = " ".join(text.get_text() for text in sheet_figure("Some", [aged]).texts)
+    assert "map 3.6 years old (step 5)" in words
+    assert "5 (years)" not in words
 
 
 def test_a_sheet_shows_a_query_without_a_place_and_is_the_same_each_time(tmp_path):

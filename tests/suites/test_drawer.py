@@ -7,10 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sasgeo_bench.draw import CANDIDATES, LEAST_CANDIDATES, Drawer, away, make_prior
+from sasgeo_bench.draw import CANDIDATES, LEAST_CANDIDATES, UNANSWERABLE, Drawer, away, make_prior
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.evidence import LayerBits
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import PriorGroup
+from sasgeo_bench.query import TWIN_EAST, TWIN_NORTH, PriorGroup
 from sasgeo_bench.split import SplitFile, make_split
 from sasgeo_bench.suites.mining import STRIDE_M, least_apart_m
 
@@ -44,7 +45,7 @@ def drawn(carried):
 
         split = make_split(spec, {name: grid if name == "here" else far(at) for at, name in enumerate(PLACES)})
         drawer = Drawer(suite=made.suite, scene=made.scene, seeds=made.seeds, group=made.suite.card.group, split=split)
-        jobs = [job for job in drawer.jobs(made.sites[:SITES]) if drawer.can_draw(job)]
+        jobs = [job for job in drawer.jobs(made.sites[:SITES]) if drawer.why_not(job) is None]
         return made, drawer, [drawer.draw(job) for job in jobs]
 
     return of_suite
@@ -160,7 +161,47 @@ def test_a_query_with_too_few_decoys_cannot_be_drawn(drawn):
         far = np.array([(10_000.0 * at, 0.0) for at in range(count)])
         few = replace(decoys, points_m=far, scorer=decoys.scorer[:1] * count)
         mined = {(made.scene.map.region, 192.0, job.site.index): few}
-        assert replace(drawer, mined=mined).can_draw(job) == can
+        assert (replace(drawer, mined=mined).why_not(job) is None) == can
+
+
+def test_a_query_at_a_place_of_which_the_map_shows_next_to_nothing_is_not_asked(drawn):
+    made, drawer, drafts = drawn("occlusion")
+    grid, shown = made.scene.map.grid, ("road_major", "green", "water")
+    jobs = [job for job in drawer.jobs(made.sites[:1]) if job.track == "localization"]
+    site, wide, narrow = made.sites[0], *(next(job for job in jobs if job.variant.view_cells == n) for n in (192, 96))
+    row, col = grid.to_cells(np.array([[site.pose.easting_m, site.pose.northing_m]]))[0].tolist()
+
+    def blank(name, cells):
+        """The map with nothing on it but one class, in a square of so many cells at the site."""
+        bits = np.zeros(grid.shape, dtype=np.uint32)
+        bits[row : row + cells, col : col + cells] = 1 << shown.index(name)
+        state = replace(made.scene.map, classes=shown, bits=LayerBits(bits=bits, count=len(shown)))
+        return replace(drawer, scene=replace(made.scene, map=state, world=state))
+
+    reason = "less than 1% of the map is drawn there"
+    assert blank("road_major", 9).why_not(narrow) == reason
+    assert blank("road_major", 12).why_not(narrow) is None
+    assert blank("green", 90).why_not(narrow) == reason  # ground cover is nothing to hold on to
+    assert blank("water", 90).why_not(narrow) is None
+    assert blank("green", 90).why_not(wide) is None  # a site was chosen by what is drawn in the main view
+    assert not any(UNANSWERABLE in truth.measured for _, truth in drafts)
+
+
+def test_a_query_that_asks_for_a_blank_place_is_marked_and_stays(drawn):
+    _, _, drafts = drawn("absent")
+    poor = [truth for _, truth in drafts if truth.measured.get("is_real_place") == 1.0]
+    assert poor
+    assert all(truth.measured[UNANSWERABLE] == 1.0 for truth in poor)
+
+
+def test_a_truth_says_where_the_twin_of_its_place_lies(drawn):
+    made, _, drafts = drawn("topology-twins")
+    assert drafts
+    for _, truth in drafts:
+        site = next(site for site in made.sites if site.pose == truth.pose)
+        east_m, north_m = made.scene.twins[site.index][0]
+        told = (truth.pose.easting_m + truth.measured[TWIN_EAST], truth.pose.northing_m + truth.measured[TWIN_NORTH])
+        np.testing.assert_allclose(told, (east_m, north_m), atol=0.01)
 
 
 def test_ids_say_nothing_and_do_not_depend_on_how_many_sites_there_are(drawn):

@@ -53,8 +53,9 @@ def check_shape(name: str, table: pd.DataFrame) -> None:
     if name != "leaderboard" and not len(table.columns):
         return
     for column, kind in _SHAPES[name].items():
-        if column not in table:
-            message = f"{name}.parquet has no column {column!r}: score it again"
+        if list(table.columns).count(column) != 1:
+            fault = "two columns" if column in table else "no column"
+            message = f"{name}.parquet has {fault} {column!r}: score it again"
             raise StoreError(message)
         if len(table) and not _is_of(table[column], kind):
             message = f"{name}.parquet: {column} holds something else than it should, or nothing: score it again"

@@ -22,7 +22,7 @@ from sasgeo_bench.bounds import (
 from sasgeo_bench.pose import Pose
 from sasgeo_bench.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.results import STATUSES, Prediction
-from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, poses_of
+from sasgeo_bench.store.taskrows import ASKED, POSE_FIELDS, is_like, poses_of
 
 SCHEMA_VERSION: Final = 1
 _CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
@@ -117,29 +117,8 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
     return twice or [
         (field.name, str(found.get(field.name, "nothing")), str(field.type))
         for field in PREDICTION_SCHEMA
-        if field.name not in found or not _is_like(found[field.name], field.type)
+        if field.name not in found or not is_like(found[field.name], field.type)
     ]
-
-
-def _is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
-    """Whether a column can be read as another: any float for a float, any string for a string, null for anything."""
-    if pa.types.is_null(found) or found.equals(wanted):
-        return True
-    if pa.types.is_floating(wanted):
-        return bool(pa.types.is_floating(found) or pa.types.is_integer(found))
-    if pa.types.is_string(wanted):
-        return bool(pa.types.is_string(found) or pa.types.is_large_string(found))
-    if pa.types.is_list(wanted):
-        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
-        return is_list and pa.types.is_struct(found.value_type) and _has_fields(found.value_type, wanted.value_type)
-    if not (pa.types.is_map(wanted) and pa.types.is_map(found)):
-        return False
-    return _is_like(found.key_type, wanted.key_type) and _is_like(found.item_type, wanted.item_type)
-
-
-def _has_fields(found: pa.StructType, wanted: pa.StructType) -> bool:
-    names = [field.name for field in found]
-    return all(names.count(field.name) == 1 and _is_like(found.field(field.name).type, field.type) for field in wanted)
 
 
 # --- rows that anybody may have written -------------------------------------------------------------------------------

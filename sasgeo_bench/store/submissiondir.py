@@ -249,8 +249,9 @@ def _check_file(path: Path, said: FileSaid) -> None:
 
 def _check_table(path: Path) -> None:
     """Refuse a table of another shape, and one that unpacks to more than anyone has to say."""
-    with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
+    with open_table(path, mend="submit again") as source:
         _check_schema(path, source.schema_arrow)
+    with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
         texts = source.read(columns=list(_TEXTS))  # each text once, however often it stands there
     for name in _TEXTS:
         known = (text for chunk in texts[name].chunks for text in chunk.dictionary if text.is_valid)

@@ -2,14 +2,15 @@
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 from pydantic import Field
 
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -23,10 +24,13 @@ from sasgeo_bench.store.taskrows import (
     ASKED,
     FILE_SCHEMA,
     HEAD_SCHEMA,
+    MAY_BE_NULL,
+    PLAIN_TRUTH_SCHEMA,
     QUERY_SCHEMA,
     TRUTH_SCHEMA,
     VIEW_BYTES,
     asked_sha256,
+    is_like,
     poses_of,
     query_of,
     query_row,
@@ -37,6 +41,8 @@ from sasgeo_bench.store.taskrows import (
 from sasgeo_bench.texts import FOLDER, json_text
 from sasgeo_bench.tomlfile import Document, check_document
 
+Row = TypeVar("Row")
+Made = TypeVar("Made")
 Count = Annotated[int, Field(ge=0)]
 Folder = Annotated[str, Field(pattern=FOLDER)]  # never a way out
 
@@ -378,7 +384,7 @@ def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, by
             for at, name in enumerate(batch["query_id"].to_pylist()):
                 if name in wanted:
                     row = batch.slice(at, 1).to_pylist()[0]
-                    yield query_of(row), stream_of(sent.slice(at, 1)), _asked_of(row, about)
+                    yield _made(folder / QUERIES, query_of, row), stream_of(sent.slice(at, 1)), _asked_of(row, about)
 
 
 def read_ids(folder: Path) -> list[str]:
@@ -418,21 +424,21 @@ def read_view_bytes(folder: Path) -> dict[str, int]:
 def read_queries(folder: Path) -> Iterator[Query]:
     """Queries of a task in the order of their ids, a row group in memory at a time."""
     for row in _rows(folder / QUERIES, QUERY_SCHEMA):
-        yield query_of(row)
+        yield _made(folder / QUERIES, query_of, row)
 
 
 def read_heads(folder: Path) -> Iterator[Head]:
     """Queries of a task without their views, in the order of their ids."""
     for batch in read_batches(folder / QUERIES, HEAD_SCHEMA.names):
         rows = batch.drop_columns(["candidates"]).to_pylist()
-        for row, poses in zip(rows, poses_of(batch["candidates"]), strict=True):
+        for row, poses in zip(rows, _made(folder / QUERIES, poses_of, batch["candidates"]), strict=True):
             yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
 
 
 def read_truths(folder: Path) -> Iterator[Truth]:
     """Truths of a task in the order of the query ids."""
     for row in _rows(folder / TRUTH, TRUTH_SCHEMA):
-        yield truth_of(row)
+        yield _made(folder / TRUTH, truth_of, row)
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
@@ -444,20 +450,45 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
         If the file is missing or damaged, or lacks a column.
     """
     with open_table(path, mend=_MEND, is_whole=False) as source:
-        _check_columns(path, source.schema_arrow.names, columns)
-        yield from source.iter_batches(batch_size=_ROWS, columns=list(columns))
+        _check_columns(path, source.schema_arrow, columns)
+        for batch in source.iter_batches(batch_size=_ROWS, columns=list(columns)):
+            empty = next((name for name in columns if name not in MAY_BE_NULL and batch[name].null_count), None)
+            if empty is not None:
+                message = f"{path} is damaged ({empty} is null in a row): {_MEND}"
+                raise StoreError(message)
+            yield batch
 
 
 def check_columns(path: Path, needed: Sequence[str]) -> None:
     """Refuse queries or truths without some columns; raises as `read_batches` does."""
-    _check_columns(path, read_schema(path, mend=_MEND).names, needed)
+    _check_columns(path, read_schema(path, mend=_MEND), needed)
 
 
-def _check_columns(path: Path, found: Sequence[str], needed: Sequence[str]) -> None:
-    missing = [name for name in needed if name not in found]
+def _check_columns(path: Path, found: pa.Schema, needed: Sequence[str]) -> None:
+    missing = [name for name in needed if name not in found.names]
     if missing:
-        message = f"{path} lacks the columns {', '.join(missing)}: make the queries again"
+        message = f"{path} lacks the columns {', '.join(missing)}: {_MEND}"
         raise StoreError(message)
+    odd = next((name for name in needed if found.names.count(name) > 1 or not _is_known(found.field(name))), None)
+    if odd is not None:
+        message = f"{path} holds the column {odd} twice, or with another type than it should: {_MEND}"
+        raise StoreError(message)
+
+
+def _is_known(field: pa.Field) -> bool:
+    """Whether a column has the type that it has in files of ours, those of a release included."""
+    schemas = (FILE_SCHEMA, TRUTH_SCHEMA, PLAIN_TRUTH_SCHEMA)
+    wanted = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
+    return not wanted or any(is_like(field.type, kind) for kind in wanted)
+
+
+def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:
+    """What a row says, which may be anyone's."""
+    try:
+        return make(row)
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
+        raise StoreError(message) from error
 
 
 def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:

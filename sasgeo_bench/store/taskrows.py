@@ -109,6 +109,16 @@ TRUTH_SCHEMA: Final = pa.schema(
 )
 
 
+# Columns of queries and truths that need not say anything; of no use where what they go with is missing.
+MAY_BE_NULL: Final = frozenset(
+    {
+        *("confidence", "observed_on", "season", "prior_easting_m", "prior_northing_m", "prior_radius_m"),
+        *("prior_yaw_deg", "prior_yaw_sigma_deg", "candidates", "vectors", "sequence_id", "frame", "increment"),
+        *("increment_covariance", "image", ASKED, *POSE_FIELDS, "alias_index"),
+    }
+)
+
+
 # Truths as a release holds them: lists of pairs where not every reader of parquet knows maps.
 _PAIR: Final = pa.struct([("name", pa.string()), ("value", pa.float64())])
 PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
@@ -306,3 +316,36 @@ def stream_of(batch: pa.RecordBatch) -> bytes:
     with pa.ipc.new_stream(sink, batch.schema) as stream:
         stream.write_batch(batch)
     return bytes(sink.getvalue())
+
+
+_LIKE: Final = (  # a kind of column, and which others can be read as it
+    (pa.types.is_floating, (pa.types.is_floating, pa.types.is_integer)),
+    (pa.types.is_integer, (pa.types.is_integer,)),
+    (pa.types.is_string, (pa.types.is_string, pa.types.is_large_string)),
+    (pa.types.is_binary, (pa.types.is_large_binary,)),
+    (pa.types.is_map, (pa.types.is_map,)),
+)
+
+
+def is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
+    """Whether a column can be read as another: any float for a float, any string for a string, null for anything.
+
+    Examples
+    --------
+    >>> is_like(pa.int16(), pa.float64()), is_like(pa.string(), pa.float64())
+    (True, False)
+    """
+    if pa.types.is_null(found) or found.equals(wanted):
+        return True
+    if pa.types.is_list(wanted):
+        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
+        return is_list and _is_like_inside(found.value_type, wanted.value_type)
+    return any(kind(wanted) and any(other(found) for other in others) for kind, others in _LIKE)
+
+
+def _is_like_inside(found: pa.DataType, wanted: pa.DataType) -> bool:
+    """Whether items of a list can be read as others; structs may have more fields."""
+    if not pa.types.is_struct(wanted):
+        return is_like(found, wanted)
+    names = [field.name for field in found] if pa.types.is_struct(found) else []
+    return all(names.count(field.name) == 1 and is_like(found.field(field.name).type, field.type) for field in wanted)

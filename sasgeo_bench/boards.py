@@ -2,9 +2,10 @@
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
 import platform
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -26,9 +27,10 @@ from sasgeo_bench.report.controls import Verdict, hold_controls, is_control, ver
 from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.report.latex import board_latex
+from sasgeo_bench.report.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
-from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
+from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, name_alone, to_frame, with_contestants
 from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
@@ -37,6 +39,7 @@ from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, read_board, write_board
+from sasgeo_bench.store.failures import LOG, Failures, stops_all
 from sasgeo_bench.validate import submission_faults, validate
 
 Tell = Callable[[str], None]
@@ -82,6 +85,8 @@ class ScoreRequest:
         Folders of submissions, scored as files are, but held to more (`validate.submission_faults`).
     jobs : int
         Processes that fit rejectors.
+    failed : mapping of str to str
+        Contestants that failed before anything was scored, and why.
     """
 
     predictions: Sequence[Path]
@@ -99,6 +104,7 @@ class ScoreRequest:
     without: Collection[str] = ()
     submissions: Sequence[Path] = ()
     jobs: int = 1
+    failed: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +114,8 @@ class Board:
     `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
     `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id,
     `truths` all that is known of it, controls among them. `everyone` are the entries with those who were asked nothing
-    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are.
+    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are. `failures`
+    are contestants and parts of the board that failed: they are not on it.
     """
 
     entries: tuple[Entry, ...]
@@ -126,6 +133,18 @@ class Board:
     truths: Mapping[str, Truth] = field(default_factory=dict)
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
+    failures: Failures = field(default_factory=lambda: Failures(Path(LOG), tell=lambda _: None))
+
+
+def log_beside(board: Path) -> Path:
+    """Where tracebacks of what failed on a board go.
+
+    Examples
+    --------
+    >>> log_beside(Path("out/boards/mine")).name
+    'mine.failures.log'
+    """
+    return board.with_name(f"{board.name}.{LOG}")
 
 
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
@@ -152,14 +171,24 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
         If there is nothing to score, or rejectors are asked for without a split.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
+    failures = Failures(log_beside(request.board), tell=lambda _: None)  # told when the board is there, or raised
+    while (board := _made(request, failures, tell)) is None:
+        tell("scored again without those that failed")
+    return board
+
+
+def _made(request: ScoreRequest, failures: Failures, tell: Tell) -> Board | None:
+    """A board of all that have not failed; None where one fails only now, and was counted with the others."""
     rules = rules_of(request.rejectors, request.split)
-    entries = leave_out(find_entries(request.predictions, request.submissions), request.without)
+    entries = leave_out(find_entries(request.predictions, request.submissions, failures=failures), request.without)
+    names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
+    failures.found |= {name: why for name, why in request.failed.items() if name not in names}
     wanted = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
-    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell)
+    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell, failures=failures)
     folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
-    _check_files([item.entry for item in told], folders, request.split)
-    everything = {item.entry.name: _scored(item, tasks, request) for item in told}
+    everything = _all_scored(told, tasks, request, failures)
+    told = [item for item in told if item.entry.name in everything]
     predictions = {item.entry.name: item.predictions for item in told}
     verdicts = hold_controls(everything)
     whole = _asked_whole(told, tasks, tell)
@@ -168,43 +197,95 @@ def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     entries = tuple(item.entry for item in told if item.entry.name in scores)
     _check_some(scores)
     apart = _apart(entries, scores, request.split, tell)
-    rows = list(_leaderboards(scores, whole, request.draws, apart))
+    compare = partial(_leaderboards, whole=whole, draws=request.draws, apart=apart)
+    try:
+        rows = compare(scores)
+    except Exception as error:
+        if stops_all(error) or not failures.blame(scores, compare):
+            raise
+        return None
     all_judged: dict[tuple[str, str], pd.DataFrame] = {}
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
     areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
     for entry in entries:
         frame = scores[entry.name]
-        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+        with failures.of(f"costs of {entry.name}"):
+            rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
         tell(f"{entry.name}: {_in_words(frame)}")
     for judged in carry_out(_judgings(entries, scores, predictions, rules, request.split), jobs=request.jobs):
         rows += judged.rows
         all_judged |= {(judged.matcher, name): said for name, said in judged.said.items()}
         for line in judged.lines:
             tell(line)
+        for name, fault in judged.failed.items():
+            failures.note(f"{judged.matcher} x {name}", fault)
+    _check_rejectors(rules, entries, failures)
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
     table = with_contestants(figures, _contestants(entries, apart))
-    findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
+    findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws, failed=failures.found)
+    held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failures.found]
     board = Board(
         entries=entries,
         scores=scores,
         predictions=predictions,
         table=table,
         findings=findings,
-        falsifiers=hold_falsifiers(request.contrasts, scores, draws=request.draws),
+        falsifiers=hold_falsifiers(held, scores, draws=request.draws),
         verdicts=verdicts,
         tasks=tuple(task.about for task in tasks),
         remarks=remarks,
-        protection=_protection(scores, predictions, request.split),
+        protection=_protection(scores, predictions, request.split, failures),
         judged={key: frame for key, frame in all_judged.items() if len(frame)},
         measured={truth.query_id: truth.measured for task in tasks for truth in task.truths},
         truths={truth.query_id: truth for task in tasks for truth in task.truths},
         everyone=tuple(item.entry for item in told),
         apart=apart,
+        failures=failures,
     )
     _tell_gone(request.board, board.everyone, tell)
-    _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
+    extras: list[Extra] = []
+    for make in request.extras:
+        with failures.of("more of the board"):
+            extras.append(make(board))
+    _write(request, board, [_guarded(extra, failures) for extra in extras], [rule.card for rule in rules.values()])
     return board
+
+
+def _guarded(extra: Extra, failures: Failures) -> Extra:
+    """The same files, and a figure that cannot be drawn costs itself alone."""
+
+    def draw(name: str, path: Path) -> None:
+        with failures.of(f"figure {name}"):
+            extra.figures[name](path)
+            return
+        path.unlink(missing_ok=True)
+
+    return replace(extra, figures={name: partial(draw, name) for name in extra.figures})
+
+
+def _all_scored(
+    told: Sequence[Told], tasks: Sequence[ScoredTask], request: ScoreRequest, failures: Failures
+) -> dict[str, pd.DataFrame]:
+    """Scored rows by contestant, of those that did not fail."""
+    folders, found = [task.folder for task in tasks], {}
+    for item in told:
+        with failures.of(item.entry.name):
+            _check_files([item.entry], folders, request.split)
+            scored = _scored(item, tasks, request)
+            hold_controls({item.entry.name: scored})
+            found[item.entry.name] = scored
+    if not found and failures.first is not None:
+        raise failures.first
+    return found
+
+
+def _check_rejectors(rules: Mapping[str, Rule], entries: Sequence[Entry], failures: Failures) -> None:
+    """Raise what a rejector raises that fails with everybody: then it is at fault, not their answers."""
+    for name in rules:
+        errors = [failures.errors.get(f"{entry.name} x {name}") for entry in entries]
+        if errors and errors[0] is not None and None not in errors:
+            raise errors[0]
 
 
 def _tell_gone(folder: Path, everyone: Sequence[Entry], tell: Tell) -> None:
@@ -273,12 +354,18 @@ def _remarks(all_judged: Mapping[tuple[str, str], pd.DataFrame], tell: Tell) -> 
 
 
 def _protection(
-    scores: Mapping[str, pd.DataFrame], predictions: Mapping[str, Mapping[str, Prediction]], split: Split | None
+    scores: Mapping[str, pd.DataFrame],
+    predictions: Mapping[str, Mapping[str, Prediction]],
+    split: Split | None,
+    failures: Failures,
 ) -> pd.DataFrame:
     """Protection levels of all contestants; empty where none tells any."""
-    frames = [protection_frame(name, frame, predictions[name], split) for name, frame in scores.items()]
+    frames = []
+    for name, frame in scores.items():
+        with failures.of(f"protection levels of {name}"):
+            frames.append(protection_frame(name, frame, predictions[name], split))
     told = [frame for frame in frames if len(frame)]
-    return pd.concat(told, ignore_index=True) if told else frames[0]
+    return pd.concat(told, ignore_index=True) if told else pd.DataFrame(columns=list(PROTECTION_COLUMNS))
 
 
 def _in_words(scores: pd.DataFrame) -> str:
@@ -308,14 +395,16 @@ def _asked_whole(told: Sequence[Told], tasks: Sequence[ScoredTask], tell: Tell) 
 
 
 def _leaderboards(
-    scores: Mapping[str, pd.DataFrame], whole: Mapping[str, Collection[str]], draws: int, apart: Collection[str]
-) -> Iterator[pd.DataFrame]:
+    scores: Mapping[str, pd.DataFrame], *, whole: Mapping[str, Collection[str]], draws: int, apart: Collection[str]
+) -> list[pd.DataFrame]:
     """Figures of suites by those who were asked all of them: in most cases one table of everything."""
     asked_by: dict[tuple[str, ...], set[str]] = {}
     for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
         asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
-    for names, suites in asked_by.items():
-        yield leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws, apart=apart)
+    return [
+        leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws, apart=apart)
+        for names, suites in asked_by.items()
+    ]
 
 
 def _check_files(entries: Sequence[Entry], folders: Sequence[Path], split: Split | None) -> None:
@@ -369,6 +458,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
         "without": sorted(set(request.without)),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "remarks": list(board.remarks),
+        "failed": board.failures.found,  # what fails while figures are drawn is added until the file is written
         "entries": [
             {
                 "name": entry.name,

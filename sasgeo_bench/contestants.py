@@ -11,6 +11,7 @@ from sasgeo_bench.entries import Entry
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.failures import Failures
 
 MOST_NAMED: Final = 3  # runs that are left out; the others are counted
 
@@ -37,6 +38,7 @@ def read_told(
     root: Path,
     named: Sequence[Path],
     tell: Callable[[str], None],
+    failures: Failures,
 ) -> list[Told]:
     """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves.
 
@@ -52,6 +54,8 @@ def read_told(
         Folders and files that the user named.
     tell : callable
         Gets a line for what is left out.
+    failures : Failures
+        Takes note of those whose answers cannot be read, who are then left out.
 
     Raises
     ------
@@ -60,22 +64,23 @@ def read_told(
     ConfigError
         If nobody answers any task.
     """
-    files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
+    files: dict[str, dict[str, Prediction]] = {}
+    for entry in entries:
+        with failures.of(entry.name):
+            if not entry.runs:
+                files[entry.name] = _rows_of_file(entry)
     is_chosen = bool(folders)
     found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
     told: list[Told] = []
     stale: list[Path] = []
-    for entry in entries:
-        if entry.runs:
-            item, others = _read_runs(entry, tasks)
+    for entry in (entry for entry in entries if entry.name not in failures.found):
+        with failures.of(entry.name):
+            item, others = _told(entry, tasks, files.get(entry.name))
             stale += others
-        else:
-            rows = files[entry.name]
-            held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-            item = Told(entry=entry, predictions=rows, held=held, asked=_asked_of(entry, tasks))
-        if item.asked:
-            told.append(item)
+            told += [item] if item.asked else []
+    if not told and failures.first is not None:
+        raise failures.first
     refused = next((source for source in stale if source in named), None)
     if refused is not None or (stale and not told):
         holder = "these tasks do" if is_chosen else "its task does"
@@ -94,6 +99,14 @@ def read_told(
         listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
         tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
     return told
+
+
+def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None) -> tuple[Told, list[Path]]:
+    """A contestant with its answers; the folders of those of its runs that answer none of the tasks."""
+    if rows is None:
+        return _read_runs(entry, tasks)
+    held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
+    return Told(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
 
 
 def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:

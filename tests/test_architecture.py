@@ -70,7 +70,17 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "submissionfile": None,
     "store": (
-        *("layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
+        *(
+            "layerfile",
+            "regiondir",
+            "taskrows",
+            "taskdir",
+            "runrows",
+            "failures",
+            "learnedfile",
+            "rundir",
+            "submissiondir",
+        ),
         *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
         *(
             "preview",

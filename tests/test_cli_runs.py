@@ -190,7 +190,7 @@ def test_the_shards_of_two_machines_merged_are_the_whole_run(program, run_folder
     for files, into in ((folders, "both.parquet"), ([run_folder], "whole.parquet")):
         program("merge", *(word for file in files for word in ("--runs", file)), "--into", into)
     both, whole = (
-        [replace(item, latency_s=None) for item in rundir.read_predictions(Path(name))]
+        [replace(item, latency_s=None, matcher_s=None) for item in rundir.read_predictions(Path(name))]
         for name in ("both.parquet", "whole.parquet")
     )
     assert both == whole

@@ -320,6 +320,7 @@ def board_markdown(
         _NOTE.format(draws=about["draws"]),
         "",
         *(f"- {line}" for line in (*control_lines(verdicts), *warnings_of(board), *training_lines(about))),
+        *(f"- Failed, and not on this board: {name}: {why}" for name, why in about.get("failed", {}).items()),
         "",
     ]
     if findings:

@@ -29,7 +29,7 @@ def request_of(task, out, name="Plain", **changes):
 
 def rows(folder):
     """All rows by query, without the time they took."""
-    return {item.query_id: replace(item, latency_s=None) for item in rundir.read_predictions(folder)}
+    return {item.query_id: replace(item, latency_s=None, matcher_s=None) for item in rundir.read_predictions(folder)}
 
 
 @pytest.mark.slow  # the next one holds as much against a run without a cluster, with a kill on the way

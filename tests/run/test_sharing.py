@@ -44,7 +44,9 @@ def plan_of(tasks, out, name="TellsProcess", **changes):
 
 
 def rows(part):
-    return {item.query_id: replace(item, latency_s=None) for item in rundir.read_predictions(part.folder)}
+    return {
+        item.query_id: replace(item, latency_s=None, matcher_s=None) for item in rundir.read_predictions(part.folder)
+    }
 
 
 def told(part, name):

@@ -14,9 +14,9 @@ import pandas as pd
 
 from sasgeo_bench.apart import set_apart
 from sasgeo_bench.boardtasks import ScoredTask, read_scored_task
-from sasgeo_bench.contestants import Told, read_told
+from sasgeo_bench.contestants import Told, read_told, score_told
 from sasgeo_bench.entries import Entry, find_entries, leave_out
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.judging import Judging, carry_out
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.query import CONTROLS, TASK_VERSION, Truth, base_of
@@ -30,17 +30,16 @@ from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
-from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, name_alone, to_frame, with_contestants
+from sasgeo_bench.report.rows import Contestant, name_alone, to_frame, with_contestants
 from sasgeo_bench.report.steps import queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
+from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, read_board, write_board
-from sasgeo_bench.store.failures import LOG, Failures, stops_all
-from sasgeo_bench.validate import submission_faults, validate
+from sasgeo_bench.store.failures import LOG, Failures, log_beside, stops_all
 
 Tell = Callable[[str], None]
 
@@ -136,17 +135,6 @@ class Board:
     failures: Failures = field(default_factory=lambda: Failures(Path(LOG), tell=lambda _: None))
 
 
-def log_beside(board: Path) -> Path:
-    """Where tracebacks of what failed on a board go.
-
-    Examples
-    --------
-    >>> log_beside(Path("out/boards/mine")).name
-    'mine.failures.log'
-    """
-    return board.with_name(f"{board.name}.{LOG}")
-
-
 def make_board(request: ScoreRequest, *, tell: Tell) -> Board:
     """Score everything and write the board.
 
@@ -187,7 +175,7 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell) -> Board | None
     told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell, failures=failures)
     folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
-    everything = _all_scored(told, tasks, request, failures)
+    everything = score_told(told, tasks, split=request.split, by_region=request.by_region, failures=failures)
     told = [item for item in told if item.entry.name in everything]
     predictions = {item.entry.name: item.predictions for item in told}
     verdicts = hold_controls(everything)
@@ -204,21 +192,11 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell) -> Board | None
         if stops_all(error) or not failures.blame(scores, compare):
             raise
         return None
-    all_judged: dict[tuple[str, str], pd.DataFrame] = {}
-    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
-    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
-    for entry in entries:
-        frame = scores[entry.name]
-        with failures.of(f"costs of {entry.name}"):
-            rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
-        tell(f"{entry.name}: {_in_words(frame)}")
-    for judged in carry_out(_judgings(entries, scores, predictions, rules, request.split), jobs=request.jobs):
-        rows += judged.rows
-        all_judged |= {(judged.matcher, name): said for name, said in judged.said.items()}
-        for line in judged.lines:
-            tell(line)
-        for name, fault in judged.failed.items():
-            failures.note(f"{judged.matcher} x {name}", fault)
+    rows += _costs(entries, scores, tasks, failures, tell)
+    all_judged, more = _all_judged(
+        _judgings(entries, scores, predictions, rules, request.split), request, failures, tell
+    )
+    rows += more
     _check_rejectors(rules, entries, failures)
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
@@ -244,40 +222,66 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell) -> Board | None
         failures=failures,
     )
     _tell_gone(request.board, board.everyone, tell)
-    extras: list[Extra] = []
-    for make in request.extras:
-        with failures.of("more of the board"):
-            extras.append(make(board))
-    _write(request, board, [_guarded(extra, failures) for extra in extras], [rule.card for rule in rules.values()])
+    extras = _extras(request, board)
+    _write(request, board, extras, [rule.card for rule in rules.values()])
     return board
 
 
-def _guarded(extra: Extra, failures: Failures) -> Extra:
-    """The same files, and a figure that cannot be drawn costs itself alone."""
+def _costs(
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    tasks: Sequence[ScoredTask],
+    failures: Failures,
+    tell: Tell,
+) -> list[pd.DataFrame]:
+    """What the answers of each contestant took; how many there are is told."""
+    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
+    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
+    rows = []
+    for entry in entries:
+        frame = scores[entry.name]
+        with failures.of(f"costs of {entry.name}"):
+            rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+        tell(f"{entry.name}: {_in_words(frame)}")
+    return rows
 
-    def draw(name: str, path: Path) -> None:
-        with failures.of(f"figure {name}"):
-            extra.figures[name](path)
-            return
-        path.unlink(missing_ok=True)
 
-    return replace(extra, figures={name: partial(draw, name) for name in extra.figures})
+Judgement = dict[tuple[str, str], pd.DataFrame]
 
 
-def _all_scored(
-    told: Sequence[Told], tasks: Sequence[ScoredTask], request: ScoreRequest, failures: Failures
-) -> dict[str, pd.DataFrame]:
-    """Scored rows by contestant, of those that did not fail."""
-    folders, found = [task.folder for task in tasks], {}
-    for item in told:
-        with failures.of(item.entry.name):
-            _check_files([item.entry], folders, request.split)
-            scored = _scored(item, tasks, request)
-            hold_controls({item.entry.name: scored})
-            found[item.entry.name] = scored
-    if not found and failures.first is not None:
-        raise failures.first
+def _all_judged(
+    judgings: Sequence[Judging], request: ScoreRequest, failures: Failures, tell: Tell
+) -> tuple[Judgement, list[pd.DataFrame]]:
+    """What rejectors say by matcher and rejector, and rows of the board."""
+    said: Judgement = {}
+    rows: list[pd.DataFrame] = []
+    for judged in carry_out(judgings, jobs=request.jobs):
+        rows += judged.rows
+        said |= {(judged.matcher, name): frame for name, frame in judged.said.items()}
+        for line in judged.lines:
+            tell(line)
+        for name, fault in judged.failed.items():
+            failures.note(f"{judged.matcher} x {name}", fault)
+    return said, rows
+
+
+def _extras(request: ScoreRequest, board: Board) -> list[Extra]:
+    """Files besides; what cannot be made is left out, and so is a figure that cannot be drawn."""
+    found: list[Extra] = []
+    for make in request.extras:
+        with board.failures.of("more of the board"):
+            extra = make(board)
+            guarded = {name: partial(_draw, draw, name, board.failures) for name, draw in extra.figures.items()}
+            found.append(replace(extra, figures=guarded))
     return found
+
+
+def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: Path) -> None:
+    """Draw a figure; of one that fails nothing is left."""
+    with failures.of(f"figure {name}"):
+        draw(path)
+        return
+    path.unlink(missing_ok=True)
 
 
 def _check_rejectors(rules: Mapping[str, Rule], entries: Sequence[Entry], failures: Failures) -> None:
@@ -405,41 +409,6 @@ def _leaderboards(
         leaderboard({name: _ranked(scores[name], suites) for name in names}, draws=draws, apart=apart)
         for names, suites in asked_by.items()
     ]
-
-
-def _check_files(entries: Sequence[Entry], folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse files and submissions that are not what the tasks ask for."""
-    for entry in entries:
-        if entry.how == AS_SUBMITTED:
-            _check_file(entry, folders, split)
-
-
-def _check_file(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse what anyone may have written if it is not what the tasks ask for; queries without a row are misses."""
-    path = entry.sources[0]
-    if entry.submission is None:
-        found = validate(path, folders)
-    else:
-        path = path.parents[1]
-        found = submission_faults(path, entry.submission, folders, places=() if split is None else tuple(split.blocks))
-    faults = [fault for fault in found if not fault.is_missing_row]
-    if faults:
-        message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
-        raise ConfigError(message)
-
-
-def _scored(told: Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> pd.DataFrame:
-    """All tasks that one contestant was asked, one row for each query."""
-    place_of = {} if request.split is None else request.split.place_of
-    frames = []
-    for task in tasks:
-        if task.folder not in told.asked:
-            continue
-        names = [head.query_id for head in task.heads]
-        mine = {name: told.predictions[name] for name in names if name in told.predictions}
-        frame = score_task(task.heads, task.truths, mine, place_of=place_of)
-        frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in request.by_region else frame)
-    return settle_not_applicable(pd.concat(frames, ignore_index=True))
 
 
 def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Final
 
 from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
-from sasgeo_bench.boards import Board, ScoreRequest, log_beside, make_board
+from sasgeo_bench.boards import Board, ScoreRequest, make_board
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.packing import pack_board
 from sasgeo_bench.paper import made_paper_task, make_paper_task
@@ -28,7 +28,7 @@ from sasgeo_bench.run.runner import Progress, run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.split import HALVES, Half
 from sasgeo_bench.store import rundir
-from sasgeo_bench.store.failures import Failures
+from sasgeo_bench.store.failures import Failures, log_beside
 from sasgeo_bench.store.packdir import check_results
 from sasgeo_bench.suites.base import Choice
 from sasgeo_bench.tasks import is_of_region, made_tasks, why_to_draw
@@ -323,11 +323,9 @@ def run_pipeline(
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
     folders: list[Path] = []
-    asked = {spec: [*tasks, *controls] for spec in plan.matchers}
-    asked.setdefault(REFERENCE, controls)
-    for spec, mine in asked.items():
+    for spec, mine in ({spec: [*tasks, *controls] for spec in (*plan.matchers, REFERENCE)}).items():
         with failures.of(spec, but=(ConfigError,)):
-            folders += _run(plan, spec, mine, tell, progress)
+            folders += _run(plan, spec, mine if spec in plan.matchers else controls, tell, progress)
     if not folders and failures.first is not None:
         raise failures.first
     split = plan.requests[0].split if plan.requests else None

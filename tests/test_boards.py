@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench import boards, cli
+from sasgeo_bench import boards, cli, contestants
 from sasgeo_bench.boards import ScoreRequest, make_board
 from sasgeo_bench.cli.boards import CONTESTANT_FAILED
 from sasgeo_bench.entries import find_entries
@@ -730,7 +730,8 @@ def test_answers_that_are_none_cost_their_author_alone(out, both, column, value,
 
 def fails_with(monkeypatch, name, is_bad):
     """A mistake of ours that only what one contestant says brings about."""
-    work = getattr(boards, name)
+    room = contestants if name == "_scored" else boards
+    work = getattr(room, name)
 
     def broken(*words, **more):
         if is_bad(*words, **more):
@@ -738,7 +739,7 @@ def fails_with(monkeypatch, name, is_bad):
             raise KeyError(message)
         return work(*words, **more)
 
-    monkeypatch.setattr(boards, name, broken)
+    monkeypatch.setattr(room, name, broken)
 
 
 @pytest.mark.parametrize(
@@ -825,7 +826,7 @@ def test_a_disk_that_is_full_stops_everything(out, both, monkeypatch):
         message = "cannot be written"
         raise StoreError(message) from OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(boards, "_scored", full)
+    monkeypatch.setattr(contestants, "_scored", full)
     with pytest.raises(StoreError, match="cannot be written"):
         board_of(out, *both)
     assert not (out / "boards" / "mine").exists()

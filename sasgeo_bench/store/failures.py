@@ -42,6 +42,17 @@ def write_log(log: Path, name: str, error: BaseException) -> None:
             target.write(f"{one_line(name)}\n{text}\n")
 
 
+def log_beside(board: Path) -> Path:
+    """Where tracebacks of what failed on a board go.
+
+    Examples
+    --------
+    >>> log_beside(Path("out/boards/mine")).name
+    'mine.failures.log'
+    """
+    return board.with_name(f"{board.name}.{LOG}")
+
+
 class Failures:
     """Who failed and why, by name: a line each.
 

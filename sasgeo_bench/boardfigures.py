@@ -67,39 +67,42 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
     # An age is no other strength: where maps have ages, those are the axis.
     others = steps[~steps["suite"].isin(set(ages["suite"]))]
     calibrated = _calibrated(board.table)
-    kinds: dict[str, Named] = {
-        "success against the age of the map": _each("age", ages, GROUP, draw_ages, shown),
-        "success against strength": _each("strength", others, GROUP, draw_steps, shown),
-        "success under stress": _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
-        "arms beside each other": _each(
+    kinds: dict[str, Callable[[], Named]] = {
+        "success against the age of the map": lambda: _each("age", ages, GROUP, draw_ages, shown),
+        "success against strength": lambda: _each("strength", others, GROUP, draw_steps, shown),
+        "success under stress": lambda: _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
+        "arms beside each other": lambda: _each(
             "ablation", ablation_frame(board.scores, contrasts, shown), GROUP[1:], draw_ablation, shown
         ),
-        "differences by place": _forests(board, contrasts),
-        "recall against K": _each(
+        "differences by place": lambda: _forests(board, contrasts),
+        "recall against K": lambda: _each(
             "recall",
             recall_frame(board.scores, board.predictions, board.truths, shown),
             GROUP[1:],
             draw_recall,
             shown,
         ),
-        "the distribution of errors": _each(
+        "the distribution of errors": lambda: _each(
             "errors", errors_frame(board.scores, board.table, shown), GROUP[1:], draw_errors, shown
         ),
-        "worth against cost": _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
-        "risk against coverage": _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
-        "reliability": _each(
+        "worth against cost": lambda: _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
+        "risk against coverage": lambda: _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
+        "reliability": lambda: _each(
             "reliability",
             reliability_frame(board.judged, calibrated, shown),
             GROUP[1:],
             draw_reliability,
             shown,
         ),
-        "the cost of decisions": _each(
+        "the cost of decisions": lambda: _each(
             "cost", cost_frame(board.judged, calibrated, shown), GROUP[1:], draw_costs, shown
         ),
-        "protection levels against errors": _stanfords(board, shown, split),
+        "protection levels against errors": lambda: _stanfords(board, shown, split),
     }
-    drawn = {kind: {f"{name}.svg": draw for name, draw in named} for kind, named in kinds.items()}
+    drawn: dict[str, dict[str, Draw]] = {}
+    for kind, make in kinds.items():
+        with board.failures.of(f"figures of {kind}"):
+            drawn[kind] = {f"{name}.svg": draw for name, draw in make()}
     empty = [kind for kind, named in drawn.items() if not named]
     if empty:
         tell(f"figures left out, for nothing on this board is seen in them: {', '.join(empty)}")

@@ -25,6 +25,7 @@ from sasgeo_bench.results import one_line
 from sasgeo_bench.store import regiondir, taskdir
 from sasgeo_bench.store.boardfile import PICTURES, PICTURES_SAID, Extra, read_pictures
 from sasgeo_bench.store.caseplot import case_pixels
+from sasgeo_bench.store.failures import Failures, stops_all
 from sasgeo_bench.store.jsonfile import parse_json
 from sasgeo_bench.store.layerfile import read_overview
 from sasgeo_bench.store.picture import WEBP, fitted, pixels_of, thumbnail
@@ -49,6 +50,7 @@ class _Found:
     files: dict[str, bytes] = field(default_factory=dict)
     said: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"regions": [], "suites": [], "cases": []})
     lacking: Counter[str] = field(default_factory=Counter)
+    failures: Failures
 
     def add(self, kind: str, name: str, draw: Callable[[], bytes], about: Mapping[str, Any]) -> None:
         """Draw one, or note why not: a board is not lost for a picture."""
@@ -56,6 +58,11 @@ class _Found:
             data = draw()
         except SasgeoError as error:
             self.lacking[one_line(str(error))] += 1
+            return
+        except Exception as error:
+            if stops_all(error):
+                raise
+            self.failures.note(f"picture {name}", error)
             return
         if sum(map(len, self.files.values())) + len(data) > MOST_BYTES:
             self.lacking[f"all pictures together take {MOST_BYTES / 1e6:g} MB at most"] += 1
@@ -99,7 +106,7 @@ def pictures_extra(
     """
     if kept is not None:
         return _kept(kept, tell, _failures(board, contrasts) if has_cases else None)
-    found = _Found()
+    found = _Found(failures=board.failures)
     asked = [about for about in board.tasks if about["suite"] != CONTROLS]
     _add_regions(found, asked, root)
     _add_suites(found, asked, board, root)
@@ -218,6 +225,8 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
 
 def _add_cases(found: _Found, board: Board, contrasts: Sequence[Contrast], root: Path) -> None:
     failures = _failures(board, contrasts)
+    if not len(failures):
+        return
     chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
     words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
     about = {(str(item["suite"]), str(item["region"])): item for item in board.tasks}
@@ -243,10 +252,11 @@ def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
     """Every failure of the matchers that a board shows, with its class."""
     frames = [pd.DataFrame(columns=list(COLUMNS))]
     for name in shown_matchers(board.table, contrasts):
-        if name in board.scores:
-            rejector = operating_rejector(board.judged, name, contrasts)
-            judged = None if rejector is None else board.judged[name, rejector]
-            frames.append(find_cases(board.scores[name], name, judged))
+        with board.failures.of(f"cases of {name}"):
+            if name in board.scores:
+                rejector = operating_rejector(board.judged, name, contrasts)
+                judged = None if rejector is None else board.judged[name, rejector]
+                frames.append(find_cases(board.scores[name], name, judged))
     return pd.concat(frames, ignore_index=True)
 
 

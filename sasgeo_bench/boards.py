@@ -2,9 +2,10 @@
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
 import platform
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -13,9 +14,9 @@ import pandas as pd
 
 from sasgeo_bench.apart import set_apart
 from sasgeo_bench.boardtasks import ScoredTask, read_scored_task
-from sasgeo_bench.contestants import Told, read_told
+from sasgeo_bench.contestants import Told, read_told, score_told
 from sasgeo_bench.entries import Entry, find_entries, leave_out
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.judging import Judging, carry_out
 from sasgeo_bench.metrics.draws import DRAWS
 from sasgeo_bench.privateboard import OnPrivate, hold_private, kept_private, seed_of
@@ -29,18 +30,19 @@ from sasgeo_bench.report.costs import cost_rows
 from sasgeo_bench.report.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.report.latex import board_latex
 from sasgeo_bench.report.plottables import age_names, ages_frame
+from sasgeo_bench.report.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.report.protection import protection_frame
 from sasgeo_bench.report.rejection import OWN, Rule, remarks_of, rules_of
-from sasgeo_bench.report.rows import AS_SUBMITTED, Contestant, to_frame, with_contestants
+from sasgeo_bench.report.rows import Contestant, name_alone, to_frame, with_contestants
 from sasgeo_bench.report.steps import GROUP, queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
-from sasgeo_bench.score import SCORER_VERSION, score_task, settle_not_applicable
+from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import PROTECTION, Extra, check_board, read_board, write_board
-from sasgeo_bench.validate import submission_faults, validate
+from sasgeo_bench.store.failures import LOG, Failures, log_beside, stops_all
 
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
 INTERVALS: Final = "intervals of suites"  # what progress is shown of
@@ -89,6 +91,8 @@ class ScoreRequest:
         A board of a private seed of the same pipeline, which the rows are held against.
     kept : mapping, optional
         What `board.json` of stored results says: of a private seed it is kept where no other board is named.
+    failed : mapping of str to str
+        Contestants that failed before anything was scored, and why.
     """
 
     predictions: Sequence[Path]
@@ -108,6 +112,7 @@ class ScoreRequest:
     jobs: int = 1
     private: Path | None = None
     kept: Mapping[str, Any] = field(default_factory=dict)
+    failed: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +123,7 @@ class Board:
     `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id,
     `truths` all that is known of it, controls among them. `everyone` are the entries with those who were asked nothing
     but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are,
-    `on_private` what came of the rows on a private seed.
+    `on_private` what came of the rows on a private seed, `failures` who failed and why.
     """
 
     entries: tuple[Entry, ...]
@@ -137,6 +142,7 @@ class Board:
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
     on_private: OnPrivate = field(default_factory=OnPrivate)
+    failures: Failures = field(default_factory=lambda: Failures(Path(LOG), tell=lambda _: None))
 
 
 def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
@@ -166,15 +172,25 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     """
     progress = progress or Lines(tell)
     check_board(request.board, scorer_version=SCORER_VERSION)
+    failures = Failures(log_beside(request.board), tell=lambda _: None)  # told when the board is there, or raised
+    while (board := _made(request, failures, tell, progress)) is None:
+        tell("scored again without those that failed")
+    return board
+
+
+def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress) -> Board | None:
+    """A board of all that have not failed; None where one fails only now, and was counted with the others."""
     rules = rules_of(request.rejectors, request.split)
-    entries = leave_out(find_entries(request.predictions, request.submissions), request.without)
+    entries = leave_out(find_entries(request.predictions, request.submissions, failures=failures), request.without)
+    names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
+    failures.found |= {name: why for name, why in request.failed.items() if name not in names}
     wanted = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
-    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell)
+    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell, failures=failures)
     folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
     seed_of([task.about for task in tasks])
-    _check_files([item.entry for item in told], folders, request.split)
-    everything = {item.entry.name: _scored(item, tasks, request) for item in told}
+    everything = score_told(told, tasks, split=request.split, by_region=request.by_region, failures=failures)
+    told = [item for item in told if item.entry.name in everything]
     predictions = {item.entry.name: item.predictions for item in told}
     verdicts = hold_controls(everything)
     whole = _asked_whole(told, tasks, tell)
@@ -185,48 +201,116 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     apart = _apart(entries, scores, request.split, tell)
     on_private = _on_private(request, entries, scores, tasks, tell)
     entries = tuple(replace(entry, how=on_private.how(entry)) for entry in entries)
-    rows = list(_leaderboards(scores, whole, request.draws, apart, progress))
-    all_judged: dict[tuple[str, str], pd.DataFrame] = {}
-    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
-    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
-    for entry in entries:
-        frame = scores[entry.name]
-        rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
-        tell(f"{entry.name}: {_in_words(frame)}")
-    progress.begin(JUDGED, len(entries))
-    for judged in carry_out(_judgings(entries, scores, predictions, rules, request.split), jobs=request.jobs):
-        rows += judged.rows
-        progress.advance(JUDGED, 1)
-        all_judged |= {(judged.matcher, name): said for name, said in judged.said.items()}
-        for line in judged.lines:
-            tell(line)
+    compare = partial(_leaderboards, whole=whole, draws=request.draws, apart=apart, progress=progress)
+    try:
+        rows = compare(scores)
+    except Exception as error:
+        if stops_all(error) or not failures.blame(scores, compare):
+            raise
+        return None
+    rows += _costs(entries, scores, tasks, failures, tell)
+    all_judged, more = _all_judged(
+        _judgings(entries, scores, predictions, rules, request.split), request, failures, tell, progress
+    )
+    rows += more
+    _check_rejectors(rules, entries, failures)
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
     table = with_contestants(figures, _contestants(entries, apart))
-    findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws)
+    findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws, failed=failures.found)
+    held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failures.found]
     board = Board(
         entries=entries,
         scores=scores,
         predictions=predictions,
         table=table,
         findings=findings,
-        falsifiers=hold_falsifiers(request.contrasts, scores, draws=request.draws),
+        falsifiers=hold_falsifiers(held, scores, draws=request.draws),
         verdicts=verdicts,
         tasks=tuple(task.about for task in tasks),
         remarks=remarks,
-        protection=_protection(scores, predictions, request.split),
+        protection=_protection(scores, predictions, request.split, failures),
         judged={key: frame for key, frame in all_judged.items() if len(frame)},
         measured={truth.query_id: truth.measured for task in tasks for truth in task.truths},
         truths={truth.query_id: truth for task in tasks for truth in task.truths},
         everyone=tuple(item.entry for item in told),
         apart=apart,
         on_private=on_private,
+        failures=failures,
     )
     _tell_gone(request.board, board.everyone, tell)
     if request.extras:
         tell("drawing figures and pictures")
-    _write(request, board, [make(board) for make in request.extras], [rule.card for rule in rules.values()])
+    extras = _extras(request, board)
+    _write(request, board, extras, [rule.card for rule in rules.values()])
     return board
+
+
+def _costs(
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    tasks: Sequence[ScoredTask],
+    failures: Failures,
+    tell: Tell,
+) -> list[pd.DataFrame]:
+    """What the answers of each contestant took; how many there are is told."""
+    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
+    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
+    rows = []
+    for entry in entries:
+        frame = scores[entry.name]
+        with failures.of(f"costs of {entry.name}"):
+            rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+        tell(f"{entry.name}: {_in_words(frame)}")
+    return rows
+
+
+Judgement = dict[tuple[str, str], pd.DataFrame]
+
+
+def _all_judged(
+    judgings: Sequence[Judging], request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress
+) -> tuple[Judgement, list[pd.DataFrame]]:
+    """What rejectors say by matcher and rejector, and rows of the board."""
+    said: Judgement = {}
+    rows: list[pd.DataFrame] = []
+    progress.begin(JUDGED, len(judgings))
+    for judged in carry_out(judgings, jobs=request.jobs):
+        rows += judged.rows
+        progress.advance(JUDGED, 1)
+        said |= {(judged.matcher, name): frame for name, frame in judged.said.items()}
+        for line in judged.lines:
+            tell(line)
+        for name, fault in judged.failed.items():
+            failures.note(f"{judged.matcher} x {name}", fault)
+    return said, rows
+
+
+def _extras(request: ScoreRequest, board: Board) -> list[Extra]:
+    """Files besides; what cannot be made is left out, and so is a figure that cannot be drawn."""
+    found: list[Extra] = []
+    for make in request.extras:
+        with board.failures.of("more of the board"):
+            extra = make(board)
+            guarded = {name: partial(_draw, draw, name, board.failures) for name, draw in extra.figures.items()}
+            found.append(replace(extra, figures=guarded))
+    return found
+
+
+def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: Path) -> None:
+    """Draw a figure; of one that fails nothing is left."""
+    with failures.of(f"figure {name}"):
+        draw(path)
+        return
+    path.unlink(missing_ok=True)
+
+
+def _check_rejectors(rules: Mapping[str, Rule], entries: Sequence[Entry], failures: Failures) -> None:
+    """Raise what a rejector raises that fails with everybody: then it is at fault, not their answers."""
+    for name in rules:
+        errors = [failures.errors.get(f"{entry.name} x {name}") for entry in entries]
+        if errors and errors[0] is not None and None not in errors:
+            raise errors[0]
 
 
 def _tell_gone(folder: Path, everyone: Sequence[Entry], tell: Tell) -> None:
@@ -319,12 +403,18 @@ def _remarks(all_judged: Mapping[tuple[str, str], pd.DataFrame], tell: Tell) -> 
 
 
 def _protection(
-    scores: Mapping[str, pd.DataFrame], predictions: Mapping[str, Mapping[str, Prediction]], split: Split | None
+    scores: Mapping[str, pd.DataFrame],
+    predictions: Mapping[str, Mapping[str, Prediction]],
+    split: Split | None,
+    failures: Failures,
 ) -> pd.DataFrame:
     """Protection levels of all contestants; empty where none tells any."""
-    frames = [protection_frame(name, frame, predictions[name], split) for name, frame in scores.items()]
+    frames = []
+    for name, frame in scores.items():
+        with failures.of(f"protection levels of {name}"):
+            frames.append(protection_frame(name, frame, predictions[name], split))
     told = [frame for frame in frames if len(frame)]
-    return pd.concat(told, ignore_index=True) if told else frames[0]
+    return pd.concat(told, ignore_index=True) if told else pd.DataFrame(columns=list(PROTECTION_COLUMNS))
 
 
 def _in_words(scores: pd.DataFrame) -> str:
@@ -355,11 +445,12 @@ def _asked_whole(told: Sequence[Told], tasks: Sequence[ScoredTask], tell: Tell) 
 
 def _leaderboards(
     scores: Mapping[str, pd.DataFrame],
+    *,
     whole: Mapping[str, Collection[str]],
     draws: int,
     apart: Collection[str],
     progress: Progress,
-) -> Iterator[pd.DataFrame]:
+) -> list[pd.DataFrame]:
     """Figures of suites by those who were asked all of them: in most cases one table of everything."""
     asked_by: dict[tuple[str, ...], set[str]] = {}
     progress.begin(
@@ -367,44 +458,15 @@ def _leaderboards(
     )
     for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
         asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
-    for names, suites in asked_by.items():
-        mine = {name: _ranked(scores[name], suites) for name in names}
-        yield leaderboard(mine, draws=draws, apart=apart, done=lambda: progress.advance(INTERVALS, 1))
-
-
-def _check_files(entries: Sequence[Entry], folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse files and submissions that are not what the tasks ask for."""
-    for entry in entries:
-        if entry.how == AS_SUBMITTED:
-            _check_file(entry, folders, split)
-
-
-def _check_file(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse what anyone may have written if it is not what the tasks ask for; queries without a row are misses."""
-    path = entry.sources[0]
-    if entry.submission is None:
-        found = validate(path, folders)
-    else:
-        path = path.parents[1]
-        found = submission_faults(path, entry.submission, folders, places=() if split is None else tuple(split.blocks))
-    faults = [fault for fault in found if not fault.is_missing_row]
-    if faults:
-        message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
-        raise ConfigError(message)
-
-
-def _scored(told: Told, tasks: Sequence[ScoredTask], request: ScoreRequest) -> pd.DataFrame:
-    """All tasks that one contestant was asked, one row for each query."""
-    place_of = {} if request.split is None else request.split.place_of
-    frames = []
-    for task in tasks:
-        if task.folder not in told.asked:
-            continue
-        names = [head.query_id for head in task.heads]
-        mine = {name: told.predictions[name] for name in names if name in told.predictions}
-        frame = score_task(task.heads, task.truths, mine, place_of=place_of)
-        frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in request.by_region else frame)
-    return settle_not_applicable(pd.concat(frames, ignore_index=True))
+    return [
+        leaderboard(
+            {name: _ranked(scores[name], suites) for name in names},
+            draws=draws,
+            apart=apart,
+            done=lambda: progress.advance(INTERVALS, 1),
+        )
+        for names, suites in asked_by.items()
+    ]
 
 
 def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
@@ -425,6 +487,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
         "without": sorted(set(request.without)),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "remarks": list(board.remarks),
+        "failed": board.failures.found,  # what fails while figures are drawn is added until the file is written
         "entries": [
             {
                 "name": entry.name,

@@ -1,16 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who was asked what, and what they answered: the entries of a board with their answers to its tasks."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.boardtasks import AskedTask, held_tasks
+import pandas as pd
+
+from sasgeo_bench.boardtasks import AskedTask, ScoredTask, held_tasks
 from sasgeo_bench.entries import Entry
 from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.report.controls import hold_controls
+from sasgeo_bench.report.rows import AS_SUBMITTED
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.score import score_task, settle_not_applicable
+from sasgeo_bench.split import Split
 from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.store.failures import Failures
+from sasgeo_bench.validate import submission_faults, validate
 
 MOST_NAMED: Final = 3  # runs that are left out; the others are counted
 
@@ -37,6 +45,7 @@ def read_told(
     root: Path,
     named: Sequence[Path],
     tell: Callable[[str], None],
+    failures: Failures,
 ) -> list[Told]:
     """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves.
 
@@ -52,6 +61,8 @@ def read_told(
         Folders and files that the user named.
     tell : callable
         Gets a line for what is left out.
+    failures : Failures
+        Takes note of those whose answers cannot be read, who are then left out.
 
     Raises
     ------
@@ -60,22 +71,23 @@ def read_told(
     ConfigError
         If nobody answers any task.
     """
-    files = {entry.name: _rows_of_file(entry) for entry in entries if not entry.runs}
+    files: dict[str, dict[str, Prediction]] = {}
+    for entry in entries:
+        with failures.of(entry.name):
+            if not entry.runs:
+                files[entry.name] = _rows_of_file(entry)
     is_chosen = bool(folders)
     found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
     told: list[Told] = []
     stale: list[Path] = []
-    for entry in entries:
-        if entry.runs:
-            item, others = _read_runs(entry, tasks)
+    for entry in (entry for entry in entries if entry.name not in failures.found):
+        with failures.of(entry.name):
+            item, others = _told(entry, tasks, files.get(entry.name))
             stale += others
-        else:
-            rows = files[entry.name]
-            held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-            item = Told(entry=entry, predictions=rows, held=held, asked=_asked_of(entry, tasks))
-        if item.asked:
-            told.append(item)
+            told += [item] if item.asked else []
+    if not told and failures.first is not None:
+        raise failures.first
     refused = next((source for source in stale if source in named), None)
     if refused is not None or (stale and not told):
         holder = "these tasks do" if is_chosen else "its task does"
@@ -94,6 +106,14 @@ def read_told(
         listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
         tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
     return told
+
+
+def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None) -> tuple[Told, list[Path]]:
+    """A contestant with its answers; the folders of those of its runs that answer none of the tasks."""
+    if rows is None:
+        return _read_runs(entry, tasks)
+    held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
+    return Told(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
 
 
 def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
@@ -141,3 +161,72 @@ def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
     names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
     folders = [root / "tasks" / suite / region for suite, region in names]
     return [folder for folder in folders if (folder / taskdir.TASK).is_file()]
+
+
+def score_told(
+    told: Sequence[Told],
+    tasks: Sequence[ScoredTask],
+    *,
+    split: Split | None,
+    by_region: Collection[str],
+    failures: Failures,
+) -> dict[str, pd.DataFrame]:
+    """Scored rows by contestant, of those whose answers can be scored.
+
+    Parameters
+    ----------
+    told : sequence of Told
+        Contestants with their answers.
+    tasks : sequence of ScoredTask
+        What was asked, with truths.
+    split : Split, optional
+        Says which blocks are one place.
+    by_region : collection of str
+        Suites whose regions are resampled, not their blocks.
+    failures : Failures
+        Takes note of the others.
+
+    Raises
+    ------
+    StoreError, ConfigError
+        The first fault, if nobody is left.
+    """
+    folders, found = [task.folder for task in tasks], {}
+    for item in told:
+        with failures.of(item.entry.name):
+            if item.entry.how == AS_SUBMITTED:
+                _check_file(item.entry, folders, split)
+            scored = _scored(item, tasks, split, by_region)
+            hold_controls({item.entry.name: scored})  # so that whoever it fails with is known
+            found[item.entry.name] = scored
+    if not found and failures.first is not None:
+        raise failures.first
+    return found
+
+
+def _check_file(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
+    """Refuse what anyone may have written if it is not what the tasks ask for; queries without a row are misses."""
+    path = entry.sources[0]
+    if entry.submission is None:
+        found = validate(path, folders)
+    else:
+        path = path.parents[1]
+        found = submission_faults(path, entry.submission, folders, places=() if split is None else tuple(split.blocks))
+    faults = [fault for fault in found if not fault.is_missing_row]
+    if faults:
+        message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
+        raise ConfigError(message)
+
+
+def _scored(told: Told, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]) -> pd.DataFrame:
+    """All tasks that one contestant was asked, one row for each query."""
+    place_of = {} if split is None else split.place_of
+    frames = []
+    for task in tasks:
+        if task.folder not in told.asked:
+            continue
+        names = [head.query_id for head in task.heads]
+        mine = {name: told.predictions[name] for name in names if name in told.predictions}
+        frame = score_task(task.heads, task.truths, mine, place_of=place_of)
+        frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in by_region else frame)
+    return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -3,6 +3,7 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from itertools import compress
 from pathlib import Path
@@ -15,6 +16,7 @@ from sasgeo_bench.query import base_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, RUN_HERE, is_unranked
 from sasgeo_bench.results import one_line
 from sasgeo_bench.store import rundir
+from sasgeo_bench.store.failures import Failures
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.submissiondir import predictions_name, read_submission
 from sasgeo_bench.submissionfile import Submission
@@ -70,7 +72,9 @@ class Entry:
         return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
 
-def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tuple[Entry, ...]:
+def find_entries(
+    paths: Sequence[Path], submissions: Sequence[Path] = (), *, failures: Failures | None = None
+) -> tuple[Entry, ...]:
     """Who is to be scored.
 
     Parameters
@@ -79,6 +83,8 @@ def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tup
         Folders with runs somewhere in them, and files of predictions.
     submissions : sequence of Path
         Folders of submissions.
+    failures : Failures, optional
+        Takes note of runs and submissions that cannot be read, which are then left out.
 
     Returns
     -------
@@ -94,7 +100,7 @@ def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tup
     ConfigError
         If two contestants have one name, or a file or submission that of a control.
     """
-    by_run: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
+    runs: list[Path] = []
     files: list[Entry] = []
     seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
     for path in paths:
@@ -106,11 +112,8 @@ def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tup
         if not found:
             message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
             raise StoreError(message)
-        for run in found:
-            if _is_new(run, seen):
-                about = _read_run(run)
-                card = about["matcher"]
-                by_run.setdefault((card["name"], card["version"], about["hash"]), []).append((run.parent, about))
+        runs += [run for run in found if _is_new(run, seen)]
+    by_run = _by_run(runs, failures)
     names = [name for name, _, _ in by_run]
     versions = [(name, number) for name, number, _ in by_run]
 
@@ -132,7 +135,7 @@ def find_entries(paths: Sequence[Path], submissions: Sequence[Path] = ()) -> tup
         for (name, number, digest), found in by_run.items()
     ]
     entries += files
-    entries += [_submitted(path) for path in submissions]
+    entries += _all_submitted(submissions, failures)
     listed = [entry.name for entry in entries]
     # No submission passes for a version of what is there: "mine" beside "mine 1" would be told apart by no reader.
     twice = next(
@@ -182,6 +185,40 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
         for entry, keep in zip(entries, kept, strict=True)
         if any(keep)
     )
+
+
+def _by_run(
+    paths: Sequence[Path], failures: Failures | None
+) -> dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]]:
+    """Runs by name, version and hash; who has one that cannot be read has none, for a part would be ranked as all."""
+    read: dict[Path, dict[str, Any]] = {}
+    for path in paths:
+        with _noted(failures, str(path.parent)):
+            read[path] = _read_run(path)
+    lost = {_root_of(path) for path in paths if path not in read}
+    found: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
+    for path, about in read.items():
+        if _root_of(path) not in lost:
+            card = about["matcher"]
+            found.setdefault((card["name"], card["version"], about["hash"]), []).append((path.parent, about))
+    return found
+
+
+def _root_of(run: Path) -> Path:
+    """Folder of all runs of a matcher with one hash, above suite and region."""
+    return list(run.resolve().parents)[:3][-1]
+
+
+def _noted(failures: Failures | None, name: str) -> AbstractContextManager[None]:
+    return nullcontext() if failures is None else failures.of(name)
+
+
+def _all_submitted(folders: Sequence[Path], failures: Failures | None) -> list[Entry]:
+    found = []
+    for folder in folders:
+        with _noted(failures, folder.name):
+            found.append(_submitted(folder))
+    return found
 
 
 def _is_new(path: Path, seen: set[Path]) -> bool:

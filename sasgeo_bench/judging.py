@@ -44,12 +44,13 @@ class Judging:
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """What came of it: by rejector what it says (`judge`), rows of the board, and why some were not applied."""
+    """What came of it: by rejector what it says (`judge`), rows of the board, why some were not applied, or failed."""
 
     matcher: str
     said: Mapping[str, pd.DataFrame]
     rows: tuple[pd.DataFrame, ...] = ()
     lines: tuple[str, ...] = field(default=())
+    failed: Mapping[str, Exception] = field(default_factory=dict)
 
 
 def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]:
@@ -67,11 +68,6 @@ def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]
     Judged
         One for each, in their order.
 
-    Raises
-    ------
-    MatchError
-        If a rejector fails.
-
     Examples
     --------
     >>> list(carry_out([], jobs=2))
@@ -82,16 +78,28 @@ def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]
 
 def judged(judging: Judging) -> Judged:
     """What the rejectors say of one contestant, its own word among them; no row where one is not applied."""
-    own = own_word(judging.scores, judging.split, is_taught=judging.is_taught)
-    said = {OWN: own} if len(own) else {}
-    lines = []
-    for name, rule in judging.rules.items():
-        said[name] = judge(judging.scores, judging.predictions, rule.make, rule.split, is_taught=judging.is_taught)
-        if not len(said[name]):
+    said, rows, lines, failed = {}, [], [], {}
+    for name in (OWN, *judging.rules):
+        try:
+            frame = _said(judging, name)
+            rows += [_figures(judging, name, frame)] if len(frame) else []
+        except Exception as error:  # noqa: BLE001 - these answers and this rejector alone do without a figure
+            failed[name] = error
+            continue
+        if len(frame) or name != OWN:
+            said[name] = frame
+        if not len(frame) and name != OWN:
             why = why_not(judging.scores, is_taught=judging.is_taught)
             lines.append(f"{name} on {judging.matcher}: not applied, {why}")
-    rows = tuple(_figures(judging, name, frame) for name, frame in said.items() if len(frame))
-    return Judged(matcher=judging.matcher, said=said, rows=rows, lines=tuple(lines))
+    return Judged(matcher=judging.matcher, said=said, rows=tuple(rows), lines=tuple(lines), failed=failed)
+
+
+def _said(judging: Judging, name: str) -> pd.DataFrame:
+    """What a rejector says of the answers, or a matcher itself."""
+    if name == OWN:
+        return own_word(judging.scores, judging.split, is_taught=judging.is_taught)
+    rule = judging.rules[name]
+    return judge(judging.scores, judging.predictions, rule.make, rule.split, is_taught=judging.is_taught)
 
 
 def _figures(judging: Judging, name: str, frame: pd.DataFrame) -> pd.DataFrame:

@@ -20,7 +20,7 @@ from sasgeo_bench.privateboard import check_public, seed_of
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.report.contrasts import Contrast
 from sasgeo_bench.results import one_line
-from sasgeo_bench.store.boardfile import read_board
+from sasgeo_bench.store.boardfile import BOARD, read_board
 from sasgeo_bench.store.catalog import find_split
 from sasgeo_bench.store.learnedfile import LearnedSaid
 from sasgeo_bench.store.packdir import check_results, is_pack, read_settings
@@ -228,7 +228,13 @@ def request_of(
         draws=settings.draws,
         by_region=settings.by_region,
         pipeline=settings.pipeline,
+        failed=_failed_before(stored_among(predictions)),
     )
+
+
+def _failed_before(stored: Path | None) -> dict[str, str]:
+    """Who failed when stored results were made: contrasts may name them, and they hold no answer of theirs."""
+    return dict(read_board(stored)[0].get("failed", {})) if stored is not None and (stored / BOARD).is_file() else {}
 
 
 def score_all(

@@ -11,7 +11,7 @@ from typing import Any, Final
 from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import Board, ScoreRequest, make_board
-from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.packing import pack_board
 from sasgeo_bench.paper import made_paper_task, make_paper_task
 from sasgeo_bench.paper.task import region_name
@@ -30,6 +30,7 @@ from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.worker import Limits
 from sasgeo_bench.split import HALVES, Half
 from sasgeo_bench.store import rundir
+from sasgeo_bench.store.failures import Failures, log_beside
 from sasgeo_bench.store.packdir import check_results
 from sasgeo_bench.suites.base import Choice
 from sasgeo_bench.tasks import is_of_region, made_tasks, why_to_draw
@@ -162,7 +163,11 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
     asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
     lines, all_done, all_left, all_behind = [], 0, 0, 0
     for spec, mine in asked:
-        goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
+        try:
+            goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
+        except (MatchError, StoreError) as error:
+            lines.append(f"    {spec}: cannot be asked ({error})")
+            continue
         left, done = _count(goes)
         planned = goes[0].plan
         lacking = [item for stage in mine for item in stage.lacking if _is_asked(plan, spec, item.suite)]
@@ -329,9 +334,13 @@ def run_pipeline(
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
     controls = _draw(plan.controls, tell, jobs=1)
-    folders = [folder for spec in plan.matchers for folder in _run(plan, spec, [*tasks, *controls], tell, progress)]
-    if REFERENCE not in plan.matchers:
-        folders += _run(plan, REFERENCE, controls, tell, progress)
+    failures = Failures(log_beside(board_folder(plan)), tell=tell)
+    folders: list[Path] = []
+    for spec, mine in ({spec: [*tasks, *controls] for spec in (*plan.matchers, REFERENCE)}).items():
+        with failures.of(spec, but=(ConfigError,)):
+            folders += _run(plan, spec, mine if spec in plan.matchers else controls, tell, progress)
+    if not folders and failures.first is not None:
+        raise failures.first
     split = plan.requests[0].split if plan.requests else None
     contrasts = _contrasts(plan.spec)
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
@@ -350,6 +359,7 @@ def run_pipeline(
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
         jobs=plan.jobs,
         private=private,
+        failed=failures.found,
     )
     board = make_board(request, tell=tell, progress=progress)
     if results is not None:

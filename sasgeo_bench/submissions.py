@@ -298,12 +298,20 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
         message = "submissions are scored beside the stored results of a board: name them with --predictions"
         raise ConfigError(message)
     found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
-    boards = {folder: read_submission(folder).board for folder in found.values()}
+    boards = {folder: _board_said(folder, board) for folder in found.values()}
     others = sorted({name for name in boards.values() if name != board})
     if others:
         count = sum(name != board for name in boards.values())
         tell(f"left out: {counted(count, 'submission')} for other boards ({', '.join(islice(others, 3))})")
     return tuple(folder for folder, name in boards.items() if name == board)
+
+
+def _board_said(folder: Path, board: str) -> str:
+    """Which board a submission is for; of one that cannot be read the board that is made, which says that it failed."""
+    try:
+        return read_submission(folder).board
+    except (StoreError, ConfigError):
+        return board
 
 
 def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell) -> Board:

@@ -76,9 +76,9 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "submissionfile": None,
     "store": (
-        *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile"),
-        *("rundir", "submissiondir", "fileset", "packabout", "boardfile", "packrows", "packdir", "packfile"),
-        *("svgfile", "sitedir", "pluginfiles", "seedfile"),
+        *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "failures"),
+        *("learnedfile", "rundir", "submissiondir", "fileset", "packabout", "boardfile", "packrows", "packdir"),
+        *("packfile", "svgfile", "sitedir", "pluginfiles", "seedfile"),
         *(
             "canvas",
             "preview",

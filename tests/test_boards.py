@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boards from runs and files: the same figures either way; faults are told in one line and nothing is written."""
 
+import errno
 import json
 import math
 import re
@@ -14,8 +15,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench import boards, cli
+from sasgeo_bench import boards, cli, contestants
 from sasgeo_bench.boards import ScoreRequest, make_board
+from sasgeo_bench.cli.boards import CONTESTANT_FAILED
 from sasgeo_bench.entries import find_entries
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.rejector import RejectorCard
@@ -30,7 +32,7 @@ from sasgeo_bench.run.runner import run
 from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.split import SplitFile, make_split
 from sasgeo_bench.store import rundir, taskdir, taskrows
-from sasgeo_bench.store.boardfile import read_board
+from sasgeo_bench.store.boardfile import Extra, read_board
 from sasgeo_bench.store.catalog import find_region_file, find_split_file, read_region_file, read_split_file
 from sasgeo_bench.tasks import make_tasks
 
@@ -680,3 +682,167 @@ def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, mo
     assert told.out.splitlines()[-1] == str(out / "boards" / "mine")  # written all the same
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
     assert text.index("CONTROLS FAILED") < text.index("## ")
+
+
+# --- one contestant that fails ----------------------------------------------------------------------------------------
+
+
+class Picky(Doubt):
+    """Cannot be fitted on answers that say too little; all of those of some are."""
+
+    card = replace(Doubt.card, name="picky")
+
+    def fit(self, predictions, is_false):
+        super().fit(predictions, is_false)
+        assert all("told" in item.diagnostics for item in predictions)
+
+
+def rewrite(path, column, value):
+    """Put a value into the first row of a file of predictions, as its author may."""
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    rows[0][column] = value
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path)
+
+
+@pytest.fixture
+def both(out, tmp_path):
+    """A good file beside a bad one; a contrast of the two."""
+    for name in ("good", "bad"):
+        submission(out, tmp_path / f"{name}.parquet", change=lambda row, _: replace(row, diagnostics={"told": 1.0}))
+    return [tmp_path / "good.parquet", tmp_path / "bad.parquet"]
+
+
+CONTRAST = Contrast(name="which", first="good", second="bad", suites=("clean",))
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "why"),
+    [
+        ("diagnostics", [("a", 1.0), ("a", 2.0)], "'a' twice"),
+        ("latency_s", math.inf, "latency_s is inf"),
+        ("candidates", None, "found null"),
+        ("message", "x" * 1_000_000, "a line of at most 300"),
+        ("candidates", [{"easting_m": 0.0, "northing_m": 0.0, "yaw_deg": 1e300, "scale": 1.0, "score": 0.0}], "1e+300"),
+        ("query_id", "0" * 24, "the id of a query"),
+    ],
+)
+def test_answers_that_are_none_cost_their_author_alone(out, both, column, value, why):
+    alone = board_of(out, both[0])
+    rewrite(both[1], column, value)
+    board = board_of(out, *both, contrasts=[CONTRAST])
+    assert [entry.name for entry in board.entries] == ["good"]
+    pd.testing.assert_frame_equal(board.scores["good"], alone.scores["good"])
+    pd.testing.assert_frame_equal(board.table, alone.table)
+    assert why in board.failures.found["bad"]
+    assert [finding.verdict for finding in board.findings] == ["not decided: bad failed"]
+    about, _ = read_board(out / "boards" / "mine")
+    assert about["failed"] == board.failures.found
+    text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
+    assert "- Failed, and not on this board: bad: " in text
+    with pytest.raises((ConfigError, StoreError)):
+        board_of(out, both[1])
+
+
+def fails_with(monkeypatch, name, is_bad):
+    """A mistake of ours that only what one contestant says brings about."""
+    room = contestants if name == "_scored" else boards
+    work = getattr(room, name)
+
+    def broken(*words, **more):
+        if is_bad(*words, **more):
+            message = "a mistake of ours"
+            raise KeyError(message)
+        return work(*words, **more)
+
+    monkeypatch.setattr(room, name, broken)
+
+
+@pytest.mark.parametrize(
+    ("step", "is_bad"),
+    [
+        ("_scored", lambda told, *_: told.entry.name == "bad"),
+        ("hold_controls", lambda scored: "bad" in scored),
+        ("leaderboard", lambda scores, **_: "bad" in scores),
+    ],
+)
+def test_a_mistake_of_ours_costs_the_contestant_it_is_about_and_the_log_says_where(
+    out, both, monkeypatch, step, is_bad
+):
+    alone = board_of(out, both[0])
+    fails_with(monkeypatch, step, is_bad)
+    board = board_of(out, *both, contrasts=[CONTRAST])
+    assert board.failures.found == {"bad": "KeyError: 'a mistake of ours' (mine.failures.log says where)"}
+    pd.testing.assert_frame_equal(board.table, alone.table)
+    assert [finding.verdict for finding in board.findings] == ["not decided: bad failed"]
+    log = (out / "boards" / "mine.failures.log").read_text(encoding="utf-8")
+    assert "Traceback" in log
+    assert "in broken" in log
+
+
+@pytest.mark.parametrize(
+    ("step", "is_bad", "what"),
+    [
+        ("cost_rows", lambda name, *_, **__: name == "bad", "costs of bad"),
+        ("protection_frame", lambda name, *_: name == "bad", "protection levels of bad"),
+    ],
+)
+def test_a_figure_that_cannot_be_made_is_left_out_and_said(out, both, monkeypatch, step, is_bad, what):
+    fails_with(monkeypatch, step, is_bad)
+    board = board_of(out, *both)
+    assert list(board.failures.found) == [what]
+    assert set(board.table["matcher"]) == {"good", "bad"}
+
+
+def test_a_figure_that_cannot_be_drawn_leaves_the_others(out, both):
+    def drawn(path):
+        path.write_text("<svg/>", encoding="utf-8")
+
+    def broken(path):
+        drawn(path)
+        raise ValueError(path.name)
+
+    board = board_of(out, *both, extras=[lambda _: Extra(figures={"age.svg": drawn, "risk.svg": broken})])
+    assert list(board.failures.found) == ["figure risk.svg"]
+    assert [path.name for path in (out / "boards" / "mine" / "figures").iterdir()] == ["age.svg"]
+    assert list(read_board(out / "boards" / "mine")[0]["failed"]) == ["figure risk.svg"]
+
+
+def test_a_rejector_that_fails_with_one_judges_the_others(out, both, split):
+    submission(out, both[1])  # says nothing beside its answers
+    contrast = replace(CONTRAST, first="good x picky", second="bad x picky", metric="aurc")
+    asked = {"split": split, "rejectors": (f"{__name__}:Picky", f"{__name__}:Doubt"), "contrasts": [contrast]}
+    board = board_of(out, *both, **asked)
+    assert set(board.judged) == {
+        ("good", "own"),
+        ("bad", "own"),
+        ("good", "picky"),
+        ("good", "doubt"),
+        ("bad", "doubt"),
+    }
+    assert list(board.failures.found) == ["bad x picky"]
+    assert [finding.verdict for finding in board.findings] == ["not decided: bad x picky failed"]
+    with pytest.raises(MatchError, match="rejector 'picky' failed"):
+        board_of(out, both[1], **asked | {"contrasts": []})
+
+
+def test_the_program_says_who_failed_and_ends_with_a_status_of_its_own(out, both, program):
+    rewrite(both[1], "latency_s", math.inf)
+    words = ("--out", out, "--name", "mine", "--draws", "200", "--no-cases")
+    code, told, err = program("score", *(word for path in both for word in ("--predictions", path)), *words)
+    assert code == CONTESTANT_FAILED
+    assert told.splitlines()[-1] == str(out / "boards" / "mine")
+    assert "Traceback" not in err
+    (line,) = [line for line in err.splitlines() if line.startswith("failed, and so not on the board: bad: ")]
+    assert "latency_s is inf" in line
+
+
+def test_a_disk_that_is_full_stops_everything(out, both, monkeypatch):
+    def full(*_, **__):
+        message = "cannot be written"
+        raise StoreError(message) from OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(contestants, "_scored", full)
+    with pytest.raises(StoreError, match="cannot be written"):
+        board_of(out, *both)
+    assert not (out / "boards" / "mine").exists()

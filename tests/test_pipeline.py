@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from sasgeo_bench import tasks
+from sasgeo_bench import pipeline, tasks
 from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
@@ -454,3 +454,50 @@ def test_matchers_of_a_task_are_asked_there_alone():
 def test_matchers_of_a_task_that_nobody_asks_are_refused(tasks, changes, fault):
     with pytest.raises(ValueError, match=fault):
         with_tasks(*tasks, **changes)
+
+
+BROKEN = """
+class Broken:
+    def __init__(self):
+        raise ValueError("no weights here")
+"""
+
+
+def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, monkeypatch):
+    (tmp_path / "broken_here.py").write_text(BROKEN, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plan, board, _ = made
+    spec = plan.spec.model_copy(
+        update={
+            "id": "beside",
+            "matchers": ["broken_here:Broken", *plan.spec.matchers],
+            "contrast": [item.model_copy(update={"second": "broken_here:Broken"}) for item in plan.spec.contrast],
+        }
+    )
+    other = plan_pipeline(spec, out=plan.out, tell=lambda _: None)
+    assert "    broken_here:Broken: cannot be asked (broken_here:Broken: cannot be made (" in other.to_text()
+    lines = []
+    beside = run_pipeline(other, tell=lines.append)
+    assert beside.table.equals(board.table)
+    assert list(beside.failures.found) == ["broken_here:Broken"]
+    assert "no weights here" in beside.failures.found["broken_here:Broken"]
+    assert [item.verdict for item in beside.findings] == ["not decided: broken_here:Broken failed"]
+    assert any(line.startswith("broken_here:Broken failed: ") for line in lines)
+    assert json.loads((plan.out / "boards" / "beside" / "board.json").read_text())["failed"] == beside.failures.found
+
+
+def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch):
+    plan, board, _ = made
+    work = pipeline.plan_run
+
+    def broken(request):
+        if request.spec == "random":
+            message = "a mistake of ours"
+            raise KeyError(message)
+        return work(request)
+
+    monkeypatch.setattr(pipeline, "plan_run", broken)
+    beside = run_pipeline(plan, tell=lambda _: None)
+    assert set(beside.scores) == set(board.scores) - {"random"}
+    assert [item.verdict for item in beside.findings] == ["not decided: random failed"]
+    assert "in broken" in (plan.out / "boards" / "small.failures.log").read_text(encoding="utf-8")

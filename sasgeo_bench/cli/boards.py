@@ -32,6 +32,7 @@ from sasgeo_bench.store.catalog import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.submissions import submissions_for
 
 CONTROL_FAILED: Final = 3  # exit status
+CONTESTANT_FAILED: Final = 4
 
 
 def _folder(text: str) -> Path:
@@ -204,9 +205,15 @@ def _how_to_publish(folder: Path) -> str:
 
 
 def _check_controls(board: Board) -> None:
-    """End with a status that a script sees where a control failed; the board is written all the same."""
+    """End with a status that a script sees where a control or a contestant failed; the board is written though."""
+    for name, why in board.failures.found.items():
+        tell(f"failed, and so not on the board: {name}: {why}")
+    if board.failures.found and board.failures.log.is_file():
+        tell(f"where it failed stands in {board.failures.log}")
     if not all(item.holds for item in board.verdicts):
         raise typer.Exit(CONTROL_FAILED)
+    if board.failures.found:
+        raise typer.Exit(CONTESTANT_FAILED)
 
 
 def show_board(board: Board) -> None:

@@ -3,7 +3,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Final
@@ -118,6 +118,7 @@ def hold_contrasts(
     judged: Mapping[tuple[str, str], pd.DataFrame],
     *,
     draws: int = DRAWS,
+    failed: Collection[str] = (),
 ) -> tuple[Finding, ...]:
     """Test every registered contrast.
 
@@ -131,20 +132,35 @@ def hold_contrasts(
         From `rejection.judge`.
     draws : int
         Of the bootstrap.
+    failed : collection of str
+        Matchers, and "matcher x rejector", that failed and so are not on the board.
 
     Returns
     -------
     tuple of Finding
-        In the same order. A contrast without a query has p = 1 and says so.
+        In the same order. A contrast without a query has p = 1 and says so; so has one with a side that failed.
 
     Raises
     ------
     ConfigError
-        If a contrast names a method that is not on the board.
+        If a contrast names a method that is not on the board, and none failed.
     """
-    found = [_tested(contrast, scores, judged, draws) for contrast in contrasts]
+    there = scores.keys() | {" x ".join(key) for key in judged}
+    found = [
+        _tested(contrast, scores, judged, draws)
+        if not failed or {contrast.first, contrast.second} <= there
+        else replace(_nothing(contrast), verdict=_undecided(contrast, there, failed))
+        for contrast in contrasts
+    ]
     adjusted = holm({item.name: 1.0 if math.isnan(item.p_clustered) else item.p_clustered for item in found})
     return tuple(_with_verdict(replace(item, p_holm=adjusted[item.name])) for item in found)
+
+
+def _undecided(contrast: Contrast, there: Collection[str], failed: Collection[str]) -> str:
+    """Why a contrast is not decided, one side of which is not on a board where something failed."""
+    side = next(name for name in (contrast.first, contrast.second) if name not in there)
+    is_known = side in failed or side.split(" x ", maxsplit=1)[0] in failed
+    return f"not decided: {side} {'failed' if is_known else 'is not on the board'}"
 
 
 def _tested(
@@ -397,7 +413,7 @@ def _p_of_draws(apart: Callable[[Floats], float], drawn: ClusterDraws) -> float:
 def _with_verdict(found: Finding) -> Finding:
     """Say in words what came of it; a null is a result."""
     if not found.n:
-        return replace(found, verdict="not tested: no query")
+        return replace(found, verdict=found.verdict or "not tested: no query")
     if found.blocks < LEAST_BLOCKS:
         return replace(
             found, verdict=f"not decided: {counted(found.blocks, 'block')}, at least {LEAST_BLOCKS} are needed"

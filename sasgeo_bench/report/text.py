@@ -328,6 +328,10 @@ def board_markdown(
             f"- {markdown_item(line)}"
             for line in (*control_lines(verdicts), *seed_lines(about), *warnings_of(board), *training_lines(about))
         ),
+        *(
+            f"- {markdown_item(f'Failed, and not on this board: {name}: {why}')}"
+            for name, why in about.get("failed", {}).items()
+        ),
         "",
     ]
     seeds = seed_table(about)

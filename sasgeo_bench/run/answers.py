@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from sasgeo_bench.errors import MatchError, StoreError
@@ -18,6 +19,7 @@ from sasgeo_bench.run.plan import RunPart, RunPlan, by_map, reach_of
 from sasgeo_bench.run.replies import Reply
 from sasgeo_bench.run.sandbox import PROMISES
 from sasgeo_bench.run.schedule import Schedule
+from sasgeo_bench.run.teach import failed_by_us, guarded
 from sasgeo_bench.run.worker import Worker
 from sasgeo_bench.store import rundir, taskdir
 from sasgeo_bench.store.regiondir import read_manifest
@@ -190,7 +192,8 @@ class _Map:
             for writer, query, blob in schedule.items(number):
                 if ready is None:
                     learned = self._plan.learned
-                    ready = worker.prepare(self._writers[0].part.region, None if learned is None else learned.text)
+                    region, text = self._writers[0].part.region, None if learned is None else learned.text
+                    ready = guarded(self._plan, partial(worker.prepare, region, text))
                     self._check_map()
                     if schedule.is_stopped:
                         return
@@ -202,11 +205,20 @@ class _Map:
                     continue
                 reply = ready
                 if ready.status == "ok":
+                    ask = partial(worker.match, blob, top_k=top_k)
                     if not is_warm:
-                        worker.match(blob, top_k=top_k)
+                        guarded(self._plan, ask)
                         is_warm = True
-                    reply = worker.match(blob, top_k=top_k)
-                writer.add(_prediction(query, reply, top_k), cpu_s=reply.cpu_s)
+                    reply = guarded(self._plan, ask)
+                writer.add(self._row(query, reply), cpu_s=reply.cpu_s)
+
+    def _row(self, query: Query, reply: Reply) -> Prediction:
+        """A row out of a reply, checked once more on this side."""
+        try:
+            return _prediction(query, reply, self._plan.request.top_k)
+        except Exception as error:  # noqa: BLE001 - whatever is made of an answer costs its own row
+            failed = failed_by_us(self._plan, error)
+            return Prediction(query_id=query.query_id, status=failed.status, message=failed.message)
 
     def _unlearned(self) -> Reply | None:
         """What every query gets where nothing came of learning: no process is started for it."""
@@ -231,7 +243,7 @@ class _Map:
 
 
 def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
-    """A row out of a reply, checked once more on this side."""
+    """A row out of a reply, held to the query."""
     if reply.status != "ok":
         return Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
     if reply.match is None:

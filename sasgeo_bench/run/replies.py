@@ -109,6 +109,7 @@ class _Loaded(_Strict):
     learns: bool
 
     def reply(self) -> Reply:
+        """As a runner takes it."""
         said: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
         return Reply(status="ok", card=MatcherCard(**said), code=self.code, learns=self.learns)
 
@@ -119,6 +120,7 @@ class _Learnt(_Strict):
     learned: str
 
     def reply(self) -> Reply:
+        """As a runner takes it."""
         return Reply(status="ok", own_s=self.seconds, learned=check_learned(self.learned))
 
 
@@ -128,6 +130,7 @@ class _Prepared(_Strict):
     grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)]
 
     def reply(self) -> Reply:
+        """As a runner takes it."""
         return Reply(status="ok", own_s=self.seconds, grown_bytes=self.grown_bytes)
 
 
@@ -144,6 +147,7 @@ class _Matched(_Strict):
     match: _Row
 
     def reply(self) -> Reply:
+        """As a runner takes it."""
         row = self.match
         match = Match(
             poses=[Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in row.candidates],

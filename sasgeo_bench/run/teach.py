@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a matcher learns before it is asked: once for a lesson, in a process of its own, kept as a text."""
 
+from collections.abc import Callable
+from functools import partial
+
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.results import one_line
+from sasgeo_bench.results import one_line, told
 from sasgeo_bench.run.lesson import Lesson, read_pairs
 from sasgeo_bench.run.plan import Learned, RunPlan, reach_of, with_learned
 from sasgeo_bench.run.replies import Reply
 from sasgeo_bench.run.worker import Worker
+from sasgeo_bench.store.failures import LOG, stops_all, write_log
 from sasgeo_bench.store.learnedfile import read_learned, write_learned
 from sasgeo_bench.store.regiondir import locked
 
@@ -54,7 +59,26 @@ def _learn(plan: RunPlan, lesson: Lesson) -> Reply:
     pairs = read_pairs(lesson)
     reach = reach_of(request, tuple(regions.values()))
     with Worker(spec=request.spec, reach=reach, limits=request.limits) as worker:
-        return worker.learn(regions, pairs)
+        return guarded(plan, partial(worker.learn, regions, pairs))
+
+
+def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
+    """The reply to a question; whatever is raised about it is one, too, unless our own disk or folders are at fault."""
+    try:
+        return ask()
+    except StoreError:
+        raise
+    except Exception as error:
+        if stops_all(error):
+            message = f"no process of a matcher can be started ({told(error)}): free some space and run again"
+            raise StoreError(message) from error
+        return failed_by_us(plan, error)
+
+
+def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
+    """What a query gets about which our own code raised something; the log beside the run says where."""
+    write_log(plan.run_folder / LOG, plan.card.name, error)
+    return Reply(status="crash", message=one_line(f"not its own process failed, but ours: {told(error)} (see {LOG})"))
 
 
 def _failed(reply: Reply) -> Learned:

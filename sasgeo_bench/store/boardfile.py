@@ -108,6 +108,7 @@ def write_board(
                 _write_part(scratch, part, said)
             for name in (one for one in _AS_CSV if one in tables):
                 tables[name].map(csv_cell).to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
+            content = {name: value for name, value in content.items() if name != "failed" or value}
             (scratch / BOARD).write_text(json_text(content), encoding="utf-8")
     except SasgeoError:
         raise

@@ -169,6 +169,7 @@ class BoardSaid(_Said):
     without: list[str] = []
     rejectors: list[dict[str, str | bool | None]] = []
     remarks: list[str] = []
+    failed: dict[str, str] = {}
     entries: list[_Entry] = []
     tasks: list[_Task] = []
 

@@ -13,8 +13,10 @@ from dataclasses import replace
 import pyarrow.parquet as pq
 import pytest
 
+from sasgeo_bench.boards import ScoreRequest, make_board
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.run import answers
 from sasgeo_bench.run.plan import RunRequest, plan_run
 from sasgeo_bench.run.runner import run
 from sasgeo_bench.run.sandbox import PROMISES
@@ -57,11 +59,8 @@ def run_all(request):
 
 def table(*paths):
     """All rows by query, without what differs from run to run: the time they took."""
-    found = {
-        item.query_id: replace(item, latency_s=None, matcher_s=None)
-        for path in paths
-        for item in rundir.read_predictions(path)
-    }
+    rows = (item for path in paths for item in rundir.read_predictions(path))
+    found = {item.query_id: replace(item, latency_s=None, matcher_s=None) for item in rows}
     return [found[name] for name in sorted(found)]
 
 
@@ -266,3 +265,74 @@ def test_another_version_of_a_matcher_has_a_folder_of_its_own(place, task, tmp_p
         source.write_text(text, encoding="utf-8")
     assert first != second
     assert plan_run(request_of(task, tmp_path)).parts[0].folder == first
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "words"),
+    [
+        ("OddName", "invalid", "expected 1..64 printable characters"),
+        ("FarAway", "invalid", "an answer that is none"),
+        ("DigsDeep", "ok", ""),
+        ("RaisesWhatNobodyCatches", "crash", "ended with exit status 1"),
+    ],
+)
+def test_a_hostile_matcher_costs_its_own_rows_from_the_run_to_the_board(
+    task, undisturbed, tmp_path, name, status, words
+):
+    report, folder = run_all(request_of(task, tmp_path, name=name, limit=2))
+    assert report.counts == {status: 2}
+    assert all(words in item.message for item in table(folder))
+    root = task.parents[2]
+    request = ScoreRequest(predictions=[folder, undisturbed[1]], root=root, board=tmp_path / "boards" / "b", draws=100)
+    board = make_board(request, tell=lambda _: None)
+    good, bad = rundir.read_run(undisturbed[1])["hash"], rundir.read_run(folder)["hash"]
+    assert {entry.hash for entry in board.entries} == {good, bad}
+    assert board.failures.found == {}
+    answered = {entry.hash: board.scores[entry.name]["status"].value_counts() for entry in board.entries}
+    assert answered[good].to_dict() == {"ok": len(taskdir.read_ids(task))}
+    assert answered[bad][status] == 2
+
+
+@pytest.mark.parametrize("step", ["_prediction", "check_match"])
+def test_a_mistake_of_ours_about_one_answer_costs_its_row_and_the_log_says_where(task, tmp_path, monkeypatch, step):
+    work, count = getattr(answers, step), iter(range(100))
+
+    def broken(*words, **more):
+        if next(count) == 1:
+            message = "a mistake of ours"
+            raise KeyError(message)
+        return work(*words, **more)
+
+    monkeypatch.setattr(answers, step, broken)
+    report, folder = run_all(request_of(task, tmp_path, limit=3))
+    assert report.counts == {"ok": 2, "crash": 1}
+    assert report.messages == {
+        "crash": "not its own process failed, but ours: KeyError: 'a mistake of ours' (see failures.log)"
+    }
+    log = (folder.parents[1] / "failures.log").read_text(encoding="utf-8")
+    assert "Traceback" in log
+    assert "in broken" in log
+
+
+def test_where_no_process_can_be_started_for_lack_of_room_the_run_stops_in_one_line(task, tmp_path, monkeypatch):
+    plan = plan_run(request_of(task, tmp_path, limit=1))
+
+    def full(**_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tempfile.mkdtemp", full)
+    with pytest.raises(StoreError, match=r"no process of a matcher can be started .*No space left"):
+        run(plan, tell=lambda _: None)
+
+
+def test_rows_say_what_the_runner_and_what_the_matcher_measured_and_older_rows_are_read(task, tmp_path):
+    _, folder = run_all(request_of(task, tmp_path, name="SetsItsClock", limit=1))
+    (row,) = rundir.read_predictions(folder)
+    assert row.latency_s >= 0.3  # it sleeps so long
+    assert row.matcher_s == 0.0
+    (part,) = rundir.parts_of(folder)
+    pq.write_table(pq.read_table(part).drop_columns(["matcher_s"]), part)
+    assert list(rundir.read_predictions(folder)) == [replace(row, matcher_s=None)]
+    assert plan_run(request_of(task, tmp_path, name="SetsItsClock", limit=1)).parts[0].left == ()
+    rundir.merge_runs([folder], tmp_path / "merged.parquet")
+    assert "matcher_s" not in pq.read_schema(tmp_path / "merged.parquet").names

@@ -111,11 +111,10 @@ def score_command(  # noqa: PLR0913 - a command has as many flags as its users n
     """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
     _check_names(name, truth)
     submitted = submissions_for(board_of(predictions), submissions, tell=tell) if submissions else ()
-    root = out if truth is None else truth.resolve().parent
     usual = request_of(
         predictions,
         board=out / "boards" / name,
-        root=root,
+        root=out if truth is None else truth.resolve().parent,
         split=split,
         folders=region_folders or (),
         rejectors=rejector or (),

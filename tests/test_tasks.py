@@ -340,9 +340,9 @@ def test_a_second_run_waits_for_the_first_and_both_leave_a_whole_task(own_out, t
     second = threading.Thread(target=make, args=(own_out,), kwargs={"tell": tell})
     with regiondir.locked(folder, tell=quiet):
         second.start()
-        assert waiting.wait(60), told
+        waiting.wait()
         assert not (folder / TASK).exists()
-    second.join(60)
+    second.join()
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
     assert leftovers(own_out) == []
 
@@ -353,7 +353,7 @@ def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
     for run in runs:
         run.start()
     for run in runs:
-        run.join(60)
+        run.join()
     assert sum("5 queries at 1 sites" in line for line in told) == 2
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
     assert leftovers(own_out) == []
@@ -361,18 +361,23 @@ def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
 
 def test_two_runs_of_different_counts_at_once_leave_one_map_and_its_task(own_out):
     told: dict[int, list[str]] = {1: [], 2: []}
-    runs = [
-        threading.Thread(
-            target=make,
-            args=(own_out, "topology-twins"),
-            kwargs={"tell": lines.append, "regions": ("town-grid",), "count": count, "may_be_fewer": True},
-        )
-        for count, lines in told.items()
-    ]
+    waiting = threading.Event()
+
+    def draw(count):
+        def tell(line):
+            told[count].append(line)
+            if "is being written by another run" in line:
+                waiting.set()
+            else:
+                waiting.wait()  # whoever draws first says nothing more, and ends not, before the other one has come
+
+        make(own_out, "topology-twins", tell=tell, regions=("town-grid",), count=count, may_be_fewer=True)
+
+    runs = [threading.Thread(target=draw, args=(count,)) for count in told]
     for run in runs:
         run.start()
     for run in runs:
-        run.join(120)
+        run.join()
     folder = own_out / "tasks/topology-twins/town-grid+topology-twins"
     assert [sum(" queries at " in line for line in lines) for lines in told.values()] == [1, 1]
     assert sum("is being written by another run" in line for lines in told.values() for line in lines) == 1

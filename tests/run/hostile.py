@@ -86,11 +86,16 @@ class ExitsOnce(TellsProcess):
         return super().match(query, top_k=top_k)
 
 
-class HangsLater(ExitsOnce):
+class HangsLater(TellsProcess):
     """Does not come back from its third question."""
 
+    def __init__(self):
+        super().__init__()
+        self.asked = 0
+
     def match(self, query, *, top_k):
-        if self.asked == 2:
+        self.asked += 1
+        if self.asked == 3:
             time.sleep(1000)
         return super().match(query, top_k=top_k)
 

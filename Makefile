@@ -15,7 +15,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region queries leaderboard test check bench ageing figures docs lock clean
+.PHONY: help install demo list-regions build-region queries leaderboard test test-quick check bench ageing figures docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -56,8 +56,14 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 	$(SASGEO) leaderboard $(or $(PIPELINE),leaderboard) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
 	  $(if $(RESULTS),--results "$(RESULTS)") --out $(OUT) $(ARGS)
 
+# Hundreds of processes import the same modules: none of them compiles them again.
+test test-quick: export PYTHONDONTWRITEBYTECODE :=
+
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
-	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(ARGS)
+	$(VENV_PYTHON) -m pytest -n 2 --dist worksteal -p no:benchmark -rs $(ARGS)
+
+test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built for several of them
+	$(VENV_PYTHON) -m pytest -n 2 --dist worksteal -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)

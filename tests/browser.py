@@ -25,7 +25,7 @@ START = (
     "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
 )
 KEYS = {"Tab": 9, "Enter": 13, "Escape": 27, "ArrowLeft": 37, "ArrowRight": 39}
-PATIENCE_S = 120.0
+PATIENCE_S = 600.0
 
 
 def find_chromium() -> str | None:
@@ -182,7 +182,7 @@ def browser(chromium: str, profile: Path) -> Iterator[Page]:
         for end in (ours_in, ours_out):
             os.close(end)
         try:
-            running.wait(timeout=20)
+            running.wait(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             running.kill()
             running.wait()

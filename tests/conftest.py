@@ -27,21 +27,32 @@ settings.register_profile(
     deadline=None,
     derandomize="CI" in os.environ,
     max_examples=50,
+    print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],
 )
+settings.register_profile("quick", settings.get_profile("sasgeo"), max_examples=10)
 settings.load_profile("sasgeo")
 
 LOOPBACK = ("127.", "localhost", "::1")
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip the tests on real data, with the reason, where there is none."""
-    if _extracts_folder() is not None:
-        return
+    """Mark the tests that are quick, and skip those on real data, with the reason, where there is none."""
     skip = pytest.mark.skip(reason="real extracts: SASGEO_EXTRACTS names no folder with *.osm.pbf files")
+    has_extracts = _extracts_folder() is not None
     for item in items:
-        if item.get_closest_marker("real"):
+        if _is_quick(item):
+            item.add_marker("quick")
+        if item.get_closest_marker("real") and not has_extracts:
             item.add_marker(skip)
+
+
+def _is_quick(item: pytest.Item) -> bool:
+    """Whether a test shares no fixture of ours with others, as whatever takes long to build is shared."""
+    found = getattr(item, "_fixtureinfo").name2fixturedefs.values()  # noqa: B009 - of a function or a docstring's example
+    shared = {each[-1].argname for each in found if each[-1].scope != "function" and each[-1].baseid}
+    return shared <= {"_no_network"} and not item.get_closest_marker("real")
 
 
 @pytest.fixture(scope="session")

@@ -65,9 +65,9 @@ class Own(Doubt):
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
+def built(tmp_path_factory, lay_towns):
     """Two towns, a task each in which every fourth place is made absent, a run of the control that has the truth."""
-    out = tmp_path_factory.mktemp("boards") / "out"
+    out = lay_towns(tmp_path_factory.mktemp("boards") / "out", *TOWNS)
     wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=2, seed=2, out=out, may_be_fewer=True)
     for request in plan_requests(wanted, tell=lambda _: None):
         make_tasks(request, tell=lambda _: None)

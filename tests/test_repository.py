@@ -190,6 +190,18 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
         assert re.search(rf"^{command}\b", blocks, flags=re.MULTILINE), command
 
 
+@pytest.mark.slow  # make test finds it too, by chance: its two processes must collect the same
+def test_two_processes_collect_the_same_tests_whenever_and_wherever_they_do() -> None:
+    found = []
+    for seed, zone, tongue in (("1", "Asia/Kolkata", "C"), ("2", "America/Lima", "C.UTF-8")):
+        place = {"PYTHONHASHSEED": seed, "TZ": zone, "LC_ALL": tongue, "COLUMNS": "40"}
+        command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", "tests"]
+        done = subprocess.run(command, cwd=ROOT, env=os.environ | place, capture_output=True, text=True, check=True)  # noqa: S603 - our own tests
+        found.append([line for line in done.stdout.splitlines() if "::" in line])
+    assert len(found[0]) > 3000
+    assert found[0] == found[1]
+
+
 def test_every_make_command_in_a_document_exists() -> None:
     targets = set(re.findall(r"^([a-z-]+):", read("Makefile"), flags=re.MULTILINE))
     for path in repository_files():

@@ -29,7 +29,9 @@ def queries_of(drawn):
     }
 
 
-def test_two_processes_draw_the_queries_that_one_draws(tmp_path):
+def test_two_processes_draw_the_queries_that_one_draws(tmp_path, lay_towns):
+    for name in ("one", "two"):
+        lay_towns(tmp_path / name, *TOWNS)
     one = list(carry_out(wanted(tmp_path / "one", "clean", "absent")))
     two = list(carry_out(wanted(tmp_path / "two", "clean", "absent"), jobs=2))
     assert [item.lines[-1].partition(" in ")[0] for item in one] == [
@@ -43,12 +45,15 @@ def test_two_processes_draw_the_queries_that_one_draws(tmp_path):
     assert not any(item.lines for item in again)
 
 
-def test_what_a_region_lacks_is_told_beside_what_others_give(tmp_path):
+def test_what_a_region_lacks_is_told_beside_what_others_give(tmp_path, lay_towns):
+    lay_towns(tmp_path, "town-suburb", "town-grid")
     drawn = list(carry_out(wanted(tmp_path, "season", regions=("town-suburb", "town-grid")), jobs=2))
     assert [bool(item.folders) for item in drawn] == [item.lack is None for item in drawn]
 
 
-def test_what_is_left_out_changes_no_other_query(tmp_path):
+def test_what_is_left_out_changes_no_other_query(tmp_path, lay_towns):
+    for name in ("all", "some"):
+        lay_towns(tmp_path / name, TOWNS[0])
     all_of_it = queries_of(carry_out(wanted(tmp_path / "all", "occlusion", regions=TOWNS[:1])))
     choice = Choice(views_cells=(192,), kinds=("U2", "U3"), tracks=("localization",))
     some = queries_of(carry_out(wanted(tmp_path / "some", "occlusion", regions=TOWNS[:1], choice=choice)))

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import pytest
 
 from sasgeo_bench.publish import publish
-from tests.browser import browser, find_chromium
+from tests.browser import PATIENCE_S, browser, find_chromium
 from tests.handmade import HOSTILE, MARKUP, SHARES, card_of, full_board, put_pictures
 
 CHROMIUM = find_chromium()
@@ -58,11 +58,10 @@ def address(site, name="index.html"):
 
 def until(page, script):
     """Wait for something that a script or a key brings about."""
-    for _ in range(200):
-        if page.value(script):
-            return
+    end = time.monotonic() + PATIENCE_S
+    while not page.value(script):
+        assert time.monotonic() < end, script
         time.sleep(0.05)
-    raise AssertionError(script)
 
 
 @pytest.mark.parametrize("width", [WIDE, 320])
@@ -262,10 +261,8 @@ def test_on_a_host_under_a_sub_path_pages_open_and_files_are_downloaded_whole(pa
         selector = f'a[href="files/{name}"]'
         page.value(f"document.querySelector({json.dumps(selector)}).click()")
         want = (site / "files" / name).read_bytes()
-        for _ in range(400):
-            found = tmp_path / name
-            if found.is_file() and found.read_bytes() == want:
-                break
+        end = time.monotonic() + PATIENCE_S
+        while not (tmp_path / name).is_file() or (tmp_path / name).read_bytes() != want:
+            assert time.monotonic() < end, name
             time.sleep(0.05)
-        assert (tmp_path / name).read_bytes() == want
     assert {path.name for path in tmp_path.iterdir()} == set(names)

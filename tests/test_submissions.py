@@ -28,6 +28,7 @@ from sasgeo_bench.store.submissiondir import list_submissions, read_submission
 from sasgeo_bench.submissionfile import Card, example_card
 from sasgeo_bench.submissions import SubmitRequest, hold_submission, make_submission, submissions_for, with_submissions
 from sasgeo_bench.tomlfile import parse_toml
+from tests.threaded import threaded
 
 CARD = {
     "name": "mine",
@@ -52,7 +53,8 @@ def stored(tasks, tmp_path_factory):
     out = tmp_path_factory.mktemp("submissions") / "out"
     shutil.copytree(tasks, out, symlinks=True)
     asked = [out / "tasks" / suite / "town-riverside" for suite in SUITES]
-    run(plan_run(RunRequest(spec="prior_centre", tasks=asked, out=out)), tell=silent)
+    with threaded():
+        run(plan_run(RunRequest(spec="prior_centre", tasks=asked, out=out)), tell=silent)
     request = ScoreRequest(
         predictions=[out / "runs"],
         tasks=asked,

@@ -35,6 +35,12 @@ LEARNT = ("learns, the same text twice", "answers without training")  # rows of 
 shut_in = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kernel has no Landlock to refuse files with")
 
 
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch):
+    """A good matcher is not too slow for the kit, however busy the machine is."""
+    monkeypatch.setattr(testing, "_QUICK_S", 600.0)
+
+
 @pytest.fixture
 def own_place(tiny, tmp_path, monkeypatch):
     """A place of one's own, beside the faulty matchers that look for it there."""

@@ -255,7 +255,7 @@ class Worker:
         code = None
         if self._process is not None:
             try:
-                code = self._process.wait(timeout=2)
+                code = self._process.wait(timeout=10)  # on a busy machine an end takes its time
             except subprocess.TimeoutExpired:
                 code = None
         if self._memory is not None and self._memory.look():

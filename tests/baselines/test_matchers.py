@@ -2,6 +2,7 @@
 """Every registered matcher on an embedded town: its card, its answers, and that they depend on the query alone."""
 
 import tomllib
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -35,6 +36,19 @@ def region(town_tasks):
 
 
 @pytest.fixture(scope="module")
+def prepared(region):
+    """A matcher by its name, prepared once: what it answers depends on nothing that it was asked before."""
+
+    @cache
+    def of_name(name):
+        matcher = make(name)
+        matcher.prepare(region, None)
+        return matcher
+
+    return of_name
+
+
+@pytest.fixture(scope="module")
 def queries(town_tasks):
     return [
         query for query in read_queries(town_tasks / "tasks" / "clean" / "town-grid") if query.evidence.shape[0] < 384
@@ -61,11 +75,10 @@ def test_every_matcher_is_registered() -> None:
 
 
 @pytest.mark.parametrize("name", REGISTERED)
-def test_answers_are_valid_and_the_same_in_any_order(name, region, queries) -> None:
+def test_answers_are_valid_and_the_same_in_any_order(name, region, prepared, queries) -> None:
     some = queries[:: STRIDES.get(name, 1)]
-    first, second = make(name), make(name)
-    for matcher in (first, second):
-        matcher.prepare(region, None)
+    first, second = prepared(name), make(name)
+    second.prepare(region, None)
     forward = {query.query_id: check_match(first.match(query, top_k=5), query, top_k=5) for query in some}
     backward = {query.query_id: check_match(second.match(query, top_k=5), query, top_k=5) for query in reversed(some)}
     assert forward == backward
@@ -80,17 +93,14 @@ def test_a_matcher_says_that_it_must_be_prepared(name, queries) -> None:
 
 
 @pytest.mark.parametrize("name", REGISTERED)
-def test_no_more_is_given_than_asked_for(name, region, queries) -> None:
-    matcher = make(name)
-    matcher.prepare(region, None)
+def test_no_more_is_given_than_asked_for(name, prepared, queries) -> None:
     query = next(item for item in queries if item.track == "retrieval")
-    assert len(matcher.match(query, top_k=1).poses) == 1
+    assert len(prepared(name).match(query, top_k=1).poses) == 1
 
 
 @pytest.mark.parametrize("name", DENSE)
-def test_dense_matchers_find_what_has_no_errors(name, region, queries, truths) -> None:
-    matcher = make(name)
-    matcher.prepare(region, None)
+def test_dense_matchers_find_what_has_no_errors(name, prepared, queries, truths) -> None:
+    matcher = prepared(name)
     for query in queries:
         truth = truths[query.query_id]
         if truth.role != "control" or truth.pose is None:
@@ -104,9 +114,8 @@ def test_dense_matchers_find_what_has_no_errors(name, region, queries, truths) -
 
 
 @pytest.mark.parametrize("name", CONTROLS)
-def test_controls_do_not_look_at_the_view(name, region, queries) -> None:
-    matcher = make(name)
-    matcher.prepare(region, None)
+def test_controls_do_not_look_at_the_view(name, prepared, queries) -> None:
+    matcher = prepared(name)
     for query in queries[:6]:
         other = query.evidence.replace(np.zeros_like(query.evidence.cells))
         changed = type(query)(**{field: getattr(query, field) for field in query.__slots__} | {"evidence": other})

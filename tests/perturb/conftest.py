@@ -6,10 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from sasgeo_bench.build import build_region, plan_build
 from sasgeo_bench.evidence import UNKNOWN, Evidence, LayerBits, observe
 from sasgeo_bench.pose import Pose
-from sasgeo_bench.store.catalog import find_region_file, read_region_file
 from sasgeo_bench.store.regiondir import read_region
 
 TOWNS = ("town-suburb", "town-riverside", "town-industrial")
@@ -18,13 +16,12 @@ SIZE_CELLS = 192
 
 
 @pytest.fixture(scope="session")
-def views(tmp_path_factory) -> Sequence[Evidence]:
+def views(lay_towns, tmp_path_factory) -> Sequence[Evidence]:
     """Views of 192 m at 1 m cells, of any heading, wholly within their town."""
     rng, found = np.random.default_rng(7), []
+    out = lay_towns(tmp_path_factory.mktemp("towns"), *TOWNS)
     for town in TOWNS:
-        plan = plan_build(read_region_file(find_region_file(town)), out=tmp_path_factory.mktemp("towns"))
-        build_region(plan, tell=lambda _: None, with_preview=False)
-        region = read_region(plan.folder)
+        region = read_region(out / "regions" / town)
         bits, grid = LayerBits.of(region.layers), region.grid
         west_m, south_m, east_m, north_m = grid.bounds_m
         wanted = len(found) + VIEWS_PER_TOWN

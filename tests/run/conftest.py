@@ -13,9 +13,10 @@ TOWN = "town-riverside"
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory):
+def made(tmp_path_factory, lay_towns):
     """A folder with out/ and hostile.py in it."""
     root = tmp_path_factory.mktemp("run")
+    lay_towns(root / "out", TOWN)
     wanted = Wanted(
         suites=("false-unknown", "clean"),
         regions=(TOWN,),

@@ -41,6 +41,21 @@ class Slow(Plain):
         return super().match(query, top_k=top_k)
 
 
+class Held(Plain):
+    """As plain, but as long as there is a file `hold` beside it, only queries that it names are answered."""
+
+    def match(self, query, *, top_k):
+        hold = Path(__file__).with_name("hold")
+        while hold.exists():
+            try:
+                if query.query_id in hold.read_text(encoding="utf-8"):
+                    break
+            except FileNotFoundError:
+                break
+            time.sleep(0.01)
+        return super().match(query, top_k=top_k)
+
+
 class TellsProcess(Plain):
     """Says which process it is in, how many maps that has prepared, and how many maps it can read."""
 
@@ -86,11 +101,16 @@ class ExitsOnce(TellsProcess):
         return super().match(query, top_k=top_k)
 
 
-class HangsLater(ExitsOnce):
+class HangsLater(TellsProcess):
     """Does not come back from its third question."""
 
+    def __init__(self):
+        super().__init__()
+        self.asked = 0
+
     def match(self, query, *, top_k):
-        if self.asked == 2:
+        self.asked += 1
+        if self.asked == 3:
             time.sleep(1000)
         return super().match(query, top_k=top_k)
 

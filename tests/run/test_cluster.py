@@ -52,21 +52,23 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     assert "nothing left" in told[-1]
 
 
-def test_a_dask_worker_that_is_killed_costs_no_row(task, tmp_path):
+def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
     alone = plan_run(request_of(task, tmp_path / "one"))
     run(alone, tell=lambda _: None)
-    plan = plan_run(request_of(task, tmp_path / "two", name="Slow", dask="local:2"))
+    plan = plan_run(request_of(task, tmp_path / "two", name="Held", dask="local:2"))
     part = plan.parts[0]
+    (place / "hold").write_text(" ".join(next(iter(cluster._chunks(part.left, 2)))), encoding="utf-8")
     killed, asked, costs = [], [], []
     with cluster.connected("local:2") as client:
         for number, _, cost in cluster.answer_on(client, plan, [part]):
             assert number == 0
             costs.append(cost)
-            if not killed:  # chunks are left, so both are at work
+            if not killed:  # the first chunk is answered, and both are held at work on another one
                 while not asked:  # the process of a matcher, of a dask worker in the middle of a chunk
                     killed = list(client.run(os.getpid).values())[:1]
                     asked = psutil.Process(killed[0]).children(recursive=True)
                 os.kill(killed[0], signal.SIGKILL)
+                (place / "hold").unlink()
         assert killed[0] not in client.run(os.getpid).values()
     assert len(costs) > 2
     assert asked

@@ -68,6 +68,7 @@ def told(request, folder):
     return {item.diagnostics["pairs"] for item in answers(request, folder).values()}
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_it(request_of):
     request = request_of()
     lines = plan_run(request).to_text().splitlines()
@@ -87,6 +88,7 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     assert merged == 2
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_what_was_learnt_is_used_again_and_learnt_anew_from_something_else(request_of, monkeypatch):
     request = request_of()
     first, _, folder = carry_out(request)
@@ -131,6 +133,7 @@ def test_whoever_fails_to_learn_loses_its_rows_and_nothing_else(request_of, name
     assert len(plan_run(replace(request, again=(status,))).parts[0].left) == 2
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_card_that_needs_training_is_not_applicable_without(request_of):
     request = request_of("NeedsTraining")
     plan, report, folder = carry_out(request)
@@ -140,6 +143,7 @@ def test_a_card_that_needs_training_is_not_applicable_without(request_of):
     assert (report.counts, report.messages) == ({"not applicable": 2}, {"not applicable": "no training"})
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
     plan, report, folder = carry_out(request_of(spec="hostile:Plain"))
     assert (plan.lesson, report.counts) == (None, {"ok": 2})
@@ -147,6 +151,7 @@ def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
     assert rundir.read_run(folder)["learned"] is None
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_time_to_learn_changes_no_run_of_those_that_do_not(request_of):
     limits = [Limits(learn_s=seconds) for seconds in (100.0, 200.0)]
     one, other = (plan_run(request_of(spec="hostile:Plain", limits=item)).hash for item in limits)

@@ -75,11 +75,11 @@ def test_a_thread_waits_until_it_is_known_whether_help_pays(pace_s, is_helped):
         clock.now += pace_s
         next(asked)  # six are left
         if is_helped:
-            assert helper.result(timeout=60) == 0
+            assert helper.result(timeout=600) == 0
         else:
             assert not helper.done()
             assert len(list(asked)) == LEAST_ITEMS - 3
-            assert helper.result(timeout=60) is None
+            assert helper.result(timeout=600) is None
 
 
 def test_whoever_waits_is_let_go_when_a_map_holds_less_than_it_said():
@@ -88,7 +88,7 @@ def test_whoever_waits_is_let_go_when_a_map_holds_less_than_it_said():
     with ThreadPoolExecutor(max_workers=1) as pool:
         helper = pool.submit(schedule.take)
         assert list(schedule.items(0)) == ["a"]
-        assert helper.result(timeout=60) is None
+        assert helper.result(timeout=600) is None
 
 
 def test_after_a_stop_nothing_is_given_and_nobody_waits():
@@ -101,7 +101,7 @@ def test_after_a_stop_nothing_is_given_and_nobody_waits():
     with ThreadPoolExecutor(max_workers=1) as pool:
         helper = pool.submit(schedule.take)
         schedule.stop()
-        assert helper.result(timeout=60) is None
+        assert helper.result(timeout=600) is None
     assert list(asked) == []
     assert list(schedule.items(1)) == []
     assert schedule.is_stopped
@@ -119,5 +119,5 @@ def test_many_threads_share_out_everything_once():
         return found
 
     with ThreadPoolExecutor(max_workers=6) as pool:
-        found = [item for asking in [pool.submit(ask) for _ in range(6)] for item in asking.result(timeout=60)]
+        found = [item for asking in [pool.submit(ask) for _ in range(6)] for item in asking.result(timeout=600)]
     assert sorted(found) == [(number, at) for number, count in enumerate(counts) for at in range(count)]

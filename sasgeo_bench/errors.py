@@ -2,6 +2,9 @@
 """The errors users meet: every one is a `SasgeoError` and fits on one line that names the fault and the mend."""
 
 from collections.abc import Sequence
+from typing import Final
+
+MOST_MESSAGE: Final = 2000  # characters
 
 
 def counted(count: int, one: str, many: str = "") -> str:
@@ -41,7 +44,7 @@ def printable(text: str) -> str:
 class SasgeoError(Exception):
     """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
 
-    Its text is one printable line even where it quotes a file or a library that says several.
+    Its text is one printable line of a bounded length, also where it quotes a file or a library that says more.
 
     Examples
     --------
@@ -52,8 +55,10 @@ class SasgeoError(Exception):
     """
 
     def __str__(self) -> str:
-        """The text on one line."""
-        return printable(super().__str__())
+        """The text on one line, cut in its middle: it begins with the fault and ends with the mend."""
+        text = printable(super().__str__())
+        half = MOST_MESSAGE // 2
+        return text if len(text) <= MOST_MESSAGE else f"{text[: half - 5]} ... {text[-half:]}"
 
 
 class GridError(SasgeoError, ValueError):

@@ -2,8 +2,11 @@
 """The errors users meet: every one is a `SasgeoError` and fits on one line that names the fault and the mend."""
 
 from collections.abc import Sequence
+from typing import Final
 
 from sasgeo_bench.texts import plain
+
+MOST_MESSAGE: Final = 2000  # characters
 
 
 def counted(count: int, one: str, many: str = "") -> str:
@@ -32,7 +35,7 @@ def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
 class SasgeoError(Exception):
     """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
 
-    Its text is one printable line even where it quotes a file or a library that says several.
+    Its text is one printable line of a bounded length, also where it quotes a file or a library that says more.
 
     Examples
     --------
@@ -43,8 +46,10 @@ class SasgeoError(Exception):
     """
 
     def __str__(self) -> str:
-        """The text on one line."""
-        return plain(" ".join(super().__str__().split()))
+        """The text on one line, cut in its middle: it begins with the fault and ends with the mend."""
+        text = plain(" ".join(super().__str__().split()))
+        half = MOST_MESSAGE // 2
+        return text if len(text) <= MOST_MESSAGE else f"{text[: half - 5]} ... {text[-half:]}"
 
 
 class GridError(SasgeoError, ValueError):

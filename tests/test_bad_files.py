@@ -29,7 +29,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.ageing.measure import DTYPES
 from sasgeo_bench.boardshape import check_shape
 from sasgeo_bench.entries import find_entries
-from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.errors import MOST_MESSAGE, SasgeoError
 from sasgeo_bench.extract.history import DatedExtract, read_history
 from sasgeo_bench.extract.read import read_extract
 from sasgeo_bench.grid import Grid
@@ -449,7 +449,7 @@ def check_reading(folder: Path, item: Format, data: bytes) -> None:
     except SasgeoError as error:
         text = str(error)
         assert text.isprintable(), text
-        assert len(text) < 3000
+        assert len(text) <= MOST_MESSAGE
     assert sorted(folder.rglob("*")) == before
     assert (folder / item.file).read_bytes() == data
 

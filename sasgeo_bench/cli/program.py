@@ -32,7 +32,6 @@ from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.results import one_line
 
 EXIT_INTERRUPTED: Final = 130
-MOST_MESSAGE: Final = 2000  # characters
 
 
 def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:
@@ -88,19 +87,13 @@ def _warn(
     tell(f"sasgeo-bench: warning: {one_line(str(message))}")
 
 
-def _cut(text: str) -> str:
-    """Cut a long message in its middle: the fault is told first and the mend last."""
-    half = MOST_MESSAGE // 2
-    return text if len(text) <= MOST_MESSAGE else f"{text[: half - 5]} ... {text[-half:]}"
-
-
 def main() -> None:
     """Run the program: 0 done, 2 the user's mistake or the disk's refusal on one line, 1 our bug with a traceback."""
     warnings.showwarning = _warn
     try:
         app()
     except SasgeoError as error:
-        tell(f"sasgeo-bench: {_cut(str(error))}")
+        tell(f"sasgeo-bench: {error}")
         sys.exit(EXIT_USER)
     except OSError as error:  # whatever nobody has put in words of their own, as of a name that is too long
         said = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+import shapely
 from matplotlib import image
 
 from sasgeo_bench.build import build_region, plan_build
@@ -56,3 +57,20 @@ def test_narrow_and_tiny_regions_are_drawn_too(tmp_path, manifest, shape):
 
 def test_the_manifest_carries_the_attribution_that_is_drawn(manifest):
     assert manifest.attribution == ATTRIBUTION
+
+
+def test_the_edge_of_what_is_mapped_is_drawn_and_nothing_covers_the_map(tmp_path, manifest):
+    west, south, east, north = manifest.bounds_m
+    empty = np.zeros((len(load_taxonomy().names), 300, 300), dtype=np.uint8)
+    whole = drawn(tmp_path, manifest, empty)
+    half = shapely.box(west, south, (west + east) / 2, north)
+    coverage = manifest.coverage.model_copy(update={"wkt": shapely.to_wkt(half), "share": 0.5})
+    parted = drawn(tmp_path, manifest.model_copy(update={"coverage": coverage}), empty)
+    # Within the map every pixel has the colour of the ground: no arrow, scale or box lies on it.
+    ground = np.abs(whole - whole[whole.shape[0] // 2, 200]).max(axis=2) <= 2
+    rows, cols = np.flatnonzero(ground.mean(axis=1) > 0.5), np.flatnonzero(ground.mean(axis=0) > 0.5)
+    inside = np.s_[rows[5] : rows[-5], cols[5] : cols[-5]]
+    assert ground[inside].all()
+    edge = np.abs(parted - whole).max(axis=2)[inside] > 60
+    assert edge.any(axis=1).all()
+    assert 1 <= edge.any(axis=0).sum() <= 5

@@ -93,7 +93,11 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
 
 
 def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
+    pip = tmp_path.parent / f"{tmp_path.name}-bin" / "pip"  # an environment may have been made without one
+    pip.parent.mkdir()
+    pip.touch(mode=0o755)
+    monkeypatch.setattr(sys, "executable", str(pip.with_name("python")))
+    monkeypatch.setenv("PATH", str(pip.parent))
     code, told, err = program("new-matcher", "my-matcher")
     assert code == 0
     assert "submit --card my-matcher/card.toml" in err
@@ -101,7 +105,7 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
     monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named
     code, told, _ = program("new-matcher", "other", "--into", "deep/er")
-    assert f"next: {Path(sys.executable).parent / 'pip'} install -e deep/er && " in told
+    assert f"next: {pip} install -e deep/er && " in told
     assert (code, told.split(":")[0]) == (0, "deep/er")
     assert (tmp_path / "deep" / "er" / "pyproject.toml").is_file()
 

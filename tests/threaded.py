@@ -26,9 +26,6 @@ class Threaded(Worker):
             threading.Thread(target=Server(theirs, spec=self.spec).run, daemon=True).start()
         return self._channel
 
-    def _watch(self) -> None:
-        """A thread has no memory of its own."""
-
     def end(self) -> None:
         """Close the channel, which ends the thread."""
         if self._channel is not None:

@@ -195,7 +195,7 @@ def score_told(
     for item in told:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
-                _check_file(item.entry, folders, split)
+                check_submitted(item.entry, folders, split)
             scored = _scored(item, tasks, split, by_region)
             hold_controls({item.entry.name: scored})  # so that whoever it fails with is known
             found[item.entry.name] = scored
@@ -204,8 +204,16 @@ def score_told(
     return found
 
 
-def _check_file(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse what anyone may have written if it is not what the tasks ask for; queries without a row are misses."""
+def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
+    """Refuse a file or submission that is not what the tasks ask for; queries without a row are misses.
+
+    Raises
+    ------
+    ConfigError
+        With the first fault, and how many there are.
+    StoreError
+        If it cannot be read.
+    """
     path = entry.sources[0]
     if entry.submission is None:
         found = validate(path, folders)

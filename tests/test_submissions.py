@@ -12,8 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.boards import ScoreRequest, make_board
+from sasgeo_bench.cli.boards import CONTESTANT_FAILED
+from sasgeo_bench.contestants import check_submitted
+from sasgeo_bench.entries import find_entries
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.packing import pack_board
+from sasgeo_bench.packing import laid_tasks, pack_board, stored_settings
 from sasgeo_bench.results import Prediction
 from sasgeo_bench.run.oracle import right_answer
 from sasgeo_bench.run.plan import RunRequest, plan_run
@@ -21,6 +24,7 @@ from sasgeo_bench.run.runner import run
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import read_board
 from sasgeo_bench.store.catalog import find_split
+from sasgeo_bench.store.failures import Failures
 from sasgeo_bench.store.regiondir import file_record
 from sasgeo_bench.store.rundir import PREDICTION_SCHEMA
 from sasgeo_bench.store.runrows import prediction_row
@@ -396,12 +400,13 @@ def rename_folder(folder):
         ),
     ],
 )
-def test_a_folder_that_is_not_what_it_says_is_refused(copied, stored, mistake, spoil, fault):
+def test_a_folder_that_is_not_what_it_says_is_refused(copied, stored, mistake, tmp_path, spoil, fault):
     spoil(copied)
     line = mistake("validate", "--predictions", copied, "--for", stored)
     assert fault in line
-    score = ["score", "--predictions", stored, "--submissions", copied.parent if copied.is_dir() else copied]
-    assert fault in mistake(*score) or fault.startswith("holds the submission")
+    failures = Failures(tmp_path / "log", tell=lambda _: None)
+    assert find_entries([], [copied], failures=failures) == ()
+    assert fault in str(failures.first) or fault.startswith("holds the submission")
 
 
 def change_rows(folder, change):
@@ -429,17 +434,28 @@ def change_rows(folder, change):
         (lambda at: change_rows(at, lambda rows: rows[1].update(confidence=-0.5)), "confidence is -0.5"),
     ],
 )
-def test_rows_and_versions_that_do_not_fit_the_board_are_listed_and_never_scored(
-    copied, stored, program, mistake, tmp_path, spoil, fault
-):
+def test_rows_and_versions_that_do_not_fit_the_board_are_listed_and_never_scored(copied, stored, program, spoil, fault):
     spoil(copied)
     code, out, _ = program("validate", "--predictions", copied, "--for", stored)
     assert code == 2
     assert fault in out
+    (entry,) = find_entries([], [copied])
+    with laid_tasks([stored]) as folders, pytest.raises(ConfigError) as refused:
+        check_submitted(entry, folders, find_split(stored_settings([stored]).split))
+    assert fault in str(refused.value)
+
+
+def test_a_submission_with_a_fault_costs_nobody_the_board(copied, stored, program, tmp_path):
+    change_rows(copied, lambda rows: rows[1].update(confidence=-0.5))
     words = ("score", "--predictions", stored, "--submissions", copied.parent, "--name", "both", "--out", tmp_path)
-    line = mistake(*words)
-    assert fault in line or "is no prediction" in line
-    assert not (tmp_path / "boards" / "both").exists()
+    code, _, err = program(*words)
+    assert code == CONTESTANT_FAILED
+    assert "failed, and so not on the board: mine: " in err
+    assert "confidence is -0.5" in err
+    about, _ = read_board(tmp_path / "boards" / "both")
+    assert list(about["failed"]) == ["mine"]
+    assert about["entries"]
+    assert "mine" not in {entry["name"] for entry in about["entries"]}
 
 
 def test_every_submission_of_the_repository_is_sound() -> None:

@@ -69,7 +69,18 @@ HOUSE: dict[str, tuple[str, ...] | None] = {
     "rejector": None,
     "submissionfile": None,
     "store": (
-        *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "learnedfile", "rundir", "submissiondir"),
+        *(
+            "parquetfile",
+            "jsonfile",
+            "layerfile",
+            "regiondir",
+            "taskrows",
+            "taskdir",
+            "runrows",
+            "learnedfile",
+            "rundir",
+            "submissiondir",
+        ),
         *("fileset", "packabout", "boardfile", "packrows", "packdir", "packfile", "svgfile", "sitedir", "pluginfiles"),
         *(
             "preview",

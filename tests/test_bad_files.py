@@ -411,7 +411,7 @@ def odd_table(draw: st.DrawFn, data: bytes) -> bytes:
     elif kind == "rows":
         table = draw(st.sampled_from((table.slice(0, 0), table.slice(1), pa.concat_tables([table, table]))))
     else:
-        value = draw(st.sampled_from(HOSTILE))
+        value = draw(st.sampled_from([value for value in HOSTILE if value != {}]))  # no parquet holds an empty struct
         try:
             odd = pa.array([value] * len(table), column.type if kind == "set" else None)
         except (pa.ArrowException, TypeError, ValueError, OverflowError):

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import geopandas as gpd
 import pandas as pd
+import pyarrow as pa
 import shapely
 from filelock import FileLock, Timeout
 from pyproj import CRS
@@ -161,7 +162,10 @@ def _read_geometry(path: Path) -> gpd.GeoDataFrame:
         pass
     try:
         return gpd.read_parquet(path, **VERIFIED)
-    except (OSError, ValueError, KeyError, TypeError, CRSError, shapely.errors.ShapelyError) as error:
+    except (
+        *(OSError, ValueError, KeyError, TypeError, AttributeError),
+        *(pa.ArrowException, CRSError, shapely.errors.ShapelyError),
+    ) as error:
         message = f"{path} cannot be read ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
 

@@ -38,6 +38,7 @@ from sasgeo_bench.report.steps import GROUP, queries_of, steps_frame
 from sasgeo_bench.report.tables import leaderboard
 from sasgeo_bench.report.text import board_markdown
 from sasgeo_bench.results import Prediction
+from sasgeo_bench.run.sandbox import joined
 from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.split import Split
 from sasgeo_bench.store import taskdir
@@ -497,7 +498,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
                 "card": entry.card,
                 "trained_on": entry.declared,
                 "set_apart": board.apart.get(entry.name),
-                "isolation": entry.runs[0].get("isolation") if entry.runs else None,
+                "isolation": joined(run.get("isolation") or {} for run in entry.runs) if entry.runs else None,
                 "learned": entry.learned(),
                 **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
             }

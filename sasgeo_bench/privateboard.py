@@ -15,6 +15,7 @@ from sasgeo_bench.query import TASK_VERSION
 from sasgeo_bench.region import DATA_VERSION
 from sasgeo_bench.report.reproduction import compare_seeds, said_of, verdict_of
 from sasgeo_bench.report.rows import RUN_HERE, name_alone
+from sasgeo_bench.run.sandbox import keeps_truth
 from sasgeo_bench.score import SCORER_VERSION
 from sasgeo_bench.store import taskdir
 from sasgeo_bench.store.boardfile import read_board, read_scores
@@ -195,8 +196,10 @@ def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
         return f"the private seed has {seed['bits']} bits, {REPRODUCING_BITS} are needed"
     if entry is None:
         return "this version, code and settings are not on the private board"
-    words = (entry.get("isolation") or {}).get("truth", "not protected")
-    return f"on the private seed its truths were {words}" if words.startswith("not ") else ""
+    isolation = entry.get("isolation") or {}
+    if keeps_truth(isolation):
+        return ""
+    return f"on the private seed its truths were not kept from it ({isolation.get('truth', 'not protected')})"
 
 
 def kept_private(about: Mapping[str, Any], entries: Sequence[Entry], root: Path) -> OnPrivate:

@@ -246,8 +246,8 @@ def test_only_the_same_code_shut_in_on_128_bits_vouches_for_a_row(made, tmp_path
             ({"private_seed": seed}, "the private seed has 80 bits, 128 are needed"),
             ({"entries": [entry | {"hash": "other"}]}, "this version, code and settings are not on the private board"),
             (
-                {"entries": [entry | {"isolation": {"truth": "not protected"}}]},
-                "on the private seed its truths were not protected",
+                {"entries": [entry | {"isolation": {"truth": "not in its root | trusted code, not shut in"}}]},
+                "on the private seed its truths were not kept from it (not in its root | trusted code, not shut in)",
             ),
         )
     ):

@@ -17,7 +17,7 @@ from sasgeo_bench.results import Prediction, one_line
 from sasgeo_bench.run.oracle import Oracle
 from sasgeo_bench.run.plan import RunPart, RunPlan, by_map, reach_of
 from sasgeo_bench.run.replies import Reply
-from sasgeo_bench.run.sandbox import PROMISES
+from sasgeo_bench.run.sandbox import PROMISES, joined
 from sasgeo_bench.run.schedule import Schedule
 from sasgeo_bench.run.teach import failed_by_us, guarded
 from sasgeo_bench.run.worker import Worker
@@ -28,7 +28,6 @@ from sasgeo_bench.store.taskrows import asked_under
 PART_ROWS: Final = 64
 PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
 
-_AND: Final = " | "  # between ways in which parts of one run were shut in
 
 Question = tuple["_Writer", Query, bytes]
 
@@ -71,21 +70,18 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
     {'ok': 3}
     """
     counts: dict[str, int] = {}
-    words: dict[str, list[str]] = {}
     messages: dict[str, str] = {}
     for cost in costs:
         messages = cost.messages | messages
         for status, count in cost.counts.items():
             counts[status] = counts.get(status, 0) + count
-        for name, said in cost.isolation.items():
-            words.setdefault(name, []).extend(said.split(_AND))
     return Cost(
         counts=counts,
         prepare_s=max((cost.prepare_s for cost in costs if cost.prepare_s is not None), default=None),
         index_bytes=max((cost.index_bytes for cost in costs if cost.index_bytes is not None), default=None),
         cpu_s=sum(cost.cpu_s for cost in costs),
         peak_bytes=max((cost.peak_bytes for cost in costs), default=0),
-        isolation={name: _AND.join(dict.fromkeys(said)) for name, said in words.items()},
+        isolation=joined(cost.isolation for cost in costs),
         messages=messages,
     )
 

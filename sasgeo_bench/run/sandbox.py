@@ -10,7 +10,7 @@ import resource
 import signal
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import FrameType
 from typing import Final, NoReturn
@@ -26,6 +26,9 @@ CLONE_NEWPID: Final = 0x20000000
 CLONE_NEWNET: Final = 0x40000000
 MS_REC_PRIVATE: Final = 0x4000 | 0x40000
 _BY_SIGNAL: Final = 128  # an exit status beyond this says which signal, as shells have it
+_NO_TRUTH: Final = "not in its root"
+_REFUSED: Final = "refused by Landlock"
+_AND: Final = " | "  # between ways in which processes of one run were shut in
 _CAPABILITIES: Final = 0x20080522  # version of the structures that say which powers a process has
 
 # What Python, psutil and libraries of linear algebra read of a /proc that shows other processes, too.
@@ -174,10 +177,36 @@ def _changed_words(walls: _Walls) -> str:
     return f"{kept}{emptied}; modes, owners, times and attributes {metadata}"
 
 
+def joined(said: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Isolation of several processes as one: each way in which one of them was shut in, once.
+
+    Examples
+    --------
+    >>> joined([{"truth": "not in its root"}, {"truth": "not protected"}, {"truth": "not protected"}])
+    {'truth': 'not in its root | not protected'}
+    """
+    words: dict[str, list[str]] = {}
+    for one in said:
+        for name, text in one.items():
+            words.setdefault(name, []).extend(text.split(_AND))
+    return {name: _AND.join(dict.fromkeys(texts)) for name, texts in words.items()}
+
+
+def keeps_truth(isolation: Mapping[str, str]) -> bool:
+    """Whether truths were kept from all processes of a run, as far as it says.
+
+    Examples
+    --------
+    >>> [keeps_truth({"truth": words}) for words in ("not in its root, refused by Landlock", "not protected")]
+    [True, False]
+    """
+    return all(part.startswith((_NO_TRUTH, _REFUSED)) for part in isolation.get("truth", "").split(_AND))
+
+
 def _truth_words(walls: _Walls, unsearched: str) -> str:
     ways = _joined(
-        "not in its root" if walls.has_root else "",
-        "refused by Landlock" if walls.landlock > 0 else "",
+        _NO_TRUTH if walls.has_root else "",
+        _REFUSED if walls.landlock > 0 else "",
         otherwise="",
     )
     return "; ".join(filter(None, (ways, unsearched))) if ways else "not protected"

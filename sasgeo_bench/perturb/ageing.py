@@ -122,7 +122,8 @@ class Ageing:
 
     Notes
     -----
-    A thing is a connected component; lines, which all connect, go and come in pieces of about 40 m. A thing vanishes
+    A thing is a connected component; lines, which all connect, go and come in pieces of about 40 m. The sea, which is
+    water that reaches a coastline, stays as it is. A thing vanishes
     with probability 1 - exp(-vanish * years). As many appear as a Poisson draw of mean
     (exp(appear * years) - 1) * things says, which is what measured rates of appearing mean, each a turned copy of one
     of its class, set down nearby where no building, water, road or railway is. One that finds no free place in twelve
@@ -158,6 +159,9 @@ class Ageing:
             return evidence
         pool = NoisePool(evidence.shape)
         layers = dict(zip(evidence.classes, evidence.cells == PRESENT, strict=True))
+        sea = _sea(layers)
+        if sea is not None:
+            layers["water"] &= ~sea
         things = {
             name: _things(name, mask, pool, evidence.cell_size_m, rng)
             for name, mask in layers.items()
@@ -165,6 +169,8 @@ class Ageing:
         }
         for name, found in things.items():
             layers[name] = self._older(name, layers[name], found, evidence.cell_size_m, rng)
+        if sea is not None:
+            layers["water"] |= sea
         for name, found in things.items():
             self._appear(name, layers, found, evidence.cell_size_m, rng)
         return with_cells(evidence, np.stack(list(layers.values())).view(np.uint8))
@@ -203,6 +209,15 @@ class Ageing:
             for below in _CLEARED.get(name, ()):
                 if below in layers:
                     layers[below][window] &= ~stamp
+
+
+def _sea(layers: Mapping[str, Mask]) -> Mask | None:
+    """Water that reaches a coastline, which does not age as ponds do; None without one."""
+    water, coast = layers.get("water"), layers.get("coastline")
+    if water is None or coast is None or not coast.any():
+        return None
+    bodies, count = ndimage.label(water)
+    return np.isin(bodies, np.setdiff1d(np.unique(bodies[dilated(coast, 1.5)]), [0])) if count else None
 
 
 def _things(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.random.Generator) -> Objects:

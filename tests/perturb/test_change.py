@@ -52,6 +52,15 @@ def test_houses_vanish_whole_and_nothing_appears_without_a_rate():
         assert set(find_objects(view.cells[0] == PRESENT).areas_cells) == {64}
 
 
+def test_the_sea_stays_where_ponds_vanish():
+    water, coast = (np.zeros((192, 192), dtype=np.uint8) for _ in range(2))
+    water[:40], water[120:130, 120:130], coast[40:42] = 1, 1, 1
+    shore = houses(per_side=1, water=water, coastline=coast)
+    views = aged(shore, rates=rates(vanish=5.0, names=("water",)), years=10)
+    assert all((view.layer("water")[:40] == PRESENT).all() for view in views)
+    assert all((view.layer("water")[120:130, 120:130] == ABSENT).all() for view in views)
+
+
 @pytest.mark.parametrize("years", [5, 20])
 def test_as_many_things_appear_as_the_rate_says_where_there_is_room(years):
     village = houses(per_side=4)

@@ -27,6 +27,7 @@ _VECTOR: Final = pa.struct(
 )
 
 
+_ASKED_VERSION: Final = 1  # raised if the same row is to be answered in another way, not when other rows are drawn
 _META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
 
 
@@ -232,7 +233,7 @@ def asked_sha256(row: Mapping[str, Any], map_said: Mapping[str, str]) -> str:
     True
     """
     said = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
-    text = json.dumps([TASK_VERSION, dict(map_said), said], sort_keys=True, default=_plain)
+    text = json.dumps([_ASKED_VERSION, dict(map_said), said], sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -184,7 +184,14 @@ def test_what_is_not_known_of_a_case_is_not_said(root):
     assert said_of(replace(case, prediction=with_nan))["status"] == "withheld"
 
 
-def test_a_picture_that_fits_in_no_quality_is_refused():
+def test_a_picture_that_fits_in_no_quality_is_made_smaller():
+    noise = np.random.default_rng(1).integers(0, 255, (200, 200, 3), dtype=np.uint8)
+    worst = len(cv2.imencode(".webp", noise, [cv2.IMWRITE_WEBP_QUALITY, 10])[1])
+    found = cv2.imdecode(np.frombuffer(fitted(noise, worst - 1), np.uint8), cv2.IMREAD_COLOR)
+    assert found.shape == (150, 150, 3)
+
+
+def test_a_picture_that_fits_in_no_quality_and_size_is_refused():
     noise = np.random.default_rng(1).integers(0, 255, (200, 200, 3), dtype=np.uint8)
     with pytest.raises(StoreError, match="a picture of 200 x 200 pixels does not fit into 100 bytes"):
         fitted(noise, 100)

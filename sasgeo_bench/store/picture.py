@@ -18,6 +18,7 @@ from sasgeo_bench.store.preview import paint_overview
 WEBP: Final = ".webp"
 PNG: Final = ".png"
 _QUALITIES: Final = (80, 65, 50, 35, 20, 10)
+_SCALES: Final = (1.0, 0.75, 0.5)
 _THUMB_INCHES: Final = 3.2
 _FOOT_INCHES: Final = 0.16
 _DPI: Final = 100
@@ -31,7 +32,7 @@ def pixels_of(figure: Figure) -> NDArray[np.uint8]:
 
 
 def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
-    """Pixels as WebP, as good as fits; the same bytes for the same pixels.
+    """Pixels as WebP, as good and then as large as fits; the same bytes for the same pixels.
 
     Parameters
     ----------
@@ -43,17 +44,19 @@ def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
     Raises
     ------
     StoreError
-        If even the worst quality takes more.
+        If even half of its size in the worst quality takes more.
 
     Examples
     --------
     >>> len(fitted(np.zeros((8, 8, 3), dtype=np.uint8), 1000)) < 200
     True
     """
-    for quality in _QUALITIES:
-        data = _encoded(WEBP, pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
-        if len(data) <= most_bytes:
-            return data
+    for scale in _SCALES:
+        smaller = np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        for quality in _QUALITIES:
+            data = _encoded(WEBP, smaller, [cv2.IMWRITE_WEBP_QUALITY, quality])
+            if len(data) <= most_bytes:
+                return data
     message = f"a picture of {pixels.shape[1]} x {pixels.shape[0]} pixels does not fit into {most_bytes} bytes"
     raise StoreError(message)
 

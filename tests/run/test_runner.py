@@ -202,7 +202,7 @@ def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypa
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(pq, "write_table", full)
+    monkeypatch.setattr(rundir, "write_table", full)
     with pytest.raises(StoreError, match=r"No space left on device.*it goes on there"):
         run_all(request_of(task, tmp_path, limit=4))
     monkeypatch.undo()

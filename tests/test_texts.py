@@ -429,7 +429,7 @@ def root(tasks, tmp_path_factory):
             else Prediction(
                 query_id=query.query_id,
                 candidates=(((query.candidates or [Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)])[0], 1.0),),
-                diagnostics={WORDS: 1.0, "cost $\\nosuchthing$": 2.0, "=1+1": 3.0},
+                diagnostics={WORDS[:64]: 1.0, "cost $\\nosuchthing$": 2.0, "=1+1": 3.0},
                 confidence=0.5,
             )
             for at, query in enumerate(taskdir.read_queries(task))

@@ -224,5 +224,6 @@ def parse_said(data: bytes | str, model: type[Model]) -> Model:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
         found = "" if not where or first["type"] == "missing" else f" is {first['input']!r}"[:80]
-        message = one_line(f"{where}{found}: {first['msg']}" if where else first["msg"])
+        fault = "Input should be an object" if first["type"] == "model_type" else first["msg"]
+        message = one_line(f"{where}{found}: {fault}" if where else fault)
         raise ValueError(message) from error

@@ -2,6 +2,7 @@
 """Memory of a process and of all that came from it: looked at in a thread of its own as long as the process lives."""
 
 import os
+import re
 import subprocess
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +18,10 @@ WATCH_S: Final = 0.05  # how often memory is looked at
 _SHARED: Final = ("/memfd:", "/dev/shm/")  # noqa: S108 - what open files are called that lie in memory
 _USUAL: Final = 3  # processes: two that keep the matcher's, and its own
 _GROWN: Final = 1.02  # by so much has an estimate grown before it is looked at closely again
+_MAPPING: Final = re.compile(
+    rb"[0-9a-f]+-[0-9a-f]+ \S{4} [0-9a-f]+ (?P<major>[0-9a-f]+):(?P<minor>[0-9a-f]+) (?P<inode>\d+)"
+)
+_SHARE: Final = re.compile(rb"Pss: +(?P<kb>\d+) kB")
 _KB: Final = 1024
 _BLOCK: Final = 512
 
@@ -67,7 +72,14 @@ class MemoryWatch:
         return max(self._sampled, self.group.peak_bytes() if self.group else 0)
 
     def look(self) -> bool:
-        """Measure once; whether it takes more than it may."""
+        """Measure once; whether it takes more than it may. Whoever keeps us from measuring does, too."""
+        try:
+            return self._measure()
+        except Exception:  # noqa: BLE001 - what a process shows of itself is its own making
+            self.is_over = True
+            return True
+
+    def _measure(self) -> bool:
         family = _family(self.process.pid)
         shared = _shared(family, self.scratch)
         estimate = _resident_bytes(family) + shared.bytes
@@ -149,17 +161,20 @@ def _exact_bytes(family: Iterable[int], shared: _Shared) -> int:
     """Memory of some processes; pages that several of them map, or that lie in a file in memory, count once."""
     total = shared.bytes
     for number in family:
-        is_counted = False
         try:
-            lines = Path(f"/proc/{number}/smaps").read_text(encoding="utf-8", errors="replace").splitlines()
+            total += _mapped_bytes(Path(f"/proc/{number}/smaps").read_bytes(), shared)
         except OSError:
             continue
-        for line in lines:
-            name, *values = line.split()
-            if not name.endswith(":"):
-                major, _, minor = values[2].partition(":")
-                device = os.makedev(int(major, 16), int(minor, 16))
-                is_counted = device == shared.scratch_device or (device, int(values[3])) in shared.sizes
-            elif name == "Pss:" and not is_counted:
-                total += int(values[0]) * _KB
+    return total
+
+
+def _mapped_bytes(smaps: bytes, shared: _Shared) -> int:
+    """Memory that a process maps by its `smaps`, but for what is shared; names of files may look like other lines."""
+    total, is_counted = 0, False
+    for line in smaps.split(b"\n"):  # the kernel writes this one break in a name as \012, and no other
+        if found := _MAPPING.match(line):
+            device = os.makedev(int(found["major"], 16), int(found["minor"], 16))
+            is_counted = device == shared.scratch_device or (device, int(found["inode"])) in shared.sizes
+        elif not is_counted and (found := _SHARE.fullmatch(line)):
+            total += int(found["kb"]) * _KB
     return total

@@ -36,8 +36,8 @@ DANGEROUS: Final = (
     "io_uring_setup 425 425, userfaultfd 323 282, perf_event_open 298 241",
     # Sockets: no namespace parts those that have a path. Connected pairs remain.
     "socket 41 198, connect 42 203",
-    # Memory and queues that outlive their process, and that nobody can count from outside.
-    "shmget 29 194, semget 64 190, msgget 68 186, mq_open 240 180",
+    # Memory and queues that outlive their process, or that nobody can count from outside.
+    "memfd_secret 447 447, shmget 29 194, semget 64 190, msgget 68 186, mq_open 240 180",
 )
 # What Landlock does not refuse: modes, owners, times and attributes, and before version 3 the length of a file by path.
 METADATA: Final = (
@@ -54,6 +54,8 @@ _GROUP: Final = 0xFF00
 _SOCKETPAIR: Final = {"x86_64": 53, "aarch64": 199}
 _KIND, _DATAGRAM = 0xF, 2
 _PRCTL: Final = {"x86_64": 157, "aarch64": 167}
+_FCNTL: Final = {"x86_64": 72, "aarch64": 25}
+_LEASES: Final = (1024, 1026)  # F_SETLEASE and F_NOTIFY: the first has all others wait who open a file
 _CLONE: Final = {"x86_64": 56, "aarch64": 220}
 _NEW_SPACES: Final = 0x7E020000  # all CLONE_NEW... that clone takes
 _CLONE3: Final = 435
@@ -105,6 +107,8 @@ def program(machine: str, *, metadata: bool) -> bytes:
     # A process that cannot be looked into hides its memory from whoever watches it.
     dumpable = [_step(_EQUAL, kernel.PR_SET_DUMPABLE, no=1), _answer(errno.EPERM)]
     steps += _by_argument(_PRCTL[machine], 0, dumpable)
+    leases = [step for command in _LEASES for step in (_step(_EQUAL, command, no=1), _answer(errno.EPERM))]
+    steps += _by_argument(_FCNTL[machine], 1, leases)
     if metadata:
         groups = [step for group in _FILE_GROUPS for step in (_step(_EQUAL, group, no=1), _answer(errno.EPERM))]
         steps += _by_argument(_IOCTL[machine], 1, [_step(_AND, _GROUP), *groups])

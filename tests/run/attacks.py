@@ -140,6 +140,12 @@ def start_program():
     assert subprocess.run([sys.executable, "-c", "print(6*7)"], capture_output=True, check=True).stdout == b"42\n"
 
 
+def take_lease():
+    """Have whoever writes to a file wait for us; a lease that has readers wait, too, is taken by the same call."""
+    with VICTIM.open("rb") as file:
+        fcntl.fcntl(file, 1024, fcntl.F_RDLCK)
+
+
 ATTACKS = {
     "read the truth": lambda: (SHOWN / "truth/answers").read_bytes()[0],
     "read stored results": lambda: (SHOWN / "truths.parquet").read_bytes()[0],
@@ -178,6 +184,8 @@ ATTACKS = {
     "fork into a namespace": lambda: os.waitpid(_forked(0x10000000), 0),
     "make a device": make_device,
     "fill the disc": fill_scratch,
+    "take a lease": take_lease,
+    "keep memory secret": lambda: call("syscall", 447, 0),
     "keep memory in the kernel": lambda: call("shmctl", _segment(), 0, None),
 }
 HARMLESS = {

@@ -4,12 +4,14 @@
 import fcntl
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.run import cgroup, worker
+from sasgeo_bench.run import cgroup, memory, worker
 from sasgeo_bench.run.cgroup import Group
 from sasgeo_bench.run.worker import Limits, Reach, Worker
 
@@ -37,6 +39,24 @@ KEEPS = {
 def in_mode(modes):
     """Each mode, if it can be made here."""
     return [pytest.param(*mode, id=name, marks=groups if mode[1] else ()) for name, mode in modes.items()]
+
+
+def test_a_file_named_as_a_line_of_the_kernel_changes_no_count():
+    mapped = "7f00-7f01 rw-s 00000000 00:01 {inode}   /memfd:x{name} (deleted)\nPss:   40 kB\n"
+    odd = "".join(mapped.format(inode=7, name=f"{mark}Pss: -900 kB{mark}y") for mark in "\x0b\x0c\x1c\x85\u2028")
+    nothing = memory._Shared(sizes={})
+    assert memory._mapped_bytes(odd.encode(), nothing) == 5 * 40 * 1024
+    assert memory._mapped_bytes(odd.encode(), memory._Shared(sizes={(1, 7): 4096})) == 0
+
+
+def test_whoever_keeps_us_from_measuring_is_ended(monkeypatch, tmp_path):
+    killed = threading.Event()
+    monkeypatch.setattr(memory, "_family", lambda _: 1 / 0)
+    watch = memory.MemoryWatch(process=SimpleNamespace(pid=0), most_bytes=1, kill=killed.set, scratch=tmp_path)
+    watch.start()
+    assert killed.wait(60)
+    watch.stop()
+    assert watch.is_over
 
 
 @pytest.fixture

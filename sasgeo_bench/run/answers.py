@@ -22,7 +22,7 @@ from sasgeo_bench.run.schedule import Schedule
 from sasgeo_bench.run.teach import failed_by_us, guarded
 from sasgeo_bench.run.worker import Worker
 from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.regiondir import read_manifest
+from sasgeo_bench.store.regiondir import check_files, read_manifest
 from sasgeo_bench.store.taskrows import asked_under
 
 PART_ROWS: Final = 64
@@ -190,7 +190,7 @@ class _Map:
                     learned = self._plan.learned
                     region, text = self._writers[0].part.region, None if learned is None else learned.text
                     ready = guarded(self._plan, partial(worker.prepare, region, text))
-                    self._check_map()
+                    self._check_map(ready)
                     if schedule.is_stopped:
                         return
                 if self._unlearned() is None:
@@ -223,12 +223,14 @@ class _Map:
             return None
         return Reply(status=learned.status, message=learned.message)
 
-    def _check_map(self) -> None:
-        """Refuse a map that another run has replaced since; whatever was prepared before is of the old one."""
+    def _check_map(self, ready: Reply) -> None:
+        """Refuse a map that another run has replaced since, or that is damaged: no failure of whoever prepared it."""
         part = self._writers[0].part
         if not taskdir.is_of_map(part.about, read_manifest(part.region)):
             message = f"{part.region} was built anew while it was searched: run again, answers are kept"
             raise StoreError(message)
+        if ready.status != "ok":
+            check_files(part.region)
 
     def _asked(self) -> Worker | Oracle:
         """Whoever is asked: a plugin in a process of its own, or the one control that is given the truth."""

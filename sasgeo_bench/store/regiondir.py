@@ -149,6 +149,25 @@ def read_features(folder: Path) -> gpd.GeoDataFrame:
     return check_features(_read_geometry(folder / FEATURES))
 
 
+def check_files(folder: Path) -> None:
+    """Refuse a region of which a file is missing, or not what `region.json` says.
+
+    Raises
+    ------
+    StoreError
+        Naming the first such file.
+
+    Examples
+    --------
+    >>> check_files(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
+    """
+    for name, said in read_manifest(folder).files.items():
+        _check_file(folder / name, said)
+
+
 def _check_file(path: Path, said: FileRecord) -> None:
     """Refuse a file that is not what the manifest says: nothing else covers a raster, or the footer of a GeoParquet."""
     if not path.is_file() or file_record(path) != said:

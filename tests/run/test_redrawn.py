@@ -111,6 +111,16 @@ def test_a_task_that_is_drawn_anew_while_it_is_asked_ends_the_run(draw):
     assert rundir.ids_done(plan.parts[0].folder, taskdir.read_asked(task)) == set()
 
 
+@pytest.mark.usefixtures("in_threads")
+def test_a_map_that_is_damaged_is_no_failure_of_who_prepares_it(draw, own_out):
+    plan = plan_of(draw(), spec="fft_vote")
+    layers = own_out / "regions" / TOWN / "layers.tif"
+    layers.write_bytes(b"x" * layers.stat().st_size)
+    with pytest.raises(StoreError, match="layers.tif is missing, or not what region.json says: build the region again"):
+        run(plan, tell=quiet)
+    assert not rundir.parts_of(plan.parts[0].folder)
+
+
 def test_another_build_of_the_map_is_another_question(draw, own_out):
     task = draw()
     plan = plan_of(task)

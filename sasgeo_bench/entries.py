@@ -12,6 +12,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
 from sasgeo_bench.matcher import check_identity
 from sasgeo_bench.metrics.cost import run_cost
+from sasgeo_bench.plugins import ORACLE
 from sasgeo_bench.query import base_of
 from sasgeo_bench.report.rows import AS_SUBMITTED, RUN_HERE, is_unranked
 from sasgeo_bench.results import one_line
@@ -270,6 +271,8 @@ def _read_run(path: Path) -> dict[str, Any]:
         LearnedSaid.of(about)
     except (MatchError, MetricError) as error:
         fault = fault or str(error)
+    if said["matcher.name"] == ORACLE != about.get("spec", ORACLE):
+        fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
     if fault is not None:
         message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
         raise StoreError(message)

@@ -603,6 +603,7 @@ def test_what_is_named_twice_counts_once(out, tmp_path):
         ({"matcher": {"name": "a|b", "version": "1"}}, r"name 'a\|b' may hold lower-case letters"),
         ({"matcher": {"name": "../../x", "version": "1"}}, "may hold lower-case letters"),
         ({"matcher": {"name": "x", "version": 1}}, "matcher.version is 1"),
+        ({"spec": "mine:Cheat"}, "it has the name of the control oracle_pose, and was run as 'mine:Cheat'"),
         ({"hash": ["x"]}, r"hash is \['x'\]"),
         ({"suite": None}, "suite is None"),
         ({"region": ""}, "region is ''"),

@@ -478,7 +478,8 @@ def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, mo
     assert "    broken_here:Broken: cannot be asked (broken_here:Broken: cannot be made (" in other.to_text()
     lines = []
     beside = run_pipeline(other, tell=lines.append)
-    assert beside.table.equals(board.table)
+    figures, before = (item[item["unit"] == "1"].reset_index(drop=True) for item in (beside.table, board.table))
+    assert figures.equals(before)  # what the runs took, in seconds and bytes, other tests add to
     assert list(beside.failures.found) == ["broken_here:Broken"]
     assert "no weights here" in beside.failures.found["broken_here:Broken"]
     assert [item.verdict for item in beside.findings] == ["not decided: broken_here:Broken failed"]

@@ -91,7 +91,9 @@ def ages_frame(steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str
     known = known[known["role"].isin([CONTROL, STRESS])]
     found = known.groupby([*GROUP, "strength", "view_cells"])["age_years"].agg(["mean", "min", "max"]).reset_index()
     names = {"mean": "age_years", "min": "age_least", "max": "age_most"}
-    return steps.merge(found.rename(columns=names), on=[*GROUP, "strength", "view_cells"], how="inner")
+    keys = [*GROUP, "strength", "view_cells"]
+    found = found.rename(columns=names).astype({name: steps[name].dtype for name in keys})  # of no steps: no type yet
+    return steps.merge(found, on=keys, how="inner")
 
 
 def age_names(ages: pd.DataFrame) -> dict[tuple[Any, ...], str]:

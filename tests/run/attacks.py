@@ -17,7 +17,7 @@ import tempfile
 import threading
 from pathlib import Path
 
-PLACE = json.loads(sys.argv[1])
+PLACE = json.loads(sys.argv[1]) if __name__ == "__main__" else dict.fromkeys(("shown", "scratch"), "")
 SHOWN, SCRATCH = Path(PLACE["shown"]), Path(PLACE["scratch"])
 VICTIM = SHOWN / "victim"
 LIBC = ctypes.CDLL(None, use_errno=True)

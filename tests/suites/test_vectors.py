@@ -141,7 +141,7 @@ def test_a_smooth_shift_is_as_large_as_asked_and_smooth(seed, rms_m):
     at = np.random.default_rng(seed).uniform(-3000, 3000, (4000, 2))
     shift = smooth_shift(rms_m, np.random.default_rng(seed))
     moved = shift(at) - at
-    assert np.sqrt((moved**2).mean(axis=0)) == pytest.approx([rms_m] * 2, rel=0.12)
+    assert np.sqrt((moved**2).mean(axis=0)) == pytest.approx([rms_m] * 2, rel=0.15)
     step = shift(at + np.array((1.0, 0.0))) - shift(at) - np.array((1.0, 0.0))
     assert np.abs(step).max() < 8 * rms_m * np.sqrt(2 / 8) * 2 * np.pi / 60  # all waves at their steepest
 

@@ -167,7 +167,7 @@ FILE_EXCEPTIONS = {
     ("run.root", "open"): "makes files to mount others on, and reads which mounts there are",
     ("run.cgroup", "read_text"): "reads what the kernel counts",
     ("run.cgroup", "write_text"): "writes limits for the kernel",
-    ("run.memory", "read_text"): "reads what the kernel says of a process",
+    ("run.memory", "read_bytes"): "reads what the kernel says of a process",
     ("run.serve", "read_bytes"): "hashes the plugin's own code",
 }
 FILE_CALLS = frozenset(

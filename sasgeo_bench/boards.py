@@ -91,7 +91,8 @@ class ScoreRequest:
     private : Path, optional
         A board of a private seed of the same pipeline, which the rows are held against.
     kept : mapping, optional
-        What `board.json` of stored results says: of a private seed it is kept where no other board is named.
+        What `board.json` of stored results says: the version of their maps is kept, and what came of a private seed
+        where no other board is named.
     failed : mapping of str to str
         Contestants that failed before anything was scored, and why.
     """
@@ -203,11 +204,8 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progr
     on_private = _on_private(request, entries, scores, tasks, tell)
     entries = tuple(replace(entry, how=on_private.how(entry)) for entry in entries)
     compare = partial(_leaderboards, whole=whole, draws=request.draws, apart=apart, progress=progress)
-    try:
-        rows = compare(scores)
-    except Exception as error:
-        if stops_all(error) or not failures.blame(scores, compare):
-            raise
+    rows = _compared(scores, compare, failures)
+    if rows is None:
         return None
     rows += _costs(entries, scores, tasks, failures, tell)
     all_judged, more = _all_judged(
@@ -240,11 +238,21 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progr
         failures=failures,
     )
     _tell_gone(request.board, board.everyone, tell)
-    if request.extras:
-        tell("drawing figures and pictures")
-    extras = _extras(request, board)
-    _write(request, board, extras, [rule.card for rule in rules.values()])
+    _write(request, board, _extras(request, board, tell), [rule.card for rule in rules.values()])
     return board
+
+
+Compare = Callable[[Mapping[str, pd.DataFrame]], list[pd.DataFrame]]
+
+
+def _compared(scores: Mapping[str, pd.DataFrame], compare: Compare, failures: Failures) -> list[pd.DataFrame] | None:
+    """Figures of all contestants beside each other; None where one of them fails, who is noted."""
+    try:
+        return compare(scores)
+    except Exception as error:
+        if stops_all(error) or not failures.blame(scores, compare):
+            raise
+        return None
 
 
 def _costs(
@@ -287,8 +295,10 @@ def _all_judged(
     return said, rows
 
 
-def _extras(request: ScoreRequest, board: Board) -> list[Extra]:
+def _extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:
     """Files besides; what cannot be made is left out, and so is a figure that cannot be drawn."""
+    if request.extras:
+        tell("drawing figures and pictures")
     found: list[Extra] = []
     for make in request.extras:
         with board.failures.of("more of the board"):
@@ -476,7 +486,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
     return {
         "scorer_version": SCORER_VERSION,
         "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
-        "data_version": DATA_VERSION,
+        "data_version": request.kept.get("data_version") or DATA_VERSION,  # of the maps that were asked about
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "libraries": _libraries(),
         "pipeline": dict(request.pipeline) or None,

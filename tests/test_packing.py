@@ -16,7 +16,7 @@ from sasgeo_bench.boardfigures import figures_extra
 from sasgeo_bench.boardpictures import pictures_extra
 from sasgeo_bench.boards import ScoreRequest
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.packing import laid_out, pack_board, request_of, score_all, stored_settings
+from sasgeo_bench.packing import laid_out, pack_board, score_all, stored_settings
 from sasgeo_bench.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.pipelinefile import PipelineFile
 from sasgeo_bench.query import base_of
@@ -83,7 +83,7 @@ def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path
 def test_stored_results_keep_the_version_of_the_maps_they_were_asked_on(kept, tmp_path, monkeypatch):
     _, _, folder, _ = kept
     monkeypatch.setattr(boards, "DATA_VERSION", 99)
-    usual = request_of([folder], board=tmp_path / "again", root=tmp_path)
+    usual = packing.request_of([folder], board=tmp_path / "again", root=tmp_path)
     score_all(replace(usual, draws=100, rejectors=()), tell=lambda _: None, has_cases=False)
     first = json.loads((folder / "board.json").read_text())
     assert json.loads((tmp_path / "again" / "board.json").read_text())["data_version"] == first["data_version"]

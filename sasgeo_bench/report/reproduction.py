@@ -7,7 +7,7 @@ can, so that only figures on it vouch for a row.
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -29,6 +29,7 @@ from sasgeo_bench.metrics.intervals import (
 from sasgeo_bench.report.measures import FALSE_ABSENT, Measure, primary_of
 from sasgeo_bench.report.rows import ALL_SUITES, NOT_REPRODUCED, REPRODUCED, RUN_HERE
 from sasgeo_bench.score import NOT_APPLICABLE
+from sasgeo_bench.store.packabout import SeedSaid
 
 _GROUP: Final = ("suite", "track", "prior_group")
 _ALL_PRIORS: Final = "all"
@@ -49,41 +50,8 @@ _IS_PUBLIC: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeedFigure:
-    """One figure of one matcher on both seeds.
-
-    Parameters
-    ----------
-    suite, track, prior_group, metric : str
-        Of which queries, and of what: success or recall under stress, or false fixes at absent places.
-    public, private : float
-        The figure on each seed.
-    difference, lo, hi : float
-        Private less public; all intervals of a matcher hold at once (95 %, Bonferroni).
-    n_public, n_private : int
-        Queries.
-    blocks_public, blocks_private, blocks_shared : int
-        Blocks of ground that they come from, and that hold queries of both.
-    is_worse : bool
-        Whether the private figure is shown to be worse.
-    """
-
-    suite: str
-    track: str
-    prior_group: str
-    metric: str
-    public: float
-    private: float
-    difference: float
-    lo: float
-    hi: float
-    n_public: int
-    n_private: int
-    blocks_public: int
-    blocks_private: int
-    blocks_shared: int
-    is_worse: bool
+class SeedFigure(SeedSaid):
+    """One figure of one matcher on both seeds, and what it tells."""
 
     @property
     def is_decided(self) -> bool:
@@ -242,7 +210,7 @@ def verdict_of(figures: Sequence[SeedFigure]) -> tuple[str, str]:
 
 def said_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[str, Any]:
     """What `board.json` says of one matcher on both seeds."""
-    return {"verdict": verdict, "why": why, "figures": [asdict(item) for item in figures]}
+    return {"verdict": verdict, "why": why, "figures": [item.model_dump() for item in figures]}
 
 
 def seed_lines(about: Mapping[str, Any]) -> list[str]:

@@ -101,7 +101,25 @@ class PrivateSaid(_Said):
     bits: Annotated[int, Field(ge=1)]
 
 
-class _SeedFigure(_Said):
+class SeedSaid(_Said):
+    """One figure of one matcher on both seeds.
+
+    Parameters
+    ----------
+    suite, track, prior_group, metric : str
+        Of which queries, and of what: success or recall under stress, or false fixes at absent places.
+    public, private : float
+        The figure on each seed.
+    difference, lo, hi : float
+        Private less public; all intervals of a matcher hold at once (95 %, Bonferroni).
+    n_public, n_private : int
+        Queries.
+    blocks_public, blocks_private, blocks_shared : int
+        Blocks of ground that they come from, and that hold queries of both.
+    is_worse : bool
+        Whether the private figure is shown to be worse.
+    """
+
     suite: str
     track: str
     prior_group: str
@@ -122,7 +140,7 @@ class _SeedFigure(_Said):
 class _OnBothSeeds(_Said):
     verdict: Literal["run here", "reproduced", "not reproduced"]
     why: str
-    figures: list[_SeedFigure]
+    figures: list[SeedSaid]
 
 
 class _Entry(_Said):

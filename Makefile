@@ -56,11 +56,12 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 	$(SASGEO) leaderboard $(or $(PIPELINE),leaderboard) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
 	  $(if $(RESULTS),--results "$(RESULTS)") --out $(OUT) $(ARGS)
 
+# Three workers for two processors: now and then a test waits for a process that it has started.
 # Hundreds of processes import the same modules: none of them compiles them again.
 test test-quick: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
-	$(VENV_PYTHON) -m pytest -n 2 --dist worksteal -p no:benchmark -rs $(ARGS)
+	$(VENV_PYTHON) -m pytest -n 3 --dist worksteal -p no:benchmark -rs $(ARGS)
 
 test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built for several of them
 	$(VENV_PYTHON) -m pytest -n 2 --dist worksteal -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)

@@ -18,8 +18,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from sasgeo_bench.build import build_region, plan_build
-from sasgeo_bench.store.catalog import find_region_file, read_region_file
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 
 SIDES_KM = (1, 2, 4, 8, 12)
 CENTER_LONLAT = (9.522, 47.15)

@@ -18,16 +18,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from sasgeo_bench.angles import wrap_deg
-from sasgeo_bench.perturb.perception import Perception
-from sasgeo_bench.pose import Pose
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.graph import verify
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.tuples import proposals
-from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.suites.base import State
-from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
+from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 
 SIDE_M = 256
 CANDIDATES = 20

@@ -18,13 +18,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from sasgeo_bench.request import Request, Wanted, is_reachable, plan_requests
-from sasgeo_bench.store.catalog import find_region_file, read_region_file
-from sasgeo_bench.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.suites.base import Scene, Seeds, Suite
-from sasgeo_bench.suites.mining import describe, mine
-from sasgeo_bench.suites.sites import choose_sites
-from sasgeo_bench.tasks import make_tasks, read_scene
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.tasks.build import make_tasks, read_scene
+from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.tasks.suites.base import Scene, Seeds, Suite
+from sasgeo_bench.tasks.suites.mining import describe, mine
+from sasgeo_bench.tasks.suites.sites import choose_sites
+from sasgeo_bench.tasks.task_plan import Request, Wanted, is_reachable, plan_requests
 
 VIEW_CELLS = 192
 SITES = 12

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from sasgeo_baselines.global_descriptor import GlobalDescriptor
 
-from sasgeo_bench.paper.task import SUITE, TRIALS, VERSION, PaperDrawer, region_name
-from sasgeo_bench.paper.windows import Windows
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query
-from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.suites.base import Seeds
+from sasgeo_bench.experiments.paper.task import SUITE, TRIALS, VERSION, PaperDrawer, region_name
+from sasgeo_bench.experiments.paper.windows import Windows
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.suites.base import Seeds
 
 WINDOWS_A_TILE = (1, 2, 5, 49)
 

@@ -14,28 +14,28 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sasgeo_bench.build import build_region, plan_build
-from sasgeo_bench.evidence import Evidence, LayerBits, observe
-from sasgeo_bench.perturb.adversarial import AdversarialMask
-from sasgeo_bench.perturb.ageing import Ageing, AgeingRates
-from sasgeo_bench.perturb.base import Perturbation, share_changed, share_hidden
-from sasgeo_bench.perturb.border import Border
-from sasgeo_bench.perturb.canopy import CanopyAndShadow
-from sasgeo_bench.perturb.crop import CentralCrop
-from sasgeo_bench.perturb.false_unknown import FalseUnknown
-from sasgeo_bench.perturb.glare import Glare
-from sasgeo_bench.perturb.line_width import LayerOffset, LineWidth
-from sasgeo_bench.perturb.local_warp import LocalWarp
-from sasgeo_bench.perturb.occlusion import Rectangles
-from sasgeo_bench.perturb.perception import Perception
-from sasgeo_bench.perturb.rotation import Rotation
-from sasgeo_bench.perturb.scale import Scale
-from sasgeo_bench.perturb.season import Season
-from sasgeo_bench.perturb.tilt import Tilt
-from sasgeo_bench.perturb.wedge import TiltWedge
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.store.catalog import find_region_file, read_region_file
-from sasgeo_bench.store.regiondir import read_region
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.perturbations.base import Perturbation, share_changed, share_hidden
+from sasgeo_bench.tasks.perturbations.border import Border
+from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
+from sasgeo_bench.tasks.perturbations.crop import CentralCrop
+from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
+from sasgeo_bench.tasks.perturbations.glare import Glare
+from sasgeo_bench.tasks.perturbations.line_width import LayerOffset, LineWidth
+from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
+from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
+from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.perturbations.rotation import Rotation
+from sasgeo_bench.tasks.perturbations.scale import Scale
+from sasgeo_bench.tasks.perturbations.season import Season
+from sasgeo_bench.tasks.perturbations.tilt import Tilt
+from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
 
 TOWNS = ("town-suburb", "town-riverside", "town-agricultural")
 VIEWS_PER_TOWN = 4

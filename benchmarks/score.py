@@ -20,18 +20,19 @@ from pathlib import Path
 
 import numpy as np
 
-from sasgeo_bench.boards import ScoreRequest, make_board
-from sasgeo_bench.evidence import Evidence
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import Head, Query, Truth
-from sasgeo_bench.report.contrasts import Contrast
-from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.results import Prediction
-from sasgeo_bench.score import score_task
-from sasgeo_bench.split import Split, SplitFile, make_split
-from sasgeo_bench.store import rundir, taskdir
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.score import score_task
+from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import Head, Query, Truth
+from sasgeo_bench.tasks.split import Split, SplitFile, make_split
 
 SIZES = ((1, 10_000), (5, 2_000))  # matchers, queries: 10,000 predictions each
 SUITES = ("clean", "occlusion", "real-age", "alias")
@@ -179,15 +180,15 @@ def write(tasks: Sequence[Task], given: Mapping[str, Sequence[Sequence[Predictio
         folder.mkdir(parents=True)
         truth.mkdir(parents=True)
         about = {"suite": task.suite, "title": task.suite, "region": task.region, "map_fingerprint": ""}
-        taskdir.write_task(folder, truth, zip(task.queries, task.truths, strict=True), about)
-        sha256 = taskdir.read_task(folder)["files"][taskdir.QUERIES]["sha256"]
+        task_files.write_task(folder, truth, zip(task.queries, task.truths, strict=True), about)
+        sha256 = task_files.read_task(folder)["files"][task_files.QUERIES]["sha256"]
         for name, parts in given.items():
             run = root / "runs" / name / task.suite / task.region
-            rundir.write_part(run, parts[at])
+            prediction_files.write_part(run, parts[at])
             card = {"name": name, "version": "1"}
             costs = {"prepare_s": 1.0, "peak_bytes": 10**9, "map_bytes": 10**7, "cpu_s": 60.0}
             said = {"suite": task.suite, "region": task.region, "queries_sha256": sha256, "hash": name}
-            rundir.write_run(run, {"matcher": card, **said, **costs})
+            prediction_files.write_run(run, {"matcher": card, **said, **costs})
 
 
 def from_disk(root: Path, split: Split, *, rejectors: Sequence[str], names: Sequence[str]) -> float:

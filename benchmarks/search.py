@@ -41,22 +41,22 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
-from sasgeo_bench.angles import wrap_deg
-from sasgeo_bench.build import build_region, plan_build
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.perturb.perception import Perception
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
-from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.find import exhaustive, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan
-from sasgeo_bench.store.catalog import find_region_file, read_region_file
-from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.suites.base import State
+from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.suites.base import State
 
 SIDES_CELLS = (512, 1024, 2048, 4096)  # 1 to 67 km2
 VIEWS_CELLS = (96, 192, 256, 384)

@@ -4,6 +4,8 @@
 from collections.abc import Mapping
 from typing import Final
 
+from sasgeo_bench.texts import plain
+
 MOST_CANDIDATES: Final = 1000  # of one answer
 MOST_DIAGNOSTICS: Final = 64
 MOST_NAME: Final = 64  # characters of the name of a diagnostic
@@ -48,3 +50,29 @@ def bounds_text(name: str) -> str:
     """
     least, most = BOUNDS[name]
     return f"{least:g}..{most:g}"
+
+
+def one_line(text: str) -> str:
+    """Any text in one line of at most `MOST_MESSAGE` printable characters.
+
+    Examples
+    --------
+    >>> one_line(chr(10).join(("first", "  second")))
+    'first second'
+    """
+    line = plain(" ".join(text.split()))
+    return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
+
+
+def told(error: BaseException) -> str:
+    """What kind of error it is and what it says, in one line; the kind alone where it cannot say anything.
+
+    Examples
+    --------
+    >>> told(ValueError("no index today"))
+    'ValueError: no index today'
+    """
+    try:
+        return one_line(f"{type(error).__name__}: {error}")
+    except Exception:  # noqa: BLE001 - a plugin's own errors may fail at telling of themselves
+        return type(error).__name__

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Text from outside as data: a function for each kind of file that it is written to, so that nothing there parses it.
 
-Figures, the terminal and pages have theirs where they are made: `store/canvas.py`, `cli/console.py`, `report/site.py`.
+Figures, the terminal and pages have theirs where they are made: `canvas.py`, `cli/console.py`, `publishing/site.py`.
 """
 
 import json

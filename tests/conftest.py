@@ -13,12 +13,15 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from sasgeo_bench import cli, pipeline
-from sasgeo_bench.build import build_region, plan_build
-from sasgeo_bench.request import Wanted, plan_requests
-from sasgeo_bench.store.catalog import find_region_file, read_region_file
-from sasgeo_bench.tasks import make_tasks
-from sasgeo_bench.testing import TinyPlace, tiny_place
+from sasgeo_bench import cli
+from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.publishing import archive
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.running.testing import TinyPlace, tiny_place
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.threaded import threaded
 
 # No test depends on how busy the machine is, nor on chance: the same examples each time. To go on searching:
@@ -35,6 +38,7 @@ settings.register_profile("quick", settings.get_profile("sasgeo"), max_examples=
 settings.register_profile("search", settings.get_profile("sasgeo"), derandomize=False, max_examples=200)
 settings.load_profile("sasgeo")
 
+BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test
 LOOPBACK = ("127.", "localhost", "::1")
 
 
@@ -51,10 +55,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _is_quick(item: pytest.Item) -> bool:
-    """Whether a test shares no fixture of ours with others, as whatever takes long to build is shared."""
+    """Whether a test shares no fixture of ours with others, as whatever takes long is shared, nor builds for itself."""
     found = getattr(item, "_fixtureinfo").name2fixturedefs.values()  # noqa: B009 - of a function or a docstring's example
     shared = {each[-1].argname for each in found if each[-1].scope != "function" and each[-1].baseid}
-    return shared <= {"_no_network"} and not item.get_closest_marker("real")
+    return shared <= {"_no_network"} and not item.get_closest_marker("real") and item.path.name not in BUILDERS
 
 
 @pytest.fixture(scope="session")
@@ -195,6 +199,16 @@ def _extracts_folder() -> Path | None:
 def in_threads() -> Iterator[None]:
     """Matchers are served by threads: for tests that are not about processes."""
     with threaded():
+        yield
+
+
+@pytest.fixture(scope="module")
+def without_drawings() -> Iterator[None]:
+    """Boards of pipelines and of the program have no figures and no pictures: for tests that are about rows."""
+    with pytest.MonkeyPatch.context() as patch:
+        for maker in (pipeline, archive):
+            for name in ("figures_extra", "pictures_extra"):
+                patch.setattr(maker, name, lambda *_, **__: Extra())
         yield
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sasgeo_bench.evidence import PRESENT, UNKNOWN
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.pose import Pose
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 
 SAID = {"version": "1", "title": "Faulty", "source": "original", "ours": "all", "licence": "Apache-2.0"}
 BOTH = ("localization", "retrieval")

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.report.contrasts import Contrast, contrast_frame, hold_contrasts
-from sasgeo_bench.report.controls import Verdict, verdict_frame
-from sasgeo_bench.report.rows import RUN_HERE, Contestant, Row, to_frame, with_contestants
-from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.score import SCORER_VERSION
-from sasgeo_bench.store.boardfile import Extra, write_board
-from sasgeo_bench.store.boardplot import Page, page
-from tests.report.test_tables import scores
+from sasgeo_bench.leaderboard.board_files import Extra, write_board
+from sasgeo_bench.leaderboard.board_plots import Page, page
+from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame, hold_contrasts
+from sasgeo_bench.scoring.controls import Verdict, verdict_frame
+from sasgeo_bench.scoring.rows import RUN_HERE, Contestant, Row, to_frame, with_contestants
+from sasgeo_bench.scoring.score import SCORER_VERSION
+from sasgeo_bench.scoring.tables import leaderboard
+from tests.scoring.test_tables import scores
 
 HOSTILE = "<script>alert(1)</script>"
 MARKUP = "<img src=x onerror=alert(2)> & <b>bold</b> \"quoted\" 'too'"

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The house (docs/README.md) as a total order: a file of sasgeo_bench imports only files above it."""
+"""The house (docs/README.md): folders in the order of the pipeline, each of which imports only those above it."""
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -10,252 +11,83 @@ import pytest
 PACKAGE = "sasgeo_bench"
 ROOT = Path(__file__).parents[1] / PACKAGE
 
-# A room is a file, or a folder with its files in their own order: what stands above may be imported, what stands below
-# may not. A folder with no files named is one whose inside is not built yet: its files get their order when they come.
-# Rooms may be listed before they are built. The package's __init__ stands last: it gathers the public names, and
-# nothing imports it.
-HOUSE: dict[str, tuple[str, ...] | None] = {
-    "texts": None,
-    "errors": None,
-    "processes": None,
-    "progress": None,
-    "tomlfile": None,
-    "angles": None,
-    "bounds": None,
-    "pose": None,
-    "grid": None,
-    "taxonomy": None,
-    "features": None,
-    "extract": (
-        "locate",
-        "snapshot",
-        "coverage",
-        "cuts",
-        "sea",
-        "mapped",
-        "scan",
-        "read",
-        "lifecycle",
-        "history",
-        "sketch",
-        "morphology",
-        "town",
-    ),
-    "regionfile": None,
-    "layers": None,
-    "evidence": None,
-    "ageing": ("pairing", "rates", "measure", "ratebook"),
-    "shapes": None,
-    "network": None,
-    "graph": None,
-    "vectors": None,
-    "region": None,
-    "search": ("field", "plan", "space", "dense", "sight", "find"),
-    "camera": None,
-    "imagery": None,
-    "perturb": (
-        *("base", "fields", "objects", "resample", "detector"),
-        *("perception", "occlusion", "border", "wedge", "glare", "canopy", "adversarial", "false_unknown"),
-        *("local_warp", "tilt", "crop", "rotation", "scale", "line_width", "season", "ageing"),
-    ),
-    "query": None,
-    "split": None,
-    "trajectory": None,
-    "duplicates": None,
-    "pipelinefile": None,
-    "twin": None,
-    "privateseed": None,
-    "suites": (
-        *("base", "sites", "mining", "vectors", "twins"),
-        *("clean", "occlusion", "false_unknown", "local_warp", "topology_twins", "instance_twins", "grade_separation"),
-        *("no_priors", "real_age", "synthetic_age", "volatile_lure", "growth", "season", "stable_not_distinctive"),
-        *("alias", "absent", "board_controls", "all_suites"),
-    ),
-    "matcher": None,
-    "results": None,
-    "rejector": None,
-    "submissionfile": None,
-    "store": (
-        *("parquetfile", "jsonfile", "layerfile", "regiondir", "taskrows", "taskdir", "runrows", "failures"),
-        *("learnedfile", "rundir", "submissiondir", "fileset", "packabout", "boardfile", "packrows", "packdir"),
-        *("packfile", "svgfile", "sitedir", "pluginfiles", "seedfile"),
-        *(
-            "canvas",
-            "preview",
-            "picture",
-            "sheet",
-            "caseplot",
-            "weightplot",
-            "lookalikeplot",
-            "splitmap",
-            "paperplot",
-            "boardplot",
-            "ageingplot",
-            "ageingfile",
-            "ratebookfile",
-            "catalog",
-        ),
-        *("columntexts", "releasedir", "stacfile", "croissantfile", "datasetcard", "datasheet"),
-    ),
-    "build": None,
-    "request": None,
-    "draw": None,
-    "tasks": None,
-    "requests": None,
-    "panels": None,
-    "paper": ("tiles", "windows", "trials", "task"),
-    "doctor": None,
-    "sasgeo": (
-        *("rates", "seasons", "stamps", "temper", "weights", "raster", "distinct"),
-        *("kinds", "nodes", "skeleton", "observed", "pairs", "mapped", "ratios", "graph", "tuples", "descriptor"),
-        *("temporal", "joint", "learnt", "arms", "reading", "learning"),
-        *("integrity", "protection", "conformal", "frame", "rejectors", "matchers", "variants"),
-    ),
-    "worth": None,
-    "lookalike": None,
-    "plugins": None,
-    "run": (
-        *("kernel", "seccomp", "landlock", "root", "sandbox", "wire", "replies", "launch", "serve", "child", "beside"),
-        *("cgroup", "memory", "worker", "oracle"),
-        *("lesson", "plan", "teach", "schedule", "answers", "cluster", "runner"),
-    ),
-    "metrics": (
-        *("base", "ranking", "pose", "decisions", "integrity", "calibration"),
-        *("sequence", "cost", "draws", "intervals", "protection", "compare", "power"),
-    ),
-    "validate": None,
-    "score": None,
-    "report": (
-        *("measures", "rows", "strata", "steps", "tables", "rejection", "integrity", "contrasts", "falsifiers"),
-        *("reproduction", "controls", "costs", "text", "latex", "protection", "cases"),
-        *("paper", "papertext", "plottables", "pools", "axes", "plots", "poolplots"),
-        *("sitetable", "sitewords", "sitesource", "siteboard", "sitepages", "coast", "siteplots", "site"),
-    ),
-    "boardtasks": None,
-    "entries": None,
-    "contestants": None,
-    "judging": None,
-    "apart": None,
-    "privateboard": None,
-    "boards": None,
-    "boardfigures": None,
-    "casepanels": None,
-    "boardpictures": None,
-    "runcases": None,
-    "packing": None,
-    "submissions": None,
-    "paperboard": None,
-    "pipeline": None,
-    "boardshape": None,
-    "publish": None,
-    "release": None,
-    "scaffold": None,
-    "testing": None,
-    "cli": (
-        *("console", "regions", "ageing", "queries", "looking", "weights", "matchers", "runs", "submissions"),
-        *("boards", "publishing", "releasing"),
-        "program",
-    ),
-}
-
-# The rooms that touch the disk, and the few calls others may make, each with its reason.
-FILE_ROOMS = ("extract", "imagery", "store")
-FILE_EXCEPTIONS = {
-    ("taxonomy", "read_text"): "reads the taxonomy.toml packaged beside it",
-    ("run.sandbox", "open"): "opens what the kernel asks for: identity maps, and who came from whom",
-    ("run.landlock", "open"): "opens paths to be allowed, as the kernel asks for",
-    ("run.root", "open"): "makes files to mount others on, and reads which mounts there are",
-    ("run.cgroup", "read_text"): "reads what the kernel counts",
-    ("run.cgroup", "write_text"): "writes limits for the kernel",
-    ("run.memory", "read_bytes"): "reads what the kernel says of a process",
-    ("run.serve", "read_bytes"): "hashes the plugin's own code",
-}
-FILE_CALLS = frozenset(
-    {
-        *("open", "fdopen", "mkstemp", "NamedTemporaryFile", "TemporaryFile"),
-        *("read_text", "write_text", "read_bytes", "write_bytes"),
-        *("read_parquet", "to_parquet", "write_table", "read_table", "read_csv", "to_csv", "read_file", "to_file"),
-        *("savefig", "imsave", "imread", "savez", "savez_compressed", "tofile", "fromfile", "memmap"),
-    }
+# A room is a folder, or a file beside the folders. What stands above may be imported, what stands below may not; a file
+# that is added to a folder edits nothing here.
+HOUSE = (
+    # What any program needs.
+    *("texts", "errors", "bounds", "config", "parallel", "progress", "files", "canvas"),
+    # The pipeline.
+    *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks", "matching", "sasgeo", "running"),
+    *("scoring", "leaderboard", "publishing", "importers", "experiments", "cli"),
 )
 
-
-def room_order(house: Mapping[str, tuple[str, ...] | None]) -> list[str]:
-    """Every module name the house knows, top to bottom, as `errors` or `extract.read`; a folder ends with itself."""
-    order = []
-    for room, files in house.items():
-        order += [f"{room}.{name}" for name in files or ()]
-        order.append(room)
-    return order
+# What draws the queries, and what answers them: a scorer that used a generator's code would know too much.
+GENERATORS = ("ageing", "tasks.perturbations", "tasks.suites", "tasks.twin", "tasks.sampling", "tasks.build")
+SCORERS = ("search", "sasgeo")
 
 
 def module_name(path: str) -> str:
-    """`extract/read.py` -> `extract.read`; `extract/__init__.py` -> `extract`; `__init__.py` -> the empty name."""
+    """`osm/read.py` -> `osm.read`; `osm/__init__.py` -> `osm`; `__init__.py` -> the empty name."""
     parts = path.removesuffix(".py").split("/")
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported_modules(tree: ast.AST, modules: set[str]) -> Iterator[tuple[int, str]]:
+def room_of(module: str) -> str:
+    return module.split(".", maxsplit=1)[0]
+
+
+def imported_modules(text: str, modules: set[str]) -> Iterator[tuple[int, str]]:
     """Line and module of every import of our own package, wherever in the file it stands."""
-    for node in ast.walk(tree):
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level:
             names = [f"{PACKAGE}.{'.' * node.level}{node.module or ''}"]  # relative: in no room, so always a fault
         elif isinstance(node, ast.ImportFrom):
-            # `from sasgeo_bench.extract import read` takes a module, `from sasgeo_bench.grid import Grid` a name.
+            # `from sasgeo_bench.osm import read` takes a module, `from sasgeo_bench.geometry.grid import Grid` a name.
             full = [f"{node.module}.{alias.name}" for alias in node.names]
-            names = [name if _inside(name) in modules else str(node.module) for name in full]
+            names = [name if inside(name) in modules else str(node.module) for name in full]
         else:
             continue
         for name in names:
             if name == PACKAGE or name.startswith(f"{PACKAGE}."):
-                yield node.lineno, _inside(name)
+                yield node.lineno, inside(name)
 
 
-def _inside(name: str) -> str:
-    """`sasgeo_bench.grid` -> `grid`; the package itself -> the empty name."""
+def inside(name: str) -> str:
+    """`sasgeo_bench.geometry.grid` -> `geometry.grid`; the package itself -> the empty name."""
     return name.removeprefix(PACKAGE).removeprefix(".")
 
 
-def house_faults(sources: Mapping[str, str], house: Mapping[str, tuple[str, ...] | None]) -> list[str]:
-    """One line for each file without a room and each import of something not above; `sources` maps path to text."""
-    order = room_order(house)
-    names = {path: module_name(path) for path in sources}
-    modules = {*order, *names.values()} - {""}
+def house_faults(sources: Mapping[str, str], house: Sequence[str]) -> list[str]:
+    """One line for each file without a room, and for each import of a room that does not stand above."""
+    modules = {module_name(path) for path in sources}
     faults = []
-    for path, name in sorted(names.items()):
-        if name and name not in order:
-            faults.append(f"{path} is in no room of the house: add it to HOUSE in tests/test_architecture.py")
+    for path, text in sorted(sources.items()):
+        room = room_of(module_name(path))
+        if room and room not in house:
+            faults.append(f"{path} is in no room of the house: put it into the folder of the noun that it makes")
             continue
-        place = order.index(name) if name else len(order)
-        for line, target in sorted(set(imported_modules(ast.parse(sources[path]), modules))):
-            if target not in order or order.index(target) >= place:
+        above = house[: house.index(room)] if room else house
+        for line, target in sorted(set(imported_modules(text, modules))):
+            if room_of(target) not in above and (room_of(target) != room or target not in modules):
                 shown = f"{PACKAGE}.{target}" if target else PACKAGE
                 faults.append(f"{path}:{line} imports {shown}, which does not stand above it")
     return faults
 
 
-def file_faults(sources: Mapping[str, str]) -> list[str]:
-    """One line for each call that opens a file outside the rooms that may."""
-    faults = []
-    for path, text in sorted(sources.items()):
-        name = module_name(path)
-        if name.split(".")[0] in FILE_ROOMS:
-            continue
-        for node in ast.walk(ast.parse(text)):
-            if not isinstance(node, ast.Call):
-                continue
-            function = node.func
-            called = getattr(function, "id", None) or getattr(function, "attr", None)
-            if called in FILE_CALLS and (name, called) not in FILE_EXCEPTIONS:
-                faults.append(f"{path}:{node.lineno} calls {called}(): only {', '.join(FILE_ROOMS)} open files")
-    return faults
-
-
-# Rooms that draw what is asked, and rooms that answer it: a scorer that used a generator's code would know too much.
-GENERATORS = ("ageing", "perturb", "suites", "twin", "draw", "tasks")
-SCORERS = ("search", "sasgeo")
+def circle(sources: Mapping[str, str]) -> list[str]:
+    """Files that import each other in a circle, in order; none where there is no circle."""
+    modules = {module_name(path) for path in sources}
+    graph = {
+        module_name(path): {target for _, target in imported_modules(text, modules)} - {module_name(path)}
+        for path, text in sources.items()
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
 
 
 def shared_code_faults(sources: Mapping[str, str]) -> list[str]:
@@ -263,12 +95,16 @@ def shared_code_faults(sources: Mapping[str, str]) -> list[str]:
     modules = {module_name(path) for path in sources}
     faults = []
     for path, text in sorted(sources.items()):
-        room = module_name(path).split(".")[0]
-        barred = GENERATORS if room in SCORERS else SCORERS if room in GENERATORS else ()
-        for line, target in imported_modules(ast.parse(text), modules):
-            if target.split(".")[0] in barred:
+        name = module_name(path)
+        barred = GENERATORS if _is_in(name, SCORERS) else SCORERS if _is_in(name, GENERATORS) else ()
+        for line, target in imported_modules(text, modules):
+            if _is_in(target, barred):
                 faults.append(f"{path}:{line} imports {target}: generator and scorer share no code")
     return faults
+
+
+def _is_in(module: str, rooms: Sequence[str]) -> bool:
+    return any(module == room or module.startswith(f"{room}.") for room in rooms)
 
 
 @pytest.fixture(scope="module")
@@ -277,82 +113,70 @@ def sources() -> dict[str, str]:
     return {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in ROOT.rglob("*.py")}
 
 
-def test_every_file_has_a_room_and_imports_only_what_stands_above_it(sources: dict[str, str]) -> None:
+def test_every_file_has_a_room_and_imports_only_rooms_above_it(sources: dict[str, str]) -> None:
     faults = house_faults(sources, HOUSE)
     assert not faults, "\n".join(faults)
 
 
+def test_no_files_import_each_other_in_a_circle(sources: dict[str, str]) -> None:
+    assert circle(sources) == []
+
+
 def test_generator_and_scorer_share_no_code(sources: dict[str, str]) -> None:
-    assert {module_name(path).split(".")[0] for path in sources} >= {*GENERATORS, *SCORERS}
+    modules = {module_name(path) for path in sources}
+    assert modules >= {*GENERATORS, *SCORERS}
     faults = shared_code_faults(sources)
     assert not faults, "\n".join(faults)
-
-
-def test_only_the_rooms_that_may_open_files_do_so(sources: dict[str, str]) -> None:
-    faults = file_faults(sources)
-    assert not faults, "\n".join(faults)
-
-
-def test_every_exception_for_files_is_still_needed(sources: dict[str, str]) -> None:
-    unused = [
-        f"{name}: {called}"
-        for name, called in FILE_EXCEPTIONS
-        if f"{called}(" not in sources.get(f"{name.replace('.', '/')}.py", "")
-    ]
-    assert unused == []
 
 
 @pytest.mark.parametrize(
     ("path", "text", "fault"),
     [
-        ("grid.py", "import sasgeo_bench.cli", "grid.py:1 imports sasgeo_bench.cli"),
-        ("grid.py", "from sasgeo_bench import cli", "grid.py:1 imports sasgeo_bench.cli"),
-        ("grid.py", "from sasgeo_bench.grid import Grid", "grid.py:1 imports sasgeo_bench.grid"),
-        ("grid.py", "def late():\n    from sasgeo_bench.layers import burn", "grid.py:2 imports sasgeo_bench.layers"),
-        ("grid.py", "from .errors import GridError", "grid.py:1 imports sasgeo_bench..errors"),
-        ("grid.py", "import sasgeo_bench as sgb", "grid.py:1 imports sasgeo_bench, which"),
-        ("grid.py", "from sasgeo_bench.unknown import thing", "grid.py:1 imports sasgeo_bench.unknown"),
-        (
-            "extract/locate.py",
-            "from sasgeo_bench.extract import read",
-            "extract/locate.py:1 imports sasgeo_bench.extract.read",
-        ),
-        ("extract/read.py", "import sasgeo_bench.extract", "extract/read.py:1 imports sasgeo_bench.extract, which"),
+        ("osm/read.py", "import sasgeo_bench.cli", "osm/read.py:1 imports sasgeo_bench.cli"),
+        ("osm/read.py", "from sasgeo_bench import cli", "osm/read.py:1 imports sasgeo_bench, which"),
+        ("osm/read.py", "from sasgeo_bench.tasks.query import Query", "osm/read.py:1 imports sasgeo_bench.tasks.query"),
+        ("osm/read.py", "def late():\n    from sasgeo_bench.cli import main", "osm/read.py:2 imports sasgeo_bench.cli"),
+        ("osm/read.py", "from .errors import GridError", "osm/read.py:1 imports sasgeo_bench..errors"),
+        ("osm/read.py", "import sasgeo_bench as sgb", "osm/read.py:1 imports sasgeo_bench, which"),
+        ("osm/read.py", "from sasgeo_bench.unknown import thing", "osm/read.py:1 imports sasgeo_bench.unknown"),
+        ("osm/read.py", "from sasgeo_bench.osm.unknown import thing", "osm/read.py:1 imports sasgeo_bench.osm.unknown"),
+        ("errors.py", "from sasgeo_bench.osm import Extract", "errors.py:1 imports sasgeo_bench.osm"),
         ("kitchen.py", "", "kitchen.py is in no room"),
-        ("extract/cellar.py", "", "extract/cellar.py is in no room"),
-        ("angles/left.py", "", "angles/left.py is in no room"),
+        ("kitchen/stove.py", "", "kitchen/stove.py is in no room"),
     ],
 )
 def test_a_made_up_violation_is_found(path: str, text: str, fault: str) -> None:
-    house = {"errors": None, "grid": None, "angles": None, "extract": ("locate", "read"), "layers": None, "cli": None}
-    faults = house_faults({path: text}, house)
+    faults = house_faults({path: text}, ("errors", "osm", "tasks", "cli"))
     assert len(faults) == 1
     assert faults[0].startswith(fault)
 
 
-def test_imports_of_rooms_above_and_of_other_packages_are_no_violation() -> None:
-    sources = {
+def test_imports_of_rooms_above_of_files_beside_and_of_other_packages_are_no_violation() -> None:
+    files = {
         "__init__.py": "from sasgeo_bench.cli import main",
-        "cli.py": "import numpy as np\nfrom sasgeo_bench.extract import Extract\nfrom sasgeo_bench import grid",
-        "extract/__init__.py": "from sasgeo_bench.extract.read import Extract",
-        "extract/read.py": "from sasgeo_bench.extract import locate\nfrom sasgeo_bench.grid import Grid",
-        "extract/locate.py": "from sasgeo_bench.errors import ExtractError",
+        "cli/__init__.py": "import numpy as np\nfrom sasgeo_bench.osm import Extract\nfrom sasgeo_bench import osm",
+        "osm/__init__.py": "from sasgeo_bench.osm.read import Extract",
+        "osm/read.py": "from sasgeo_bench.osm import locate\nfrom sasgeo_bench.errors import ExtractError",
+        "osm/locate.py": "from sasgeo_bench.errors import ExtractError",
     }
-    house = {"errors": None, "grid": None, "extract": ("locate", "read"), "cli": None}
-    assert house_faults(sources, house) == []
+    assert house_faults(files, ("errors", "osm", "cli")) == []
+    assert circle(files) == []
+
+
+def test_a_made_up_circle_is_found() -> None:
+    files = {
+        "osm/read.py": "def late():\n    from sasgeo_bench.osm import scan",
+        "osm/scan.py": "import sasgeo_bench.osm.read",
+    }
+    assert set(circle(files)) == {"osm.read", "osm.scan"}
 
 
 def test_made_up_shared_code_is_found() -> None:
-    files = {"suites/base.py": "from sasgeo_bench.search.find import find", "perturb/base.py": "import numpy"}
+    files = {"tasks/suites/base.py": "from sasgeo_bench.search.find import find", "tasks/query.py": "import numpy"}
     other = {
-        "sasgeo/arms.py": "from sasgeo_bench.suites import base",
-        "sasgeo/rates.py": "from sasgeo_bench import grid",
+        "sasgeo/arms.py": "from sasgeo_bench.tasks.suites import base",
+        "sasgeo/rates.py": "from sasgeo_bench.tasks.query import Query",
     }
-    assert shared_code_faults(files) == ["suites/base.py:1 imports search.find: generator and scorer share no code"]
+    found = "tasks/suites/base.py:1 imports search.find: generator and scorer share no code"
+    assert shared_code_faults(files) == [found]
     assert len(shared_code_faults(other)) == 1
-
-
-@pytest.mark.parametrize("call", ["open('a')", "Path('a').read_text()", "rasterio.open('a')", "table.to_parquet('a')"])
-def test_a_made_up_file_access_is_found(call: str) -> None:
-    assert len(file_faults({"grid.py": call})) == 1
-    assert file_faults({"store/region_dir.py": call}) == []

@@ -26,33 +26,36 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sasgeo_bench.ageing.files import read_ageing
 from sasgeo_bench.ageing.measure import DTYPES
-from sasgeo_bench.boardshape import check_shape
-from sasgeo_bench.entries import find_entries
+from sasgeo_bench.ageing.ratebook_file import read_ratebook
+from sasgeo_bench.config import parse_toml, shipped_dir
 from sasgeo_bench.errors import MOST_MESSAGE, SasgeoError
-from sasgeo_bench.extract.history import DatedExtract, read_history
-from sasgeo_bench.extract.read import read_extract
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.files.file_manifest import check_site
+from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.board_schema import check_shape
+from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
+from sasgeo_bench.matching.learned_file import read_learned
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.submission import Card, Submission, TaskSaid, example_card
+from sasgeo_bench.osm.history import DatedExtract, read_history
+from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.publishing.archive_file import StoredRun, TaskFolders, unpack, write_pack
+from sasgeo_bench.publishing.release_files import check_target
+from sasgeo_bench.publishing.site_files import read_board_files
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_spec import read_region_file
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row
+from sasgeo_bench.running.testing import TinyPlace
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.ageingfile import read_ageing
-from sasgeo_bench.store.catalog import read_pipeline_file, read_region_file, read_split_file, shipped_dir
-from sasgeo_bench.store.fileset import check_site
-from sasgeo_bench.store.learnedfile import read_learned
-from sasgeo_bench.store.packfile import StoredRun, TaskFolders, unpack, write_pack
-from sasgeo_bench.store.parquetfile import write_frame
-from sasgeo_bench.store.ratebookfile import read_ratebook
-from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.store.releasedir import check_target
-from sasgeo_bench.store.runrows import PREDICTION_SCHEMA, prediction_row
-from sasgeo_bench.store.sitedir import read_board_files
-from sasgeo_bench.store.submissiondir import read_card, read_submission, write_submission
-from sasgeo_bench.submissionfile import Card, Submission, TaskSaid, example_card
-from sasgeo_bench.taxonomy import load_taxonomy
-from sasgeo_bench.testing import TinyPlace
-from sasgeo_bench.tomlfile import parse_toml
+from sasgeo_bench.scoring.entries import find_entries
+from sasgeo_bench.scoring.submission_files import read_card, read_submission, write_submission
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.split import read_split_file
 from tests.handmade import card_of, full_board, put_board, put_pictures
 
 FEW = settings(
@@ -109,8 +112,8 @@ def make_region(folder: Path, tiny: TinyPlace) -> None:
 def task_of(tiny: TinyPlace) -> Path:
     """The task with most tracks."""
     return max(
-        (path.parent for path in (tiny.folder / "tasks").rglob(taskdir.TASK)),
-        key=lambda path: (len(taskdir.read_task(path)["counts"]), path.name),
+        (path.parent for path in (tiny.folder / "tasks").rglob(task_files.TASK)),
+        key=lambda path: (len(task_files.read_task(path)["counts"]), path.name),
     )
 
 
@@ -128,19 +131,19 @@ def answers_of(task: Path) -> list[Prediction]:
     pose = Pose(easting_m=500_000.0, northing_m=5_200_000.0, yaw_deg=10.0)
     return [
         Prediction(query_id=name, candidates=((pose, 0.5),) * (at % 2), confidence=0.5, diagnostics={"margin": 1.0})
-        for at, name in enumerate(taskdir.read_ids(task))
+        for at, name in enumerate(task_files.read_ids(task))
     ]
 
 
 def about_of(task: Path) -> dict[str, Any]:
-    said = taskdir.read_task(task)
+    said = task_files.read_task(task)
     return {
         "schema_version": 1,
         "matcher": card_of("mine"),
         "spec": "mine",
         "hash": "0123456789ab",
         **{name: said[name] for name in ("suite", "region", "task_version", "map_fingerprint")},
-        "queries_sha256": said["files"][taskdir.QUERIES]["sha256"],
+        "queries_sha256": said["files"][task_files.QUERIES]["sha256"],
         "top_k": 5,
         "learned": {"key": "ab", "file": None, "trained_on": ["porto"], "pairs": 3},
         "cpu_s": 1.5,
@@ -149,8 +152,8 @@ def about_of(task: Path) -> dict[str, Any]:
 
 def make_run(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
-    rundir.write_run(folder, about_of(task))
-    rundir.write_part(folder, answers_of(task), asked=taskdir.read_asked(task)).rename(folder / PART)
+    prediction_files.write_run(folder, about_of(task))
+    prediction_files.write_part(folder, answers_of(task), asked=task_files.read_asked(task)).rename(folder / PART)
 
 
 def make_predictions(folder: Path, tiny: TinyPlace) -> None:
@@ -177,7 +180,7 @@ def make_submission(folder: Path, tiny: TinyPlace) -> None:
         licence="ODbL-1.0",
         attribution="OpenStreetMap",
     )
-    write_submission(folder / "mine", said, answers_of(task), taskdir.read_asked(task))
+    write_submission(folder / "mine", said, answers_of(task), task_files.read_asked(task))
 
 
 def make_pack(folder: Path, tiny: TinyPlace) -> None:
@@ -208,17 +211,21 @@ def make_ageing(folder: Path, _: TinyPlace) -> None:
 
 
 def read_all_of_task(folder: Path) -> object:
-    taskdir.read_task(folder)
-    taskdir.check_truths(folder, folder)
-    rows = (taskdir.read_queries(folder), taskdir.read_heads(folder), taskdir.read_truths(folder))
-    asked = taskdir.read_asked(folder)
-    return [*map(list, rows), taskdir.read_view_bytes(folder), list(taskdir.read_some(folder, asked))]
+    task_files.read_task(folder)
+    task_files.check_truths(folder, folder)
+    rows = (task_files.read_queries(folder), task_files.read_heads(folder), task_files.read_truths(folder))
+    asked = task_files.read_asked(folder)
+    return [*map(list, rows), task_files.read_view_bytes(folder), list(task_files.read_some(folder, asked))]
 
 
 def read_all_of_run(folder: Path) -> object:
     asked = dict.fromkeys(("a", "b"), "ff")
     find_entries([folder])
-    return rundir.read_answers(folder, asked), list(rundir.read_predictions(folder)), rundir.read_ties(folder)
+    return (
+        prediction_files.read_answers(folder, asked),
+        list(prediction_files.read_predictions(folder)),
+        prediction_files.read_ties(folder),
+    )
 
 
 def read_pack(folder: Path) -> object:
@@ -290,7 +297,7 @@ FORMATS = {
         file="mine.parquet",
         make=make_predictions,
         read=lambda folder: (
-            list(rundir.read_predictions(folder / "mine.parquet")),
+            list(prediction_files.read_predictions(folder / "mine.parquet")),
             find_entries([folder / "mine.parquet"]),
         ),
     ),
@@ -469,14 +476,18 @@ def folders(tmp_path_factory: pytest.TempPathFactory, tiny: TinyPlace) -> dict[s
 
 def try_examples(
     folder: Path, item: Format, spoil: Callable[[bytes], st.SearchStrategy[bytes]], budget: settings
-) -> None:
+) -> int:
+    """Hold the reader to each example of a spoilt file; -> how many there were."""
     path = folder / item.file
     manifest = folder / (item.listed or item.file)
     sound, listed = path.read_bytes(), manifest.read_bytes()
+    tried = 0
 
     @budget
     @given(spoil(sound))
     def check(data: bytes) -> None:
+        nonlocal tried
+        tried += 1
         check_reading(folder, item, data)
 
     try:
@@ -484,6 +495,7 @@ def try_examples(
     finally:
         path.write_bytes(sound)
         manifest.write_bytes(listed)
+    return tried
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -494,13 +506,13 @@ def test_a_sound_file_is_read(folders: dict[str, Path], name: str) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_damaged_file_is_read_or_refused_in_one_line(folders: dict[str, Path], name: str) -> None:
-    try_examples(folders[name], FORMATS[name], damaged, FEW)
+    assert try_examples(folders[name], FORMATS[name], damaged, FEW) >= FEW.max_examples
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if Path(FORMATS[name].file).suffix in ODD])
 def test_a_file_with_an_odd_value_is_read_or_refused_in_one_line(folders: dict[str, Path], name: str) -> None:
     item = FORMATS[name]
-    try_examples(folders[name], item, ODD[Path(item.file).suffix], FEW)
+    assert try_examples(folders[name], item, ODD[Path(item.file).suffix], FEW) > 0
 
 
 @pytest.mark.slow

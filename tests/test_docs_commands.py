@@ -17,15 +17,15 @@ import pytest
 import typer
 
 from sasgeo_bench import cli
-from sasgeo_bench.boards import ScoreRequest, make_board
 from sasgeo_bench.cli import program
-from sasgeo_bench.packing import pack_board
-from sasgeo_bench.request import Wanted, plan_requests
-from sasgeo_bench.run.plan import RunRequest, plan_run
-from sasgeo_bench.run.runner import run
-from sasgeo_bench.store.catalog import find_split
-from sasgeo_bench.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks import make_tasks
+from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.publishing.archive import pack_board
+from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.runner import run
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.split import find_split
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.threaded import threaded
 
 ROOT = Path(__file__).parents[1]
@@ -48,22 +48,22 @@ DOCUMENTS = (
 ONLY_PARSED = {
     r"vaduz": "needs an extract of Liechtenstein",
     r"--extracts|--extract ": "needs extracts",
-    r"^sasgeo-bench leaderboard (?!.*--dry-run)": "minutes to hours; tests/test_pipeline.py carries a small one out",
-    r"--dask": "needs a scheduler; tests/run does it",
+    r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
+    r"--dask": "needs a scheduler; tests/running does it",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
-    r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/test_cli_runs.py does it",
-    r"--train ": "needs a matcher that learns; tests/run does it",
+    r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",
+    r"--train ": "needs a matcher that learns; tests/running does it",
     r"FILE\.json|<hash>": "needs what a matcher has learnt",
-    r"HASH|--query ID": "needs a run or a query of the reader's own; tests/test_boardpictures.py does it",
-    r"out/boards/demo": "needs the board of the demo; tests/test_publish.py publishes small ones",
-    r"^sasgeo-bench verify crossfit": "minutes: it reads every region that is built; tests/test_cli_queries.py does it",
+    r"HASH|--query ID": "needs a run or a query of the reader's own; tests/leaderboard/test_board_pictures.py does it",
+    r"out/boards/demo": "needs the board of the demo; tests/publishing/test_publish.py publishes small ones",
+    r"^sasgeo-bench verify crossfit": "minutes: tests/cli/test_cli_queries.py does it",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
 }
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
     r"^pip install -e my-matcher$": "done by hand: an installation needs the package registry",
     r"^sha256sum ": "a program of the system",
-    r"umask.*secrets\.token_hex": "makes a secret; tests/test_privateseed.py reads one",
+    r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
     r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",
 }
 PLUGIN = """[sasgeo_bench.matchers]
@@ -119,11 +119,8 @@ def is_ours(line: Line) -> bool:
 def parsed(text: str) -> None:
     """Hold a command against the program's flags and choices, without doing anything."""
     name, *words = shlex.split(text)[1:]
-    group = typer.main.get_command(program.app)
-    with typer.Context(group, info_name="sasgeo-bench") as parent:
-        command = group.get_command(parent, name)
-        assert command is not None, f"there is no command {name}"
-        command.make_context(name, words, parent=parent)
+    with typer.Context(typer.main.get_command(program.app), info_name="sasgeo-bench") as parent:
+        program.load(name).make_context(name, words, parent=parent)
 
 
 def first_runs() -> dict[str, Line]:

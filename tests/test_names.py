@@ -8,16 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.pipelinefile import ContrastSpec, PipelineFile
-from sasgeo_bench.plugins import MATCHERS, REJECTORS
-from sasgeo_bench.rejector import RejectorCard
-from sasgeo_bench.split import SplitFile
-from sasgeo_bench.store.catalog import list_pipeline_files, read_pipeline_file
-from sasgeo_bench.submissionfile import Card
+from sasgeo_bench.leaderboard.pipeline_spec import ContrastSpec, PipelineFile, list_pipeline_files, read_pipeline_file
+from sasgeo_bench.matching.matcher import MatcherCard
+from sasgeo_bench.matching.plugins import MATCHERS, REJECTORS
+from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.submission import Card
+from sasgeo_bench.tasks.split import SplitFile
 from sasgeo_bench.texts import NAME, VERSION
-from sasgeo_bench.tomlfile import check_document
 from tests.test_texts import NASTY
 
 ROOT = Path(__file__).parents[1]

@@ -34,6 +34,7 @@ MAX_FILE_BYTES = 500_000
 
 # Distributions whose module has another name.
 IMPORTED_AS = {
+    "lazy-loader": "lazy_loader",
     "opencv-python-headless": "cv2",
     "rio-cogeo": "rio_cogeo",
     "scikit-image": "skimage",
@@ -162,10 +163,10 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
 
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(wheel).namelist())
-    expected = {"sasgeo_bench/py.typed", "sasgeo_bench/taxonomy.toml", "sasgeo_bench/cli/program.py"}
-    expected.add("sasgeo_bench/ageing/ratebook.toml")
-    templates = (ROOT / "sasgeo_bench" / "report" / "templates").iterdir()
-    expected |= {f"sasgeo_bench/report/templates/{path.name}" for path in templates}
+    files = ("py.typed", "__init__.pyi", "osm/taxonomy.toml", "ageing/ratebook.toml", "cli/program.py")
+    expected = {f"sasgeo_bench/{name}" for name in files}
+    templates = (ROOT / "sasgeo_bench" / "publishing" / "templates").iterdir()
+    expected |= {f"sasgeo_bench/publishing/templates/{path.name}" for path in templates}
     for folder in SHIPPED:
         expected |= {f"sasgeo_bench/shipped/{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
     assert expected - names == set()

@@ -20,22 +20,23 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.table import Table
 
+from sasgeo_bench.canvas import PlainFigure
 from sasgeo_bench.cli.console import Bars, errors, print_table, say, tell
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.rejector import RejectorCard
-from sasgeo_bench.report.controls import Verdict
-from sasgeo_bench.report.latex import board_latex
-from sasgeo_bench.report.site import _environment
-from sasgeo_bench.report.tables import leaderboard
-from sasgeo_bench.report.text import board_markdown
-from sasgeo_bench.results import Prediction
-from sasgeo_bench.store import rundir, taskdir
-from sasgeo_bench.store.boardfile import write_board
-from sasgeo_bench.store.boardplot import Page, page
-from sasgeo_bench.store.canvas import PlainFigure
-from sasgeo_bench.store.picture import pixels_of
-from sasgeo_bench.store.regiondir import read_manifest, write_manifest
-from sasgeo_bench.store.svgfile import svg_fault
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.board_files import write_board
+from sasgeo_bench.leaderboard.board_plots import Page, page
+from sasgeo_bench.leaderboard.latex import board_latex
+from sasgeo_bench.leaderboard.picture import pixels_of
+from sasgeo_bench.leaderboard.text import board_markdown
+from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.publishing.site import _environment
+from sasgeo_bench.publishing.svg import svg_fault
+from sasgeo_bench.regions.region_files import read_manifest, write_manifest
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.scoring.controls import Verdict
+from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.tasks import task_files
 from sasgeo_bench.texts import (
     csv_cell,
     json_text,
@@ -332,9 +333,9 @@ def callers():
         ("Figure", set()),
         ("Console", set()),
         ("echo", {"cli/console.py", "cli/submissions.py"}),
-        ("Environment", {"report/site.py"}),
+        ("Environment", {"publishing/site.py"}),
         ("Markup", set()),
-        ("to_csv", {"store/boardfile.py"}),
+        ("to_csv", {"leaderboard/board_files.py"}),
         ("to_markdown", set()),
         ("to_html", set()),
         ("to_latex", set()),
@@ -432,12 +433,12 @@ def root(tasks, tmp_path_factory):
                 diagnostics={WORDS[:64]: 1.0, "cost $\\nosuchthing$": 2.0, "=1+1": 3.0},
                 confidence=0.5,
             )
-            for at, query in enumerate(taskdir.read_queries(task))
+            for at, query in enumerate(task_files.read_queries(task))
         ]
-        rundir.write_part(folder, answers, asked=taskdir.read_asked(task))
+        prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
         about = {"matcher": card, "hash": HASH, "suite": suite, "region": region, "isolation": {"network": WORDS}}
-        sha256 = taskdir.read_task(task)["files"][taskdir.QUERIES]["sha256"]
-        rundir.write_run(folder, about | {"queries_sha256": sha256})
+        sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
+        prediction_files.write_run(folder, about | {"queries_sha256": sha256})
     return out
 
 
@@ -468,7 +469,7 @@ def test_a_hostile_board_is_scored_looked_at_published_and_released(root, printe
             assert not [cell for cell in cells if cell[:1] in ("=", "+", "@")]
     run = root / "runs" / "mine" / HASH
     printed("inspect", run, "--out", root)
-    query = taskdir.read_ids(root / "tasks" / "clean" / "town-riverside")[0]
+    query = task_files.read_ids(root / "tasks" / "clean" / "town-riverside")[0]
     out, _ = printed("inspect", run, "--query", query, "--out", root)
     assert cv2.imread(out.removeprefix("picture: ").strip()).shape[2] == 3
     assert plain(WORDS) in printed("inspect", root / "regions" / "town-grid", "--out", root)[0]

@@ -10,10 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench import testing
-from sasgeo_bench.run import answers, plan, teach
-from sasgeo_bench.run.serve import TOOLS, Server
-from sasgeo_bench.run.worker import Worker
+from sasgeo_bench.running import answers, plan, testing, training
+from sasgeo_bench.running.serve import TOOLS, Server
+from sasgeo_bench.running.worker import Worker
 
 
 class Threaded(Worker):
@@ -39,6 +38,6 @@ def threaded() -> Iterator[None]:
     for tool in TOOLS:  # the hash of a matcher's code covers those that are imported: all of them, from the beginning
         import_module(f"sasgeo_bench.{tool}")
     with pytest.MonkeyPatch.context() as patch:
-        for module in (answers, plan, teach, testing):
+        for module in (answers, plan, training, testing):
             patch.setattr(module, "Worker", Threaded)
         yield

@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import UNKNOWN
-from sasgeo_bench.matcher import Match
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query
+from sasgeo_bench import UNKNOWN, Match, Pose, Query
 
 
 def is_blind(query: Query) -> bool:

@@ -9,10 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.region import Region
+from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Grid, Pose, Region
 
 FULL: Final = 255  # present without doubt; degrees are kept in steps of 1/255
 _NOTHING: Final = 6.5  # times the reach: less than 1e-9 is left

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.view import NOWHERE, Patch, Samples, View
 from sasgeo_baselines.voting import ByPlanes, ByRows
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench import Pose, Prior
 
 _FEW: Final = 32  # places a side: more cost less by transforms of planes
 _TILE: Final = 256  # places a side that are searched at once; larger ones take more memory and save no time

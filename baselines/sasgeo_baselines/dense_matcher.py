@@ -12,10 +12,7 @@ from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.dense import Mode, Plan, Search, ranked
 from sasgeo_baselines.verification import Verifier
 from sasgeo_baselines.view import View
-from sasgeo_bench.evidence import PRESENT, Evidence
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
+from sasgeo_bench import PRESENT, WITHHELD, Evidence, Match, MatcherCard, Query, Region
 
 MOST_PLACES: Final = 20  # modes given for one query, however many are asked for
 

@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.dense_matcher import DenseMatcher
 from sasgeo_baselines.voting import Gains, make_template
-from sasgeo_bench.evidence import Evidence
-from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.region import Region
+from sasgeo_bench import Evidence, MatcherCard, Region
 
 
 class FftVote(DenseMatcher):

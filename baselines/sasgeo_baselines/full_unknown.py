@@ -2,7 +2,7 @@
 """`full_unknown`: as `raster_graph_stability`, and what is unknown in the view says nothing."""
 
 from sasgeo_baselines.raster import GRAPH, LIMITS, OURS, SOURCE, STABLE, RasterMatcher, Switches
-from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench import MatcherCard
 
 
 class FullUnknown(RasterMatcher):

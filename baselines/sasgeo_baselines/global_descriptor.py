@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
-from sasgeo_bench.evidence import PRESENT, UNKNOWN
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
+from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, Match, MatcherCard, Query, Region
 
 STEP_M: Final = 32.0  # no place is further than 23 m from one of the lattice
 APART_M: Final = 25.0

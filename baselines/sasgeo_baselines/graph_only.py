@@ -15,11 +15,7 @@ from sasgeo_baselines.dense import Disc
 from sasgeo_baselines.descriptor import Descriptor, components
 from sasgeo_baselines.nodes import Nodes
 from sasgeo_baselines.places import at_place, first_apart, lattice_m, points_of
-from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.pose import Prior
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
+from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, Evidence, Match, MatcherCard, Prior, Query, Region
 
 CELL_M: Final = 2.0  # finer patches cost more and tell no more
 STEP_M: Final = 32.0

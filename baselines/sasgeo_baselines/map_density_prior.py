@@ -7,9 +7,7 @@ import numpy as np
 
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
+from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region
 
 DRAWN: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 STEP_M: Final = 16.0

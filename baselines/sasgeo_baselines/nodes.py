@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sasgeo_baselines.descriptor import Descriptor
-from sasgeo_bench.features import make_features
-from sasgeo_bench.graph import MapGraph, build_graph
+from sasgeo_bench import MapGraph, build_graph, make_features
 
 # A crossing connects nothing: one road is above the other. Dead ends are left out: gaps in what is seen make more.
 KINDS: Final = (

@@ -8,10 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.answers import offsets_m
-from sasgeo_bench.evidence import PRESENT
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.region import Region
+from sasgeo_bench import PRESENT, Grid, Pose, Prior, Region
 
 _POOLED_M: Final = 4.0  # a cell of the sums; finer ones take memory and tell no more
 

@@ -3,9 +3,7 @@
 
 from sasgeo_baselines.answers import is_blind, offsets_m, ranked_candidates
 from sasgeo_baselines.places import at_place, middle_m, points_of
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
+from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region
 
 
 class PriorCentre:

@@ -8,12 +8,7 @@ import numpy as np
 
 from sasgeo_baselines.answers import is_blind, ranked_candidates
 from sasgeo_baselines.places import middle_m
-from sasgeo_bench.bounds import MOST_CANDIDATES
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
+from sasgeo_bench import MOST_CANDIDATES, WITHHELD, Grid, Match, MatcherCard, Pose, Query, Region
 
 
 class RandomPlaces:

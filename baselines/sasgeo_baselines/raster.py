@@ -12,9 +12,7 @@ from sasgeo_baselines.dense import Mode, Plan
 from sasgeo_baselines.dense_matcher import DenseMatcher
 from sasgeo_baselines.verification import Verifier, blended
 from sasgeo_baselines.voting import Gains, make_template
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.region import Region
-from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Evidence, Region, load_taxonomy
 
 THIN: Final = (
     *("road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"),

@@ -2,7 +2,7 @@
 """`raster_graph`: the raster with uniform weights, its modes ranked anew by the graph descriptor."""
 
 from sasgeo_baselines.raster import GRAPH, LIMITS, OURS, SOURCE, UNKNOWN_IS_ABSENT, RasterMatcher, Switches
-from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench import MatcherCard
 
 
 class RasterGraph(RasterMatcher):

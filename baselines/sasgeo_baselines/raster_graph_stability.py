@@ -2,7 +2,7 @@
 """`raster_graph_stability`: as `raster_graph`, and what lasts weighs more in the raster."""
 
 from sasgeo_baselines.raster import GRAPH, LIMITS, OURS, SOURCE, STABLE, UNKNOWN_IS_ABSENT, RasterMatcher, Switches
-from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench import MatcherCard
 
 
 class RasterGraphStability(RasterMatcher):

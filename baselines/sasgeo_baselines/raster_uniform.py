@@ -2,7 +2,7 @@
 """`raster_uniform`: the paper's raster objective with uniform weights, thin lines by their distance transform."""
 
 from sasgeo_baselines.raster import LIMITS, OURS, SOURCE, UNKNOWN_IS_ABSENT, RasterMatcher
-from sasgeo_bench.matcher import MatcherCard
+from sasgeo_bench import MatcherCard
 
 
 class RasterUniform(RasterMatcher):

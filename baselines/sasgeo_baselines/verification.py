@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.descriptor import Descriptor, components
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN
-from sasgeo_bench.pose import Pose
+from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Pose
 
 # The graph is made of what the raster has seen already, so it gets half the raster's say. Among N poses of which one
 # stands out in the raster and all others are alike, it stands N / sqrt(N - 1) > sqrt(N) standard deviations above

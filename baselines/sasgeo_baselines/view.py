@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.chart import FULL, Chart
-from sasgeo_bench.evidence import Evidence
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, inverse
+from sasgeo_bench import Evidence, Grid, Pose, inverse
 
 NOWHERE = -math.inf  # the score of a pose that shows too little of the map
 _AT_ONCE: Final = 16384  # samples

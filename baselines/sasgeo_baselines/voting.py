@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN
+from sasgeo_bench import ABSENT, PRESENT, UNKNOWN
 
 _HALF_A_CELL: Final = 0.5  # a count that is whole is at least 1 or at most 0, whatever the transform rounds
 

@@ -34,9 +34,9 @@ from sasgeo_bench.ageing.pairing import (
     replaced_share,
 )
 from sasgeo_bench.ageing.rates import Rate, bootstrap_rate, seeded_rng
-from sasgeo_bench.extract.history import History, State
-from sasgeo_bench.extract.lifecycle import Lifecycle, ObjectKey
-from sasgeo_bench.taxonomy import Kind, load_taxonomy
+from sasgeo_bench.osm.history import History, State
+from sasgeo_bench.osm.lifecycle import Lifecycle, ObjectKey
+from sasgeo_bench.osm.taxonomy import Kind, load_taxonomy
 
 BLOCK_M: Final = 1000.0
 DAYS_PER_YEAR: Final = 365.25
@@ -159,8 +159,8 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
 
     Examples
     --------
-    >>> from sasgeo_bench.extract.lifecycle import no_lifecycle
-    >>> from sasgeo_bench.features import DTYPES as COLUMNS, make_features
+    >>> from sasgeo_bench.osm.lifecycle import no_lifecycle
+    >>> from sasgeo_bench.osm.features import DTYPES as COLUMNS, make_features
     >>> def state(year, houses):
     ...     filler = {name: [0] * len(houses) for name in COLUMNS}
     ...     text = {"osm_type": ["way"] * len(houses), "class": ["building"] * len(houses)}

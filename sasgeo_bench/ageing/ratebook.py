@@ -10,8 +10,8 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import Field
 
+from sasgeo_bench.config import Document
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.tomlfile import Document
 
 LEAST_THINGS: Final = 20  # a rate of fewer things is that of a few accidents
 _BEFORE_DATE: Final = re.compile(r"^(.+?)[-_.]*\d{4}-\d{2}-\d{2}")

@@ -6,11 +6,13 @@ from typing import Annotated
 
 import typer
 
+from sasgeo_bench.ageing.files import read_ageing, write_ageing, write_summary
 from sasgeo_bench.ageing.measure import measure_ageing
-from sasgeo_bench.cli.console import Out, read_box, read_day, say, tell
-from sasgeo_bench.extract.history import MARGIN_M, date_extracts, read_history
-from sasgeo_bench.store.ageingfile import read_ageing, write_ageing, write_summary
-from sasgeo_bench.store.ratebookfile import write_ratebook
+from sasgeo_bench.ageing.ratebook_file import write_ratebook
+from sasgeo_bench.cli.console import Out, read_day, say, tell
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.osm.history import MARGIN_M, date_extracts, read_history
+from sasgeo_bench.osm.scan import Box
 
 
 def measure_ageing_command(
@@ -26,7 +28,7 @@ def measure_ageing_command(
     out: Out = Path("out"),
 ) -> None:
     """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg."""
-    box = read_box(bounds)
+    box = _read_box(bounds)
     dated = date_extracts(extract, at=[read_day(text, flag="--at") for text in at or ()])
     history = read_history(dated, bounds=box, margin_m=margin_m, tell=tell)
     name = place or extract[0].name.split(".")[0].split("-")[0]
@@ -47,3 +49,17 @@ def compare_ageing_command(
     say(write_summary(out, places, controls))
     if rates is not None:
         say(write_ratebook(rates, places))
+
+
+def _read_box(text: str | None) -> Box | None:
+    """Read west,south,east,north in degrees, None where it was left out."""
+    if text is None:
+        return None
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError:
+        west, south, east, north = 0.0, 0.0, 0.0, 0.0
+    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees on a sphere
+        message = f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
+        raise ConfigError(message)
+    return (west, south, east, north)

@@ -9,27 +9,26 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.boards import Board
 from sasgeo_bench.cli.console import (
     ExtractFolders,
     Out,
     RegionFolders,
-    SeedFile,
     print_table,
-    private_seed,
     say,
     shown_progress,
     tell,
 )
+from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.metrics.draws import DRAWS
-from sasgeo_bench.packing import board_of, request_of, score_all
-from sasgeo_bench.pipeline import board_folder, plan_pipeline, run_pipeline
-from sasgeo_bench.privateboard import check_public, read_private
-from sasgeo_bench.privateseed import seed_said
-from sasgeo_bench.report.text import control_lines, finding_table, summary, warnings_of
-from sasgeo_bench.store.catalog import find_pipeline_file, read_pipeline_file
-from sasgeo_bench.submissions import submissions_for
+from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.leaderboard.build import Board
+from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
+from sasgeo_bench.leaderboard.private_board import check_public, read_private
+from sasgeo_bench.leaderboard.text import control_lines, finding_table, summary, warnings_of
+from sasgeo_bench.publishing.archive import board_of, request_of, score_all
+from sasgeo_bench.publishing.submissions import submissions_for
+from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.tasks.private_seed import seed_said
 
 CONTROL_FAILED: Final = 3  # exit status
 CONTESTANT_FAILED: Final = 4

@@ -16,10 +16,6 @@ from rich.table import Table
 from rich.text import Text
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.extract.scan import Box
-from sasgeo_bench.privateseed import LEAST_BITS, REPRODUCING_BITS, PrivateSeed
-from sasgeo_bench.request import PRIVATE_ROOT
-from sasgeo_bench.store.seedfile import VARIABLE, take_seed
 from sasgeo_bench.texts import plain, plain_lines
 
 EXIT_USER: Final = 2
@@ -49,30 +45,6 @@ ExtractFolders = Annotated[
     typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
 ]
 
-SeedFile = Annotated[
-    Path | None,
-    typer.Option(
-        help=f"file NAME.seed with a private seed, readable by you alone (or the seed in {VARIABLE}): draw by it, into "
-        "OUT/private"
-    ),
-]
-
-
-def private_seed(file: Path | None, *, public: int | None = None) -> PrivateSeed | None:
-    """Take the private seed of a file or of the environment, and say what is to be known of it; None without one."""
-    seed = take_seed(file)
-    if seed is None:
-        return None
-    if public is not None:
-        message = "--seed is public and a private seed is given too: leave one of them out"
-        raise ConfigError(message)
-    tell(f"drawing by a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}, into OUT/{PRIVATE_ROOT}")
-    if seed.bits < LEAST_BITS:
-        tell(f"warning: {seed.bits} bits are no secret: whoever sees a query can find the seed; use 32 hex digits")
-    elif seed.bits < REPRODUCING_BITS:
-        tell(f"warning: a board of this seed makes no row reproduced: that takes {REPRODUCING_BITS} bits")
-    return seed
-
 
 def read_date(text: str | None) -> dt.date | None:
     """Read the value of --date, None where it was left out."""
@@ -86,20 +58,6 @@ def read_day(text: str, *, flag: str) -> dt.date:
     except ValueError as error:
         message = f"{flag} must be a date as in 2021-10-28, got {text!r}"
         raise ConfigError(message) from error
-
-
-def read_box(text: str | None) -> Box | None:
-    """Read west,south,east,north in degrees, None where it was left out."""
-    if text is None:
-        return None
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError:
-        west, south, east, north = 0.0, 0.0, 0.0, 0.0
-    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees on a sphere
-        message = f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
-        raise ConfigError(message)
-    return (west, south, east, north)
 
 
 def tell(line: str) -> None:

@@ -8,30 +8,24 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, say, tell
-from sasgeo_bench.duplicates import constellations, search_split
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.panels import panels
-from sasgeo_bench.query import base_of
-from sasgeo_bench.region import Manifest
-from sasgeo_bench.report.cases import count_cases, sample_cases
-from sasgeo_bench.report.strata import STRESS
-from sasgeo_bench.runcases import RunCases, is_run, picture_of, read_run_cases
-from sasgeo_bench.split import make_split
-from sasgeo_bench.store.caseplot import case_pixels
-from sasgeo_bench.store.catalog import (
-    find_split_file,
-    list_region_files,
-    list_split_files,
-    read_region_file,
-    read_split_file,
-)
-from sasgeo_bench.store.picture import write_png
-from sasgeo_bench.store.regiondir import differing_files, read_features, read_manifest
-from sasgeo_bench.store.sheet import write_sheet
-from sasgeo_bench.store.splitmap import write_split_map
-from sasgeo_bench.store.taskdir import TASK, read_task
-from sasgeo_bench.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks import check_task, has_truths
+from sasgeo_bench.leaderboard.case_plot import case_pixels
+from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
+from sasgeo_bench.leaderboard.picture import write_png
+from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
+from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.scoring.strata import STRESS
+from sasgeo_bench.tasks.build import check_task, has_truths
+from sasgeo_bench.tasks.duplicates import constellations, search_split
+from sasgeo_bench.tasks.panels import panels
+from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.sheet import write_sheet
+from sasgeo_bench.tasks.split import find_split_file, list_split_files, make_split, read_split_file
+from sasgeo_bench.tasks.split_map import write_split_map
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.task_files import TASK, read_task
 
 TOP_DROPS: Final = 12
 SOME_CASES: Final = 3
@@ -54,7 +48,7 @@ def inspect_command(
     region_folders: RegionFolders = None,
     out: Out = Path("out"),
 ) -> None:
-    """Say what is in a region, a task, a split or a run; draw a task's sheet, a split's map, a query and its answer."""
+    """Say what is in a region, task, split or run; draw a task's sheet, a split's map, a query and its answer."""
     folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
     if (folder / TASK).is_file():
         _inspect_task(folder, out, query=query, rows=rows)

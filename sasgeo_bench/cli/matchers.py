@@ -4,7 +4,6 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -12,32 +11,9 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
-from sasgeo_bench.plugins import MATCHERS, ORACLE, REJECTORS, list_entry_points
-from sasgeo_bench.scaffold import plugin_files
-from sasgeo_bench.store.pluginfiles import write_plugin
-from sasgeo_bench.testing import check_matcher
-
-
-def list_matchers_command() -> None:
-    """List the matchers that are installed, and where each comes from."""
-    _list("matcher", MATCHERS, {ORACLE: ("sasgeo-bench", "a control, given the truth")})
-
-
-def list_rejectors_command() -> None:
-    """List the rejectors that are installed, and where each comes from."""
-    _list("rejector", REJECTORS, {})
-
-
-def _list(kind: str, group: str, own: Mapping[str, tuple[str, str]]) -> None:
-    """Print the entry points of a group, and what needs none."""
-    rows = {
-        name: (point.dist.name if point.dist is not None else "", point.value)
-        for name, point in list_entry_points(group).items()
-    }
-    table = Table(kind, "package", "class", box=None, pad_edge=False)
-    for name, told in sorted((rows | dict(own)).items()):
-        table.add_row(name, *told)
-    print_table(table)
+from sasgeo_bench.matching.plugin_files import write_plugin
+from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.running.testing import check_matcher
 
 
 def new_matcher_command(

@@ -1,77 +1,122 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program `sasgeo-bench`: parses, calls, prints. Results go to stdout, everything else to stderr."""
+"""The program `sasgeo-bench`: parses, calls, prints."""
 
+import ast
 import sys
 import warnings
-from collections.abc import Callable
-from pathlib import Path
-from typing import Final, TextIO
+from functools import cache
+from importlib import import_module, metadata, resources
+from typing import Annotated, Any, Final, TextIO
 
 import typer
-from rich.table import Table
+from typer.core import TyperGroup
 
-from sasgeo_bench.cli.ageing import compare_ageing_command, measure_ageing_command
-from sasgeo_bench.cli.boards import leaderboard_command, score_command
-from sasgeo_bench.cli.console import EXIT_USER, ExtractFolders, Out, print_table, tell
-from sasgeo_bench.cli.looking import inspect_command, verify_command
-from sasgeo_bench.cli.matchers import (
-    check_matcher_command,
-    list_matchers_command,
-    list_rejectors_command,
-    new_matcher_command,
-)
-from sasgeo_bench.cli.publishing import publish_command
-from sasgeo_bench.cli.queries import list_suites_command, make_queries_command
-from sasgeo_bench.cli.regions import build_region_command, list_regions_command
-from sasgeo_bench.cli.releasing import release_command
-from sasgeo_bench.cli.runs import merge_command, run_command
-from sasgeo_bench.cli.submissions import submit_command, validate_command
-from sasgeo_bench.cli.weights import lookalike_command, weights_command
-from sasgeo_bench.doctor import examine
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.cli.console import EXIT_USER, say, tell
 from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.results import one_line
 
 EXIT_INTERRUPTED: Final = 130
+HELP: Final = (
+    "Build regions from OpenStreetMap extracts, draw queries, run matchers, score them, publish boards. Results go to "
+    "stdout, everything else to stderr."
+)
 
-
-def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:
-    """Say which versions, folders and extracts are found, and what is missing."""
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for name, finding in examine(extracts or (), out=out):
-        table.add_row(name, finding)
-    print_table(table)
-
-
-# In the order of the work, as --help shows them.
-COMMANDS: Final[dict[str, Callable[..., None]]] = {
-    "doctor": doctor_command,
-    "list-regions": list_regions_command,
-    "build-region": build_region_command,
-    "measure-ageing": measure_ageing_command,
-    "compare-ageing": compare_ageing_command,
-    "list-suites": list_suites_command,
-    "make-queries": make_queries_command,
-    "inspect": inspect_command,
-    "verify": verify_command,
-    "weights": weights_command,
-    "lookalike": lookalike_command,
-    "list-matchers": list_matchers_command,
-    "list-rejectors": list_rejectors_command,
-    "new-matcher": new_matcher_command,
-    "check-matcher": check_matcher_command,
-    "run": run_command,
-    "merge": merge_command,
-    "validate": validate_command,
-    "submit": submit_command,
-    "score": score_command,
-    "leaderboard": leaderboard_command,
-    "publish": publish_command,
-    "release": release_command,
+# Group -> command -> its file here, in the order of the work; the function behind `run` is `run_command`. The file is
+# imported, with all that it needs, when the command runs: `--help` answers at once.
+COMMANDS: Final[dict[str, dict[str, str]]] = {
+    "Set-up": {
+        "doctor": "doctor",
+    },
+    "Regions": {
+        "list-regions": "listing",
+        "build-region": "regions",
+        "measure-ageing": "ageing",
+        "compare-ageing": "ageing",
+    },
+    "Queries": {
+        "list-suites": "listing",
+        "make-queries": "queries",
+        "inspect": "looking",
+        "verify": "looking",
+    },
+    "Matchers": {
+        "list-matchers": "listing",
+        "list-rejectors": "listing",
+        "new-matcher": "matchers",
+        "check-matcher": "matchers",
+        "weights": "weights",
+        "lookalike": "weights",
+    },
+    "Runs": {
+        "run": "runs",
+        "merge": "runs",
+        "validate": "submissions",
+        "submit": "submissions",
+    },
+    "Boards": {
+        "score": "boards",
+        "leaderboard": "boards",
+        "publish": "publishing",
+        "release": "releasing",
+    },
 }
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False, help=__doc__)
-for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
+
+class _Group(TyperGroup):
+    """Commands whose code is read when they run; help about all of them reads none."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - as below
+        """Name, command and the words that are left; the command is imported now."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command and load(name or ""), rest
+
+
+def load(name: str) -> Any:  # noqa: ANN401 - typer makes its commands of a class that it does not name
+    """The command of a name, as typer makes it of the function behind it."""
+    file = next(group[name] for group in COMMANDS.values() if name in group)
+    alone = typer.Typer(add_completion=False)
+    alone.command(name)(getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name)))
+    return typer.main.get_command(alone)
+
+
+def help_of(file: str, name: str) -> str:
+    """The docstring of the function behind a command, out of the source, so that nothing is imported for it."""
+    return _docstrings(file)[_function_of(name)]
+
+
+@cache
+def _docstrings(file: str) -> dict[str, str]:
+    source = resources.files("sasgeo_bench.cli").joinpath(f"{file}.py").read_text(encoding="utf-8")
+    functions = (item for item in ast.parse(source).body if isinstance(item, ast.FunctionDef))
+    return {item.name: ast.get_docstring(item) or "" for item in functions}
+
+
+def _function_of(name: str) -> str:
+    return f"{name.replace('-', '_')}_command"
+
+
+def _print_version(*, is_asked: bool) -> None:
+    if is_asked:
+        say(f"sasgeo-bench {metadata.version('sasgeo-bench')}")
+        raise typer.Exit
+
+
+app = typer.Typer(cls=_Group, no_args_is_help=True, pretty_exceptions_enable=False, help=HELP)
+
+
+@app.callback()
+def _program(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and stop")
+    ] = False,
+) -> None:
+    """Options of the program itself; each is carried out by its callback."""
+
+
+for _panel, _commands in COMMANDS.items():
+    for _name, _file in _commands.items():
+        app.command(_name, help=help_of(_file, _name), rich_help_panel=_panel)(lambda: None)
 
 
 def _warn(

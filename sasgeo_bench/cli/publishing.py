@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.cli.console import Out, say, tell
-from sasgeo_bench.packing import board_of
-from sasgeo_bench.publish import publish
-from sasgeo_bench.submissions import with_submissions
+from sasgeo_bench.publishing.archive import board_of
+from sasgeo_bench.publishing.build import publish
+from sasgeo_bench.publishing.submissions import with_submissions
 
 
 def publish_command(

@@ -6,34 +6,21 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from sasgeo_bench.cli.console import (
     ExtractFolders,
     Out,
     OwnRegionFolders,
-    SeedFile,
-    print_table,
-    private_seed,
     say,
     tell,
 )
+from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.processes import spread
-from sasgeo_bench.query import PriorGroup
-from sasgeo_bench.request import Request, Wanted, plan_requests, root_of
-from sasgeo_bench.suites.all_suites import EVERY_SUITE, SUITES, find_suite
-from sasgeo_bench.tasks import make_tasks
-
-
-def list_suites_command() -> None:
-    """List the suites: what each does and what it separates."""
-    table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
-    for name, suite in EVERY_SUITE.items():
-        card = suite.card
-        per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
-        table.add_row(name, card.title, ", ".join(card.tracks), str(per_site), card.separates)
-    print_table(table)
+from sasgeo_bench.parallel import spread
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
 
 def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its users need

@@ -6,24 +6,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from sasgeo_bench.build import BuildPlan, build_region, plan_build
 from sasgeo_bench.cli.console import (
     ExtractFolders,
     Out,
     RegionFolders,
-    print_table,
     read_date,
     say,
     tell,
 )
-from sasgeo_bench.processes import spread
-from sasgeo_bench.store.catalog import (
-    find_region_file,
-    list_region_files,
-    read_region_file,
-)
+from sasgeo_bench.parallel import spread
+from sasgeo_bench.regions.build import BuildPlan, build_region, plan_build
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 
 
 def build_region_command(
@@ -58,16 +52,3 @@ def _plan(
 ) -> BuildPlan:
     spec = read_region_file(find_region_file(name, folders=regions or ()))
     return plan_build(spec, out=out, date=date, extract_folders=extracts or ())
-
-
-def list_regions_command(regions: RegionFolders = None) -> None:
-    """List the regions that come with the package, and your own."""
-    table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
-    for name, path in sorted(list_region_files(folders=regions or ()).items()):
-        spec = read_region_file(path)
-        grid = spec.grid()
-        area_km2 = grid.rows * grid.cols * grid.cell_size_m**2 / 1e6
-        dates = [extract.date.isoformat() for extract in spec.extract]
-        shown = dates[0] if len(dates) == 1 else f"{dates[0]} .. {dates[-1]} ({len(dates)})"
-        table.add_row(name, spec.title, f"{area_km2:.1f}", f"{grid.cell_size_m:g} m", shown, ", ".join(spec.scenes))
-    print_table(table)

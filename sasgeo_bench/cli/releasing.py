@@ -8,7 +8,7 @@ import typer
 
 from sasgeo_bench.cli.console import Out, read_date, say, tell
 from sasgeo_bench.errors import counted
-from sasgeo_bench.release import ReleaseRequest, make_release
+from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 
 
 def release_command(  # noqa: PLR0913 - a command has as many flags as its users need
@@ -25,7 +25,7 @@ def release_command(  # noqa: PLR0913 - a command has as many flags as its users
     url: Annotated[str | None, typer.Option(help="address where the release will be found")] = None,
     out: Out = Path("out"),
 ) -> None:
-    """Write regions and their queries as a dataset that others load without this program (needs the extra publish)."""
+    """Write regions and queries as a dataset that others load without this program (needs the extra publish)."""
     day = read_date(date)
     request = ReleaseRequest(
         regions=tuple(regions),

@@ -10,13 +10,12 @@ import typer
 
 from sasgeo_bench.cli.console import Out, say, shown_progress, tell
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.run.plan import RunPlan, RunRequest, plan_run
-from sasgeo_bench.run.runner import run
-from sasgeo_bench.run.worker import Limits
-from sasgeo_bench.split import Split
-from sasgeo_bench.store.catalog import find_split, list_split_files
-from sasgeo_bench.store.rundir import merge_runs
-from sasgeo_bench.store.taskdir import read_asked, read_task
+from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
+from sasgeo_bench.running.prediction_files import merge_runs
+from sasgeo_bench.running.runner import run
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.tasks.split import Split, find_split, list_split_files
+from sasgeo_bench.tasks.task_files import read_asked, read_task
 
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 

@@ -9,11 +9,11 @@ import typer
 
 from sasgeo_bench.cli.console import EXIT_USER, say, tell
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.packing import laid_tasks
-from sasgeo_bench.store.submissiondir import is_submission
-from sasgeo_bench.submissionfile import example_card
-from sasgeo_bench.submissions import SubmitRequest, hold_submission, make_submission
-from sasgeo_bench.validate import Violation, set_aside, validate
+from sasgeo_bench.matching.submission import example_card
+from sasgeo_bench.publishing.archive import laid_tasks
+from sasgeo_bench.publishing.submissions import SubmitRequest, hold_submission, make_submission
+from sasgeo_bench.scoring.submission_files import is_submission
+from sasgeo_bench.scoring.validate import Violation, set_aside, validate
 
 MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
 
@@ -59,7 +59,7 @@ def validate_command(
     predictions: Annotated[Path, typer.Option(help="predictions file, the folder of a run, or a submission")],
     tasks: BoardTasks = None,
 ) -> None:
-    """List everything in which predictions are not what the tasks ask for; many queries without a row are counted."""
+    """List everything in which predictions are not what the tasks ask for, and count queries without a row."""
     if is_submission(predictions):
         _validate_submission(predictions, tasks or [])
         return

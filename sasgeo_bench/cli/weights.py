@@ -12,16 +12,14 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import Out, print_table, say
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.lookalike import SIDE_M, find_lookalike, sheet_of
-from sasgeo_bench.region import Region
-from sasgeo_bench.sasgeo.arms import Switches
-from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.store.learnedfile import read_learned
-from sasgeo_bench.store.lookalikeplot import draw_lookalike
-from sasgeo_bench.store.regiondir import MANIFEST, read_region
-from sasgeo_bench.store.weightplot import WeightSheet, draw_weights, top_of
-from sasgeo_bench.taxonomy import load_taxonomy
-from sasgeo_bench.worth import (
+from sasgeo_bench.leaderboard.lookalike import SIDE_M, find_lookalike, sheet_of
+from sasgeo_bench.leaderboard.lookalike_plot import draw_lookalike
+from sasgeo_bench.matching.learned_file import read_learned
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import MANIFEST, read_region
+from sasgeo_bench.sasgeo.ablations import Switches
+from sasgeo_bench.sasgeo.class_weights import (
     AGES_YEARS,
     FITTED,
     HAND,
@@ -34,6 +32,8 @@ from sasgeo_bench.worth import (
     worth_of,
     worth_table,
 )
+from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
 WORTH: Final = (
@@ -96,7 +96,7 @@ def lookalike_command(
     side_m: Annotated[float, typer.Option(min=64, max=1000, help="side of the view, metres")] = SIDE_M,
     out: Out = Path("out"),
 ) -> None:
-    """Draw a place, the weights of its map, and the place most like it by class shares; with the scores of both."""
+    """Draw a place, the weights of its map, and the place most like it by class shares; with both scores."""
     learnt = read_learnt(learned)
     mapped = find_region(region, out=out)
     seen = mapped if world is None else find_region(world, out=out)

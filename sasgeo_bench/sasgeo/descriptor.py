@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from sasgeo_bench.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 
 BINS: Final = 16
 LEAST_M2: Final = 9.0  # smaller patches are specks

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster import vq
 
-from sasgeo_bench.evidence import PRESENT
+from sasgeo_bench.regions.evidence import PRESENT
 
 CELL_M: Final = 4.0  # of a configuration: rings hold a handful of cells in each sector
 RINGS_M: Final = (16.0, 48.0)  # a junction; a junction and the next houses

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.integrity import APART_M, EVIDENCE
 
 Rows = NDArray[np.float64]
@@ -39,7 +39,7 @@ def lead(prediction: Prediction) -> float:
 
     Examples
     --------
-    >>> from sasgeo_bench.pose import Pose
+    >>> from sasgeo_bench.geometry.pose import Pose
     >>> places = [Pose(easting_m=x, northing_m=0.0, yaw_deg=0.0) for x in (0.0, 10.0, 40.0)]
     >>> lead(Prediction(query_id="a", candidates=tuple(zip(places, (5.0, 4.0, 2.0)))))
     3.0

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.pose import Pose, inverse
+from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.sasgeo.kinds import KINDS
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints
@@ -101,10 +101,10 @@ def verify(
     Three streets seen where they are, and a quarter turn off:
 
     >>> import shapely
-    >>> from sasgeo_bench.evidence import Evidence
-    >>> from sasgeo_bench.graph import build_graph
-    >>> from sasgeo_bench.grid import Grid
-    >>> from sasgeo_bench.vectors import as_features, vector_table
+    >>> from sasgeo_bench.regions.evidence import Evidence
+    >>> from sasgeo_bench.regions.graph import build_graph
+    >>> from sasgeo_bench.geometry.grid import Grid
+    >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
     >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
     >>> lines = shapely.from_wkt(ways)
     >>> streets = vector_table([("road_minor", 0, False, line) for line in lines])

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from sasgeo_bench.network import LAYERS, ROAD
+from sasgeo_bench.regions.network import LAYERS, ROAD
 
 Drawing = Literal["vectors", "mask"]
 

@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.evidence import Evidence
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.matcher import Training
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query, Truth
-from sasgeo_bench.region import Region
-from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Training
+from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.sasgeo.ablations import Switches
+from sasgeo_bench.sasgeo.edit_age import StampTally, fit_trust, stamp_tally, strata
+from sasgeo_bench.sasgeo.evidence_scaling import fit_temper
 from sasgeo_bench.sasgeo.joint import Blend, columns
 from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
-from sasgeo_bench.sasgeo.stamps import StampTally, fit_trust, stamp_tally, strata
-from sasgeo_bench.sasgeo.temper import fit_temper
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
+from sasgeo_bench.tasks.query import Query, Truth
 
 MODES: Final = 16  # of a search to learn from
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.sasgeo.edit_age import STRATA
+from sasgeo_bench.sasgeo.evidence_scaling import START
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
 from sasgeo_bench.sasgeo.seasons import SEASONS, by_hand, fit_season
-from sasgeo_bench.sasgeo.stamps import STRATA
-from sasgeo_bench.sasgeo.temper import START
 
 VERSION: Final = 1  # of the text
 DEFAULT_BLEND: Final = Blend()
@@ -39,7 +39,7 @@ class Learnt:
     temper : ndarray of float, shape (C,)
         What the score of each is multiplied with: neighbouring cells say the same.
     trust : ndarray of float, shape (C, STRATA)
-        How much a feature is worth by its own age: see `stamps.fit_trust`.
+        How much a feature is worth by its own age: see `edit_age.fit_trust`.
     seasons : mapping of str to ndarray of float, shape (C,)
         By season, what share of a mapped class can still be seen.
     blend : Blend

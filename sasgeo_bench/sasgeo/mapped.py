@@ -9,11 +9,10 @@ import geopandas as gpd
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sasgeo_bench.evidence import PRESENT
-from sasgeo_bench.graph import MapGraph
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.network import LAYERS
-from sasgeo_bench.region import Region
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.regions.evidence import PRESENT
+from sasgeo_bench.regions.network import LAYERS
+from sasgeo_bench.regions.region import MapGraph, Region
 from sasgeo_bench.sasgeo.kinds import KINDS
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes, nodes_of, patches_of
 from sasgeo_bench.sasgeo.pairs import JUNCTIONS, JunctionPairs
@@ -61,8 +60,8 @@ class MappedGraph:
         Examples
         --------
         >>> import shapely
-        >>> from sasgeo_bench.graph import build_graph
-        >>> from sasgeo_bench.vectors import as_features, vector_table
+        >>> from sasgeo_bench.regions.graph import build_graph
+        >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
         >>> house = as_features(vector_table([("building", 0, False, shapely.box(5, 5, 9, 9))]))
         >>> grid = Grid(epsg=32632, west_m=0.0, north_m=20.0, cell_size_m=1.0, rows=20, cols=20)
         >>> mapped = MappedGraph.make(build_graph(house), house, known=np.ones((20, 20), dtype=bool), grid=grid)

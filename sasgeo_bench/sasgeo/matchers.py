@@ -8,12 +8,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import UNKNOWN
-from sasgeo_bench.matcher import WITHHELD, Match, MatcherCard, Training
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
-from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.graph import GraphScore
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.learning import learn
@@ -22,6 +21,7 @@ from sasgeo_bench.sasgeo.protection import levels_of
 from sasgeo_bench.sasgeo.reading import Glance, Reader
 from sasgeo_bench.search.find import rank, search
 from sasgeo_bench.search.plan import Mode, Null, Plan
+from sasgeo_bench.tasks.query import Query
 
 LISTED: Final = 20  # modes of one search, or candidates, that are looked at again: all that comes after shares them
 

@@ -13,11 +13,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sasgeo_bench.angles import bearing_deg, wrap_deg
-from sasgeo_bench.graph import RELATIONS, MapGraph
-from sasgeo_bench.network import LAYERS, ROAD, make_chains, make_network
+from sasgeo_bench.geometry.angles import bearing_deg, wrap_deg
+from sasgeo_bench.regions.graph import RELATIONS
+from sasgeo_bench.regions.network import LAYERS, ROAD, make_chains, make_network
+from sasgeo_bench.regions.region import MapGraph
+from sasgeo_bench.regions.shapes import centroids, groups_within
 from sasgeo_bench.sasgeo.kinds import INDEX, KINDS, PATCHES, ROADS, Drawing
-from sasgeo_bench.shapes import centroids, groups_within
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -290,7 +291,7 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
 
     Examples
     --------
-    >>> from sasgeo_bench.vectors import as_features, vector_table
+    >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
     >>> row = [("building", 0, False, shapely.box(at, 0, at + 9, 9)) for at in (0, 9, 50)]
     >>> patches_of(as_features(vector_table(row))).area_m2.tolist()
     [162.0, 81.0]

@@ -12,17 +12,17 @@ import pandas as pd
 import shapely
 from scipy.spatial import cKDTree
 
-from sasgeo_bench.angles import bearing_deg, wrap_deg
-from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.graph import build_graph
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.network import LAYERS, ROAD, make_network
-from sasgeo_bench.query import Query
+from sasgeo_bench.geometry.angles import bearing_deg, wrap_deg
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.graph import build_graph
+from sasgeo_bench.regions.network import LAYERS, ROAD, make_network
+from sasgeo_bench.regions.shapes import delaunay_pairs
 from sasgeo_bench.sasgeo.kinds import INDEX, KINDS, PATCHES, ROADS, Drawing
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes, arms_of, nodes_of, nothing, patches_of
 from sasgeo_bench.sasgeo.skeleton import lines_of_mask
-from sasgeo_bench.shapes import delaunay_pairs
-from sasgeo_bench.vectors import as_features, instances_of_mask, vector_table
+from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_table
 
 MARGIN_M: Final = 8.0  # of what is known, where a thing may have slipped out of it
 NEAR_M: Final = 80.0  # neighbours whose relative place is looked at

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sasgeo_bench.angles import bearing_deg
+from sasgeo_bench.geometry.angles import bearing_deg
 from sasgeo_bench.sasgeo.kinds import INDEX
 from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 

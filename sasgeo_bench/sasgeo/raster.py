@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.region import Region
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.sasgeo.edit_age import STRATA, strata
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
-from sasgeo_bench.sasgeo.stamps import STRATA, strata
 from sasgeo_bench.sasgeo.weights import Gains, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 
@@ -59,7 +59,7 @@ def read_field(
     likeness : ndarray of float, shape (C, FAR + 1)
         Of its classes: see `rates.likeness` and `likeness_by_hand`.
     trust : ndarray of float, shape (C, STRATA), optional
-        Of features by their own age: see `stamps.fit_trust`; all alike without it.
+        Of features by their own age: see `edit_age.fit_trust`; all alike without it.
     cell_size_m : float
         Least side of a cell of the search, metres.
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.evidence import ABSENT, PRESENT
-from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 
 RINGS_M: Final = (4.0, 8.0, 12.0)  # around a class: OSM lies a few metres off, masks of views another few
 FAR: Final = len(RINGS_M) + 1

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sasgeo_bench.angles import wrap_deg
+from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.sasgeo.nodes import Floats, Ints
 
 

@@ -10,11 +10,10 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import PRESENT
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.query import Query
-from sasgeo_bench.region import Region
-from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import PRESENT
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.distinct import Rarity
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.joint import columns
@@ -25,6 +24,7 @@ from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
 from sasgeo_bench.sasgeo.tuples import proposals
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
+from sasgeo_bench.tasks.query import Query
 
 DAYS_PER_YEAR: Final = 365.25
 LEAST_SIGMA_M: Final = 1.0  # of a refined position: half a cell of the search

@@ -10,9 +10,9 @@ import shapely
 from numpy.typing import NDArray
 from skimage.morphology import skeletonize
 
-from sasgeo_bench.evidence import PRESENT, Evidence, cell_offsets_m
+from sasgeo_bench.regions.evidence import PRESENT, Evidence, cell_offsets_m
 from sasgeo_bench.sasgeo.kinds import ROADS
-from sasgeo_bench.vectors import vector_table
+from sasgeo_bench.tasks.vectors import vector_table
 
 # What is drawn together, and the class that its lines get; which class of road it is a crossing does not ask.
 LAYERS: Final = {"road_minor": ROADS, "railway": ("railway",), "waterway": ("waterway",)}

@@ -7,9 +7,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sasgeo_bench.angles import wrap_deg
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
@@ -73,11 +73,11 @@ def proposals(
     Three streets of a map, seen with another heading and from elsewhere:
 
     >>> import shapely
-    >>> from sasgeo_bench.evidence import Evidence
-    >>> from sasgeo_bench.graph import build_graph
-    >>> from sasgeo_bench.grid import Grid
-    >>> from sasgeo_bench.pose import inverse
-    >>> from sasgeo_bench.vectors import as_features, vector_table
+    >>> from sasgeo_bench.regions.evidence import Evidence
+    >>> from sasgeo_bench.regions.graph import build_graph
+    >>> from sasgeo_bench.geometry.grid import Grid
+    >>> from sasgeo_bench.geometry.pose import inverse
+    >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
     >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
     >>> lines = shapely.from_wkt(ways)
     >>> grid = Grid(epsg=32632, west_m=-96.0, north_m=96.0, cell_size_m=2.0, rows=96, cols=96)

@@ -3,8 +3,8 @@
 
 from typing import Final
 
-from sasgeo_bench.matcher import MatcherCard
-from sasgeo_bench.sasgeo.arms import Switches
+from sasgeo_bench.matching.matcher import MatcherCard
+from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.matchers import LearningMatcher, SasgeoMatcher
 
 _SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), {what}"

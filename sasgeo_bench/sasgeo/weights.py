@@ -12,9 +12,9 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.evidence import ABSENT, PRESENT
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 from sasgeo_bench.sasgeo.rates import ClassRates
-from sasgeo_bench.taxonomy import load_taxonomy
 
 _LEAST: Final = 1e-4  # a probability is no nearer to 0 or 1: one cell of a few thousand can always be wrong
 

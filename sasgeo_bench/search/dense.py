@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from sasgeo_bench.angles import wrap_deg
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, inverse
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.search.field import Level, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Mode, Null
 from sasgeo_bench.search.space import Tile, Turns

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
 
 FULL: Final = 255  # of a field: the map has it for certain
 

@@ -10,13 +10,13 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.angles import wrap_deg
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.search.dense import dense
 from sasgeo_bench.search.field import Field, Template
+from sasgeo_bench.search.local_refinement import Guess, Sight, Stride, climbed, polished
 from sasgeo_bench.search.plan import Found, Mode, Null, Plan
-from sasgeo_bench.search.sight import Guess, Sight, Stride, climbed, polished
 from sasgeo_bench.search.space import NO_PLACE, Disc, Tile, Turns, all_around, tiles_of, turns_of
 
 _NOTHING: Final = 1e-9

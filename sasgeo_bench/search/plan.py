@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.pose import Pose
+from sasgeo_bench.geometry.pose import Pose
 
 
 @dataclass(frozen=True, kw_only=True)

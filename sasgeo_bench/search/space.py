@@ -9,8 +9,8 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
 
 _QUARTERS: Final = 4
 _MOST_PLACES: Final = 512  # a side of what is searched at once: bounds the memory of the transforms

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sasgeo_bench.evidence import Evidence, LayerBits, observe
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.query import Query
-from sasgeo_bench.request import Wanted, plan_requests
-from sasgeo_bench.tasks import make_tasks
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 CLASSES = ("building", "road_minor", "water")
 SIDE = 420

@@ -10,8 +10,8 @@ from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.descriptor import BINS, LEAST_M2, MOST_THINGS, Descriptor, components
 from sasgeo_baselines.raster import REACH_M, THIN
 
-from sasgeo_bench.evidence import UNKNOWN, LayerBits, observe
-from sasgeo_bench.pose import Pose
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
 
 PLACES = arrays(np.float64, st.tuples(st.integers(0, 9), st.just(2)), elements=st.floats(-40, 40))
 REACH = 120.0

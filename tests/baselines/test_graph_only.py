@@ -12,11 +12,11 @@ from sasgeo_baselines import graph_only
 from sasgeo_baselines.graph_only import GraphOnly
 from sasgeo_baselines.nodes import KINDS, Nodes
 
-from sasgeo_bench.evidence import UNKNOWN, Evidence
-from sasgeo_bench.features import DTYPES, make_features
-from sasgeo_bench.graph import build_graph
-from sasgeo_bench.matcher import WITHHELD, check_match
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import WITHHELD, check_match
+from sasgeo_bench.osm.features import DTYPES, make_features
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.graph import build_graph
 
 NORTH = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=5.0, scale_sigma=0.0)
 PLACES = tuple(Pose(easting_m=1000.0 + east_m, northing_m=8904.0, yaw_deg=0.0) for east_m in (300, 100, 200))

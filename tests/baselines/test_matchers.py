@@ -12,10 +12,10 @@ from sasgeo_baselines.global_descriptor import GlobalDescriptor
 from sasgeo_baselines.map_density_prior import MapDensityPrior
 from sasgeo_baselines.places import Sums
 
-from sasgeo_bench.matcher import MatcherCard, candidates_at, check_match
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.store.taskdir import read_queries, read_truths
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.tasks.task_files import read_queries, read_truths
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.matchers"]

@@ -19,10 +19,10 @@ from sasgeo_baselines.rejectors.margin import Margin
 from sasgeo_baselines.rejectors.margin_nms import MarginNms
 from sklearn.isotonic import IsotonicRegression
 
-from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.rejector import check_p_false
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.plugins import load_rejector
+from sasgeo_bench.matching.rejector import check_p_false
+from sasgeo_bench.matching.results import Prediction
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.rejectors"]

@@ -14,10 +14,10 @@ from sasgeo_baselines.raster_graph import RasterGraph
 from sasgeo_baselines.raster_uniform import RasterUniform
 from sasgeo_baselines.view import Patch, View
 
-from sasgeo_bench.angles import wrap_deg
-from sasgeo_bench.evidence import UNKNOWN
-from sasgeo_bench.matcher import WITHHELD, check_match
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import WITHHELD, check_match
+from sasgeo_bench.regions.evidence import UNKNOWN
 
 CELL_M, YAW_STEP_DEG = 1.0, 3.0
 POSES = st.builds(

@@ -17,10 +17,10 @@ from sasgeo_baselines.raster_graph_stability import RasterGraphStability
 from sasgeo_baselines.raster_uniform import RasterUniform
 from sasgeo_baselines.verification import BETA, Verifier, blended
 
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.matcher import check_match
-from sasgeo_bench.pose import Pose, Prior
-from sasgeo_bench.taxonomy import load_taxonomy
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import check_match
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 
 VARIANTS = (RasterUniform, RasterGraph, RasterGraphStability, FullUnknown)
 HERE = Pose(easting_m=1170.0, northing_m=8800.0, yaw_deg=40.0)

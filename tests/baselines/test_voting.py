@@ -10,8 +10,8 @@ from sasgeo_baselines.chart import Chart, fade
 from sasgeo_baselines.view import Patch, View
 from sasgeo_baselines.voting import ByPlanes, ByRows, Gains, make_template, score_cells, vote, vote_directly
 
-from sasgeo_bench.evidence import UNKNOWN, LayerBits, observe
-from sasgeo_bench.pose import Pose
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
 
 POSITIVE = arrays(np.float64, 3, elements=st.floats(0, 10))
 GAINS = st.builds(Gains, agree=POSITIVE, extra=POSITIVE, missed=POSITIVE)

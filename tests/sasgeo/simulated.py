@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.protection import levels_of
 from sasgeo_bench.search.plan import Null

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.sasgeo.descriptor import GraphDescriptor, descriptor_score
 
 

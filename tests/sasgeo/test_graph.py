@@ -8,20 +8,20 @@ import pytest
 import shapely
 
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.graph import build_graph
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.perturb.local_warp import LocalWarp, warped
-from sasgeo_bench.pose import Pose, compose, inverse
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, compose, inverse
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.graph import build_graph
+from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.kinds import INDEX
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.store.regiondir import read_region
-from sasgeo_bench.suites.base import State
-from sasgeo_bench.suites.local_warp import bent
-from sasgeo_bench.suites.vectors import VectorNoise, perceive_vectors
-from sasgeo_bench.vectors import as_features, vector_table
+from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
+from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.suites.local_warp import bent
+from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
+from sasgeo_bench.tasks.vectors import as_features, vector_table
 
 WAYS = (
     *("LINESTRING (-97 -20, -40 -20, 20 -20, 97 -20)", "LINESTRING (-40 -20, -40 97)", "LINESTRING (20 -20, 20 -97)"),

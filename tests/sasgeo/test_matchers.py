@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.matcher import Learner, Matcher, Training, check_match
+from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_match
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
 from sasgeo_bench.sasgeo.learnt import Learnt
 from sasgeo_bench.sasgeo.protection import PROTECTION

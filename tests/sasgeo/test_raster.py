@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.raster import RasterView, doubted, likeness_by_hand, read_field
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.weights import even_gains, likelihood_gains

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.evidence import PRESENT
+from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, ClassRates, Tally, fit_rates, hand_rates, likeness, rings, tally
 
 TRUE = ClassRates(hit=0.88, false_alarm=0.015, missing=0.04, vanish_per_year=0.02, appear_per_year=0.006, mapped=0.12)

@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.metrics.calibration import calibration_error
-from sasgeo_bench.metrics.decisions import COST_RATIOS, Answers, accept_by_cost
-from sasgeo_bench.metrics.integrity import aurc
-from sasgeo_bench.plugins import load_rejector
-from sasgeo_bench.rejector import check_p_false, remark_of
-from sasgeo_bench.results import Prediction
+from sasgeo_bench.matching.plugins import load_rejector
+from sasgeo_bench.matching.rejector import check_p_false, remark_of
+from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.conformal import upper_rate
 from sasgeo_bench.sasgeo.frame import features, lead
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
 from sasgeo_bench.sasgeo.rejectors import FEW, Counted, SasgeoBoosted, SasgeoLogistic
+from sasgeo_bench.scoring.calibration import calibration_error
+from sasgeo_bench.scoring.decisions import COST_RATIOS, Answers, accept_by_cost
+from sasgeo_bench.scoring.integrity_metric import aurc
 from tests.sasgeo.simulated import simulate
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))

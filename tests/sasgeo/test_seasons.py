@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally
 from sasgeo_bench.sasgeo.seasons import HAND, SEASONS, by_hand, fit_season
 from sasgeo_bench.sasgeo.weights import likelihood_gains
-from sasgeo_bench.taxonomy import load_taxonomy
 
 RATES = ClassRates(hit=0.9, false_alarm=0.01, missing=0.01, vanish_per_year=0.03, appear_per_year=0.01, mapped=0.1)
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.rates import ClassRates
 from sasgeo_bench.sasgeo.weights import hand_gains, information, likelihood_gains, weigh
-from sasgeo_bench.taxonomy import load_taxonomy
 
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
 shares = st.floats(0.001, 0.999)

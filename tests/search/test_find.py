@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.angles import wrap_deg
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
-from sasgeo_bench.grid import Grid
-from sasgeo_bench.pose import Pose, Prior
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.search.dense import _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.find import exhaustive, rank, score_at, search

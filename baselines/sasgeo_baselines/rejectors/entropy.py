@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.rejectors.leads import entropy, with_withheld
-from sasgeo_bench.rejector import RejectorCard
-from sasgeo_bench.results import Prediction
+from sasgeo_bench import Prediction, RejectorCard
 
 
 class Entropy:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from sklearn.isotonic import IsotonicRegression  # type: ignore[import-untyped, unused-ignore]
 
 from sasgeo_baselines.rejectors.leads import answered, base_rate, margin, with_withheld
-from sasgeo_bench.rejector import RejectorCard
-from sasgeo_bench.results import Prediction
+from sasgeo_bench import Prediction, RejectorCard
 
 
 class IsotonicMargin:

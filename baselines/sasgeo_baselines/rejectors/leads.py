@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.pose import Pose
-from sasgeo_bench.results import Prediction
+from sasgeo_bench import Pose, Prediction
 
 # The widest tolerance of the benchmark: what lies nearer is the same answer. (A footprint would do, but no rule sees
 # the view.)

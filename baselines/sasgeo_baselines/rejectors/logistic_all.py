@@ -20,8 +20,7 @@ from sasgeo_baselines.rejectors.leads import (
     scores_of,
     with_withheld,
 )
-from sasgeo_bench.rejector import RejectorCard
-from sasgeo_bench.results import Prediction
+from sasgeo_bench import Prediction, RejectorCard
 
 _NEAR: Final = 1e-150  # a smaller spread is none: quotients stay finite
 _FAR: Final = 10.0  # standard deviations: beyond what calibration has seen, farther is no more

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ageing.parquet`, `ageing.md`, `ageing.svg`: what was measured of one place, and a table of several places."""
+
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing
+from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
+from sasgeo_bench.ageing.plots import draw_ageing
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.parquet import read_frame, write_frame
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.texts import markdown, markdown_item
+
+TABLE: Final = "ageing.parquet"
+TEXT: Final = "ageing.md"
+PLOT: Final = "ageing.svg"
+
+_READING: Final = f"""\
+Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g} or, where split or merged, by the ground
+they share; lines by the length within {NEAR_M:g} m of a line of the other map. Vanished is a share of the older amount,
+appeared of the newer: of the ground or length ("amount"), and of the number of things, each of which counts where more
+than half of it does. Small things make the two differ. Re-drawn is what was kept and moved by more than {REDRAWN_M:g} m
+(areas: their centroid, so an area that grew has moved too). Ground lost and gained is what the class no longer, or
+newly, covers. Rates are those of an exponential life whose end is known only to lie between two dates, by amount, with
+95 % intervals from 1,000 draws of blocks of 1 km. Of what vanished or appeared, some is retagged (another class of its
+kind gave or took its place), some tags tell to be the world's change (construction, demolished, a start date after the
+older map) or the map's catching up (a start date before); the rest cannot be told. A dash: nothing to measure, or a
+rate of dates less than {LEAST_DAYS} days apart; "all": no bound."""
+
+_BOTH_WAYS: Final = ("vanished", "vanished_number", "appeared", "appeared_number")
+_CONTROLS: Final = """\
+Pairs of maps so near in time that next to nothing can have changed: what is found here is not ageing but the floor of
+the method, mostly things that one extract was cut to hold and the other was not. Shares of the amount that vanished,
+appeared."""
+
+
+def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
+    """Write table, text and plot into a folder; each file is replaced whole.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    ageing : Ageing
+        What was measured.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    StoreError
+        If the folder or a file cannot be written.
+    """
+    attrs = {
+        "attribution": ATTRIBUTION,
+        "licence": LICENCE,
+        "place": ageing.place,
+        "sources": list(ageing.sources),
+        "area_km2": ageing.area_km2,
+    }
+    writers: dict[str, Callable[[Path], object]] = {
+        TABLE: lambda path: write_frame(ageing.table, path, attrs=attrs),
+        TEXT: lambda path: path.write_text(ageing_text(ageing), encoding="utf-8"),
+        PLOT: lambda path: draw_ageing(path, ageing),
+    }
+    return tuple(replace_file(folder / name, write) for name, write in writers.items())
+
+
+def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
+    """Let a function write a scratch file beside the target, then put it in the target's place.
+
+    Raises
+    ------
+    StoreError
+        If the folder or the file cannot be written.
+    """
+    scratch = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write(scratch)
+        scratch.replace(target)
+    except OSError as error:
+        message = f"{target} cannot be written ({error}): check the free space and the rights of its folder"
+        raise StoreError(message) from error
+    finally:
+        with suppress(OSError):  # where a file stands for a folder there is nothing to remove
+            scratch.unlink(missing_ok=True)
+    return target
+
+
+def read_ageing(folder: Path) -> Ageing:
+    """Read what `write_ageing` wrote.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no `ageing.parquet`, or another one.
+
+    Examples
+    --------
+    >>> read_ageing(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no ageing.parquet: run measure-ageing with --out nowhere first
+    """
+    path = folder / TABLE
+    if not path.is_file():
+        message = f"{folder} holds no {TABLE}: run measure-ageing with --out {folder} first"
+        raise StoreError(message)
+    try:
+        table = read_frame(path, mend="measure it again")
+        facts = table.attrs
+        ageing = Ageing(
+            place=facts["place"], sources=tuple(facts["sources"]), area_km2=facts["area_km2"], table=table[list(DTYPES)]
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        message = f"{path} cannot be read as a table of ageing ({' '.join(str(error).split())[:120]}): measure it again"
+        raise StoreError(message) from error
+    return ageing
+
+
+def ageing_text(ageing: Ageing) -> str:
+    """Markdown of one place: rates, then every pair of dates, class by class."""
+    table = ageing.table
+    rates = _rate_table(table, by="class")
+    spans = table[table["span"] != "pooled"]
+    sources = "\n".join(f"- {markdown_item(source)}" for source in ageing.sources)
+    return "\n\n".join(
+        (
+            f"# {markdown(ageing.place)}: how the map aged",
+            _READING,
+            f"{ageing.area_km2:,.1f} km2 that all of these map:\n\n{sources}",
+            "## Rates over all intervals",
+            rates,
+            "## Pairs of dates",
+            _grid(_PAIR_HEAD, [_pair_cells(row) for _, row in spans.iterrows()]),
+            f"{ATTRIBUTION}\n",
+        )
+    )
+
+
+def summary_text(places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> str:
+    """Markdown of several places: the rates of each class beside each other, then what controls found.
+
+    Raises
+    ------
+    ConfigError
+        If two places have one name.
+
+    Examples
+    --------
+    >>> summary_text([]).splitlines()[0]
+    '# How maps aged'
+    """
+    check_names((*places, *controls))
+    rows = [_place_cells(place) for place in (*places, *controls)]
+    parts = ["# How maps aged", _READING, _grid(_PLACE_HEAD, rows)]
+    together = _together(places)
+    for name in _classes_of(together):
+        handset = load_taxonomy()[name].persistence
+        rates = (100 * handset.vanish_per_year, 100 * handset.appear_per_year)
+        note = f"The taxonomy has, set by hand: vanishes {rates[0]:.2f}, appears {rates[1]:.2f} %/year."
+        parts += [f"## {name}", note, _rate_table(together[together["class"] == name], by="place")]
+    if controls:
+        parts += ["## Controls", _CONTROLS, _control_table(controls)]
+    return "\n\n".join((*parts, f"{ATTRIBUTION}\n"))
+
+
+def check_names(places: Sequence[Ageing]) -> None:
+    """Refuse two tables of one place.
+
+    Raises
+    ------
+    ConfigError
+        If two places have one name.
+
+    Examples
+    --------
+    >>> check_names([])
+    """
+    twice = [name for name, count in Counter(place.place for place in places).items() if count > 1]
+    if twice:
+        message = f"two tables are of {twice[0]!r}: measure one of them with another --place"
+        raise ConfigError(message)
+
+
+def _together(places: Sequence[Ageing]) -> pd.DataFrame:
+    tables = [place.table.assign(place=place.place) for place in places]
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(DTYPES))
+
+
+def _classes_of(table: pd.DataFrame) -> list[str]:
+    """Names in a table, in the order of their ids."""
+    found = set(table["class"])
+    return [name for name in load_taxonomy().names if name in found]
+
+
+def _control_table(controls: Sequence[Ageing]) -> str:
+    """A row for each class, a column for each control."""
+    tables = {control.place: control.table.set_index(["span", "class"]) for control in controls}
+    lines = [
+        [name, *(_control_cell(table, name) for table in tables.values())] for name in _classes_of(_together(controls))
+    ]
+    return _grid(("class", *tables), lines)
+
+
+def _control_cell(table: pd.DataFrame, name: str) -> str:
+    shares = (table[f"{what}_share"].get(("whole", name)) for what in ("vanished", "appeared"))
+    return ", ".join("-" if share is None else _percent(share) for share in shares)
+
+
+def write_summary(path: Path, places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> Path:
+    """Write `summary_text` into a file, replaced whole.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be written.
+    ConfigError
+        If two places have one name.
+    """
+    text = summary_text(places, controls)
+    return replace_file(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
+
+
+_PLACE_HEAD: Final = ("place", "km2", "maps", "first", "last")
+
+
+def _place_cells(ageing: Ageing) -> list[str]:
+    first, last = ageing.table["date_from"].min(), ageing.table["date_to"].max()
+    return [
+        ageing.place,
+        f"{ageing.area_km2:,.1f}",
+        str(len(ageing.sources)),
+        f"{first:%Y-%m-%d}",
+        f"{last:%Y-%m-%d}",
+    ]
+
+
+_RATE_HEAD: Final = (
+    *("first amount", "last amount", "vanishes, %/year", "appears, %/year"),
+    *("vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
+    *("re-drawn, amount", "ids gone, number"),
+    *("of vanished: world, retagged, untold", "of appeared: world, catch-up, retagged, untold"),
+)
+
+
+def _rate_table(table: pd.DataFrame, *, by: str) -> str:
+    """A row for each class (or place): pooled rates, then shares of the first map against the last."""
+    lines = []
+    pooled, whole = (table[table["span"] == span].set_index(by) for span in ("pooled", "whole"))
+    for name in pooled.index:
+        rate, share = pooled.loc[name], whole.loc[name]
+        lines.append(
+            [
+                str(name),
+                _amount(share["amount_from"], share["unit"]),
+                _amount(share["amount_to"], share["unit"]),
+                _rate(rate, "vanish_per_year"),
+                _rate(rate, "appear_per_year"),
+                *(_percent(share[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "id_vanished")),
+                _shares(rate, "vanished", ("world", "retagged", "untold")),
+                _shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")),
+            ]
+        )
+    return _grid((by, *_RATE_HEAD), lines)
+
+
+_PAIR_HEAD: Final = (
+    *("class", "from", "to", "things", "vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
+    *("re-drawn", "retagged", "ground lost, gained"),
+    *("shift median, p90", "ids gone", "vanishes, %/year", "appears, %/year"),
+)
+
+
+def _pair_cells(row: pd.Series) -> list[str]:
+    mark = " (first to last)" if row["span"] == "whole" else ""
+    shifts = (row["shift_median_m"], row["shift_p90_m"])
+    return [
+        f"{row['class']}{mark}",
+        f"{row['date_from']:%Y-%m-%d}",
+        f"{row['date_to']:%Y-%m-%d}",
+        f"{row['n_from']:,} to {row['n_to']:,}",
+        *(_percent(row[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "retagged")),
+        f"{_percent(row['ground_lost_share'])}, {_percent(row['ground_gained_share'])}",
+        "-" if pd.isna(shifts[0]) else f"{shifts[0]:.1f} m, {shifts[1]:.1f} m",
+        _percent(row["id_vanished_share"]),
+        _rate(row, "vanish_per_year"),
+        _rate(row, "appear_per_year"),
+    ]
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value / 1e6:,.3f} km2" if unit == "m2" else f"{value / 1e3:,.1f} km"
+
+
+def _shares(row: pd.Series, what: str, reasons: Sequence[str]) -> str:
+    return ", ".join(_percent(row[f"{what}_{reason}_share"]) for reason in reasons)
+
+
+def _percent(share: float) -> str:
+    return "-" if pd.isna(share) else f"{100 * share:.1f} %"
+
+
+def _rate(row: pd.Series, name: str) -> str:
+    """`0.30 (0.25 to 0.36)`, in percent."""
+    value, lo, hi = (100 * row[f"{name}{end}"] for end in ("", "_lo", "_hi"))
+    if pd.isna(value):
+        return "-"
+    known = "" if pd.isna(lo) or math.isinf(lo) else f" ({lo:.2f} to {_bounded(hi)})"
+    return f"{_bounded(value)}{known}"
+
+
+def _bounded(percent: float) -> str:
+    """A rate whose likelihood grows without end belongs to a class of which nothing stayed."""
+    return "all" if math.isinf(percent) else f"{percent:.2f}"
+
+
+def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [map(markdown, head), ["---"] * len(head), *(map(markdown, row) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

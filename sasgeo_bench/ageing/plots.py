@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ageing.svg`: yearly rates of each class with their intervals, and what ids would have said."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from sasgeo_bench.ageing.measure import Ageing
+from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.region import ATTRIBUTION
+
+_RANGE: Final = (0.01, 100.0)  # %/year: what is less is drawn at the left edge, what is more at the right one
+_TICKS: Final = (0.01, 0.1, 1.0, 10.0, 100.0)
+_POOLED: Final = "#000000"
+_WHOLE: Final = "#d55e00"
+_BY_ID: Final = "#0072b2"
+_LATE: Final = 0.8  # of viridis: beyond, its yellow is too pale on white
+_ROW_INCHES: Final = 0.42
+_WIDTH_INCHES: Final = 12.0
+_FRAME_INCHES: Final = 2.75
+_TOP_INCHES: Final = 1.0
+# Text stays text, so that it can be searched for; ids and dates come from neither clock nor chance.
+_STYLE: Final[dict[Any, Any]] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sasgeo-bench",
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+}
+
+
+def draw_ageing(path: Path, ageing: Ageing) -> None:
+    """Draw what was measured of one place.
+
+    Parameters
+    ----------
+    path : Path
+        The SVG to write; the same bytes for the same table.
+    ageing : Ageing
+        The table with its place and dates.
+    """
+    titles = {item.name: item.title for item in load_taxonomy().classes}
+    names = list(dict.fromkeys(ageing.table["class"]))
+    height = _ROW_INCHES * len(names) + _FRAME_INCHES
+    with mpl.rc_context(_STYLE):
+        figure = PlainFigure(figsize=(_WIDTH_INCHES, height), facecolor="white")
+        FigureCanvasAgg(figure)
+        panels = figure.subplots(1, 3, sharey=True, width_ratios=[1, 1, 0.8])
+        low, high = 1.3 / height, 1 - _TOP_INCHES / height
+        figure.subplots_adjust(left=0.16, right=0.985, bottom=low, top=high, wspace=0.13)
+        _draw_rates(panels[0], ageing.table, names, "vanish_per_year", "vanishes, % of the older map a year")
+        _draw_rates(panels[1], ageing.table, names, "appear_per_year", "appears, % of the newer map a year")
+        _draw_shares(panels[2], ageing.table, names)
+        panels[0].set_yticks(range(len(names)), [titles[name] for name in names])
+        panels[0].set_ylim(len(names) - 0.5, -0.5)
+        _words(figure, ageing, height)
+        figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None, "Rights": ATTRIBUTION})
+
+
+def _draw_rates(chart: Axes, table: pd.DataFrame, names: list[str], column: str, title: str) -> None:
+    rows = {name: number for number, name in enumerate(names)}
+    chart.set_xscale("log")
+    chart.set_xlim(_RANGE[0] * 0.75, _RANGE[1] * 1.3)
+    middles = (table["date_from"] + (table["date_to"] - table["date_from"]) / 2).astype("int64").to_numpy()
+    age = (middles - middles.min()) / max(np.ptp(middles), 1)
+    shade = mpl.colormaps["viridis"]
+    facts = zip(
+        table["class"], table["span"], *(100 * table[f"{column}{end}"] for end in ("", "_lo", "_hi")), strict=True
+    )
+    for number, (name, span, value, *ends) in enumerate(facts):
+        at = rows[name]
+        if np.isnan(value):
+            continue
+        if span == "interval":
+            colour = shade(_LATE * age[number])
+            chart.plot(_within(value), at + 0.22, marker="o", color=colour, ms=4, ls="", mec="none", clip_on=False)
+        elif span == "whole":
+            chart.plot(_within(value), at, marker="D", color="none", mec=_WHOLE, ms=7, ls="", mew=1.4, zorder=4)
+        else:
+            chart.plot([_within(end) for end in ends], [at, at], color=_POOLED, lw=1.6, zorder=3)
+            chart.plot(_within(value), at, marker="o", color=_POOLED, ms=5, ls="", zorder=5)
+    chart.xaxis.set_major_locator(FixedLocator(_TICKS))
+    chart.xaxis.set_minor_locator(NullLocator())
+    chart.xaxis.set_major_formatter(FuncFormatter(_tick))
+    if table[column].isna().all():
+        chart.text(0.5, 0.5, "too short a time\nfor yearly rates", ha="center", va="center", transform=chart.transAxes)
+    _dress(chart, title, len(names))
+
+
+def _tick(value: float, _: object) -> str:
+    beyond = {_RANGE[0]: "\u2264 ", _RANGE[1]: "\u2265 "}
+    return f"{beyond.get(value, '')}{value:g}"
+
+
+def _within(percent: float) -> float:
+    """A rate where the axis can show it; an end that is not known stays away."""
+    return float(np.clip(percent, *_RANGE))
+
+
+def _draw_shares(chart: Axes, table: pd.DataFrame, names: list[str]) -> None:
+    """What ids say is gone against what geometry says, by amount and by number, first map against last."""
+    whole = table[table["span"] == "whole"].set_index("class").loc[names]
+    columns = ("id_vanished_share", "vanished_share", "vanished_number_share")
+    for at, (by_id, by_place, by_number) in enumerate(zip(*(100 * whole[name] for name in columns), strict=True)):
+        ends = [end.reduce([by_id, by_place, by_number]) for end in (np.fmin, np.fmax)]
+        chart.plot(ends, [at, at], color="#bbbbbb", lw=1.5, zorder=1)
+        chart.plot(by_id, at, marker="s", color=_BY_ID, ms=6, ls="", zorder=3)
+        chart.plot(by_number, at, marker="o", color="none", mec=_WHOLE, ms=5, ls="", mew=1.4, zorder=4)
+        chart.plot(by_place, at, marker="D", color="white", mec=_WHOLE, ms=7, ls="", mew=1.4, zorder=2)
+    chart.set_xlim(-3, 103)
+    _dress(chart, "gone from first map to last, %", len(names))
+
+
+def _dress(chart: Axes, title: str, rows: int) -> None:
+    chart.set_title(title, fontsize=10, loc="left")
+    chart.grid(visible=True, axis="x", color="#dddddd", lw=0.7)
+    for at in range(0, rows, 2):
+        chart.axhspan(at - 0.5, at + 0.5, color="#f6f6f6", lw=0, zorder=0)
+    chart.set_axisbelow(True)
+    chart.tick_params(axis="y", length=0)
+    for side in ("top", "right", "left"):
+        chart.spines[side].set_visible(False)
+
+
+def _words(figure: Figure, ageing: Ageing, height: float) -> None:
+    """Title above; what the marks mean and whose data they are below."""
+    table = ageing.table
+    first, last = table["date_from"].min(), table["date_to"].max()
+    states = f"{len(ageing.sources)} maps from {first:%Y-%m-%d} to {last:%Y-%m-%d}, {ageing.area_km2:,.1f} km2"
+    figure.text(0.015, 1 - 0.15 / height, f"{ageing.place}: how the map aged", fontsize=14, weight="bold", va="top")
+    figure.text(0.015, 1 - 0.47 / height, states, fontsize=9.5, color="#444444", va="top")
+    common: dict[str, Any] = {"ls": "", "marker": "o"}
+    marks = [
+        Line2D([], [], color=_POOLED, marker="o", ms=5, lw=1.6, label="rate over all intervals, 95 %"),
+        Line2D([], [], color=mpl.colormaps["viridis"](0.0), ms=4, label="one interval, early", **common),
+        Line2D([], [], color=mpl.colormaps["viridis"](_LATE), ms=4, label="one interval, late", **common),
+        Line2D(
+            [],
+            [],
+            color="white",
+            mec=_WHOLE,
+            marker="D",
+            ms=7,
+            mew=1.4,
+            ls="",
+            label="first map to last, by geometry (amount)",
+        ),
+        Line2D([], [], color="none", mec=_WHOLE, ms=5, mew=1.4, label="the same, by number", **common),
+        Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="by id"),
+    ]
+    figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=6, frameon=False)
+    note = (
+        "What appears may be mapping that catches up. Rates beyond the scale lie on its edges. "
+        "Amount: ground or length; number and id: things."
+    )
+    figure.text(0.015, 0.33 / height, note, fontsize=8.5, color="#444444", va="top")
+    figure.text(0.985, 0.33 / height, ATTRIBUTION, fontsize=8.5, va="top", ha="right")

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that list what there is."""
+
+from collections.abc import Mapping
+
+from rich.table import Table
+
+from sasgeo_bench.cli.console import RegionFolders, print_table
+from sasgeo_bench.matching.plugins import MATCHERS, ORACLE, REJECTORS, list_entry_points
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+
+
+def list_regions_command(regions: RegionFolders = None) -> None:
+    """List the regions that come with the package, and your own."""
+    table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
+    for name, path in sorted(list_region_files(folders=regions or ()).items()):
+        spec = read_region_file(path)
+        grid = spec.grid()
+        area_km2 = grid.rows * grid.cols * grid.cell_size_m**2 / 1e6
+        dates = [extract.date.isoformat() for extract in spec.extract]
+        shown = dates[0] if len(dates) == 1 else f"{dates[0]} .. {dates[-1]} ({len(dates)})"
+        table.add_row(name, spec.title, f"{area_km2:.1f}", f"{grid.cell_size_m:g} m", shown, ", ".join(spec.scenes))
+    print_table(table)
+
+
+def list_suites_command() -> None:
+    """List the suites: what each does and what it separates."""
+    table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
+    for name, suite in EVERY_SUITE.items():
+        card = suite.card
+        per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
+        table.add_row(name, card.title, ", ".join(card.tracks), str(per_site), card.separates)
+    print_table(table)
+
+
+def list_matchers_command() -> None:
+    """List the matchers that are installed, and where each comes from."""
+    _list("matcher", MATCHERS, {ORACLE: ("sasgeo-bench", "a control, given the truth")})
+
+
+def list_rejectors_command() -> None:
+    """List the rejectors that are installed, and where each comes from."""
+    _list("rejector", REJECTORS, {})
+
+
+def _list(kind: str, group: str, own: Mapping[str, tuple[str, str]]) -> None:
+    """Print the entry points of a group, and what needs none."""
+    rows = {
+        name: (point.dist.name if point.dist is not None else "", point.value)
+        for name, point in list_entry_points(group).items()
+    }
+    table = Table(kind, "package", "class", box=None, pad_edge=False)
+    for name, told in sorted((rows | dict(own)).items()):
+        table.add_row(name, *told)
+    print_table(table)

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""TOML text into a frozen pydantic model, with every fault told in one line."""
+
+import difflib
+import json
+import tomllib
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from sasgeo_bench.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_SHORT: Final = 60  # characters
+_LONGEST: Final = 300
+
+
+def _printable(text: str) -> str:
+    """Refuse what could not be shown as one line of text: breaks, controls, marks that turn the writing round."""
+    if not text.isprintable():
+        message = "must be one line of printable characters"
+        raise ValueError(message)
+    return text
+
+
+def _said(text: str) -> str:
+    if not text.strip():
+        message = "must be one line of printable characters"
+        raise ValueError(message)
+    return text
+
+
+Prose = Annotated[str, Field(max_length=2000), AfterValidator(_printable)]  # which may be empty
+Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable), AfterValidator(_said)]
+Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_printable), AfterValidator(_said)]
+
+
+Kind = Literal["regions", "splits", "pipelines"]
+
+
+class Document(BaseModel):
+    """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion.
+
+    Examples
+    --------
+    >>> class Town(Document):
+    ...     seed: int
+    >>> parse_toml("seed = 3", Town, source="town.toml")
+    Town(seed=3)
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class NamedDocument(Document):
+    """Base of what ships as files that are named by their id."""
+
+    id: str
+
+
+def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
+    """Parse and validate one TOML document.
+
+    Parameters
+    ----------
+    text : str
+        The TOML text.
+    model : type
+        A `Document`.
+    source : str
+        What to call the file in an error.
+
+    Returns
+    -------
+    Model
+        The validated document.
+
+    Raises
+    ------
+    ConfigError
+        If the text is no TOML, a key is unknown, a type is wrong or a value out of range; all faults on one line.
+
+    Examples
+    --------
+    >>> class Town(Document):
+    ...     seed: int
+    >>> parse_toml("sead = 3", Town, source="town.toml")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: town.toml: unknown key 'sead', did you mean 'seed'?; 'seed' is missing
+    """
+    try:
+        content = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # too many digits or brackets are no error of TOML's own
+        message = f"{source}: not valid TOML: {error}"
+        raise ConfigError(message) from error
+    return check_document(content, model, source=source)
+
+
+def check_document(content: object, model: type[Model], *, source: str) -> Model:
+    """Hold what a file says, whatever its format, to a model.
+
+    Raises
+    ------
+    ConfigError
+        As `parse_toml` does; all faults on one line.
+
+    Examples
+    --------
+    >>> class Town(Document):
+    ...     seed: int
+    >>> check_document({"seed": 3}, Town, source="town.json")
+    Town(seed=3)
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        faults = sorted((_fault(item, model) for item in error.errors()), key=lambda fault: "is missing" in fault)
+        message = f"{source}: " + "; ".join(dict.fromkeys(faults))
+        raise ConfigError(message) from error
+
+
+def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic's own error record
+    """One pydantic error as a clause; unknown keys get the nearest known one."""
+    where = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        known = _keys_beside(item["loc"], model)
+        near = difflib.get_close_matches(str(item["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+        return f"unknown key {where!r}, {hint}"
+    if item["type"] == "missing":
+        return f"{where!r} is missing"
+    if item["type"] == "list_type" and not isinstance(item["input"], dict):
+        return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
+    text = str(item["msg"]).removeprefix("Value error, ")
+    return f"{where!r}: {text}, got {_short(item['input'])}" if where and "got " not in text else text
+
+
+def _short(value: object) -> str:
+    """A value as it is quoted: a table or text may be as long as the file."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
+    """The keys a model knows at the level where an unknown key was met."""
+    current: Any = model
+    for part in location[:-1]:
+        if isinstance(part, int):
+            continue
+        field = current.model_fields.get(part) or next(
+            (known for known in current.model_fields.values() if known.alias == part), None
+        )
+        if field is None:
+            return []
+        current = _model_inside(field.annotation)
+        if current is None:
+            return []
+    return [field.alias or name for name, field in current.model_fields.items()]
+
+
+def _model_inside(annotation: Any) -> type[BaseModel] | None:  # noqa: ANN401 - any type annotation
+    """The model within `list[M]`, `M | None` or `M` itself."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    inner = (_model_inside(part) for part in getattr(annotation, "__args__", ()))
+    return next((part for part in inner if part is not None), None)
+
+
+def shipped_dir(kind: Kind) -> Path:
+    """Folder of the shipped files: inside an installed package, at the top of a checkout otherwise.
+
+    Examples
+    --------
+    >>> shipped_dir("regions").name
+    'regions'
+    """
+    package = Path(__file__).parent
+    installed = package / "shipped" / kind
+    return installed if installed.is_dir() else package.parent / kind
+
+
+def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
+    """Read a file of a kind that ships.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read or a value in it is wrong; all faults on one line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark of its byte order
+    except (OSError, UnicodeDecodeError) as error:
+        noun = kind.removesuffix("s")
+        message = f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"
+        raise ConfigError(message) from error
+    parsed: Model = _parsed(text, model, str(path))
+    return parsed
+
+
+@lru_cache(maxsize=512)  # every lookup of an id reads all files of its kind
+def _parsed(text: str, model: type[Model], source: str) -> Model:
+    return parse_toml(text, model, source=source)
+
+
+def list_documents(kind: Kind, model: type[NamedDocument], folders: Sequence[Path]) -> dict[str, Path]:
+    """Id -> file of a kind, of the given folders and those shipped.
+
+    Raises
+    ------
+    ConfigError
+        If a folder is missing, a file is wrong, or two files have one id.
+    """
+    noun = kind.removesuffix("s")
+    found: dict[str, Path] = {}
+    for folder in (*folders, shipped_dir(kind)):
+        if not folder.is_dir():
+            message = f"there is no folder {folder} with {noun} files"
+            raise ConfigError(message)
+        for path in sorted(folder.glob("*.toml")):
+            identifier = read_document(path, model, kind).id
+            if identifier in found and not found[identifier].samefile(path):
+                message = f"two {noun} files have the id {identifier!r}: {found[identifier]} and {path}; rename one"
+                raise ConfigError(message)
+            found.setdefault(identifier, path)
+    return found
+
+
+def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[], dict[str, Path]]) -> Path:
+    """Find a file by its id, or take the path of one.
+
+    Raises
+    ------
+    ConfigError
+        If there is none; the line suggests the nearest id.
+    """
+    if id_or_path.endswith(".toml"):
+        path = Path(id_or_path)
+        if not path.is_file():
+            message = f"there is no {noun} file {id_or_path}"
+            raise ConfigError(message)
+        return path
+    known = list_known()
+    if id_or_path not in known:
+        near = difflib.get_close_matches(id_or_path, known, n=1, cutoff=0.6)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        message = f"there is no {noun} {id_or_path!r}{hint} ({mend})"
+        raise ConfigError(message)
+    return known[id_or_path]

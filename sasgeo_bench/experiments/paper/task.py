@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The experiment as a region and a task on disk: the order of the steps."""
+
+import datetime as dt
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyproj
+import shapely
+
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.experiments.paper.tiles import CELL_M, EPSG, TILES, make_tiles, mosaic_grid, tile_boxes
+from sasgeo_bench.experiments.paper.trials import (
+    Transformation,
+    View,
+    draw_crops,
+    draw_transformation,
+    draw_view,
+    true_pose,
+)
+from sasgeo_bench.experiments.paper.windows import MARGIN_M, WINDOW_CELLS, WINDOW_M, Windows
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE
+from sasgeo_bench.osm.locate import Extract
+from sasgeo_bench.osm.read import Reading
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.build import build_made
+from sasgeo_bench.regions.evidence import PRESENT
+from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION, Region
+from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import check_task, has_truths, put_task
+from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_said
+from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup, Query, Truth
+from sasgeo_bench.tasks.sampling import make_prior
+from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, Seeds, State, changed_share
+from sasgeo_bench.tasks.suites.mining import Windows as MinedWindows
+from sasgeo_bench.tasks.suites.mining import describe, mine
+from sasgeo_bench.tasks.task_plan import check_roots
+
+SUITE: Final = PAPER_SUITE
+VERSION: Final = 1
+TRIALS: Final = 220
+GROUP: Final = PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15)
+DATE: Final = dt.date(2026, 1, 1)
+STRENGTH_UNIT: Final = "map-change probability"
+DATA: Final = "procedural regions, no OSM data in them"  # what pictures and tables say of where they come from
+
+
+def make_paper_task(
+    *, seed: int, out: Path, trials: int = TRIALS, private: PrivateSeed | None = None, tell: Tell
+) -> Path:
+    """Make the paper's 30 regions and draw its retrieval trials on them.
+
+    Parameters
+    ----------
+    seed : int
+        Of regions and trials; the paper's is 42.
+    out : Path
+        Root: the region goes to `out/regions/paper-poc-<seed>`, the task to `out/tasks/paper-poc/paper-poc-<seed>`.
+    trials : int
+        How many; the first of a longer request are those of a shorter one.
+    private : PrivateSeed, optional
+        Root of all chance instead; the public seed is then a name.
+    tell : callable
+        Gets one line for every step.
+
+    Returns
+    -------
+    Path
+        Folder of the task.
+
+    Raises
+    ------
+    ConfigError
+        If the seed is negative, there are no trials, or truths would lie where the queries are.
+    StoreError
+        If a folder cannot be written, or holds something that is not ours.
+    """
+    if seed < 0:
+        message = f"the seed names the region and must be 0 or more, got {seed}"
+        raise ConfigError(message)
+    if trials < 1:
+        message = f"there must be at least one trial, got {trials}"
+        raise ConfigError(message)
+    check_roots(out)
+    seeds = Seeds(root=seed, names=(SUITE, str(VERSION)))
+    if private is not None:
+        seeds = Seeds(root=private, names=(SUITE, str(VERSION), str(seed)))
+    tell(f"{region_name(seed)}: drawing {TILES} tiles")
+    folder = build_made(_spec(seed), _generated(seed, seeds), out=out, tell=tell)
+    drawer = PaperDrawer.of(region_files.read_region(folder), seeds)
+    pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
+    hidden = {**seed_said(private or seed), "request_sha256": _request_sha256(seed, trials, private)}
+    made = put_task(pairs, _about(drawer.region), hidden, out=out, tell=tell)
+    tell(f"{SUITE} on {region_name(seed)}: {made.queries} trials in {made.folder}")
+    return made.folder
+
+
+def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS, private: PrivateSeed | None = None) -> Path | None:
+    """Task folder of these trials, or None if they have to be drawn; nothing is drawn to find out.
+
+    Task, truths and region are as they were written, and nothing that decides what they hold has changed since.
+
+    Examples
+    --------
+    >>> made_paper_task(seed=42, out=Path("nowhere")) is None
+    True
+    """
+    folder = out / "tasks" / SUITE / region_name(seed)
+    said = task_files.read_hidden(out / "truth" / SUITE / region_name(seed))
+    if said.get("request_sha256") != _request_sha256(seed, trials, private):
+        return None
+    try:
+        faults = [*check_task(folder, out=out), *region_files.differing_files(out / "regions" / region_name(seed))]
+        return folder if not faults and has_truths(folder, out=out) else None
+    except StoreError:
+        return None
+
+
+def _request_sha256(seed: int, trials: int, private: PrivateSeed | None) -> str:
+    """Hash of all that decides which trials come of a seed; the recipe itself is in it by its version."""
+    said = {
+        "suite": [SUITE, VERSION, TASK_VERSION],
+        "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().model_dump(mode="json")],
+        "seed": seed,
+        "trials": trials,
+        "made_by": version("sasgeo-bench"),
+    }
+    if private is not None:
+        said["private_seed"] = private.commitment
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def region_name(seed: int) -> str:
+    """Name of the region of a seed.
+
+    Examples
+    --------
+    >>> region_name(42)
+    'paper-poc-42'
+    """
+    return f"{SUITE}-{seed}"
+
+
+def _spec(seed: int) -> RegionFile:
+    """Where the mosaic lies, as a region file would say it."""
+    grid = mosaic_grid()
+    west_m, south_m, east_m, north_m = grid.bounds_m
+    to_lonlat = pyproj.Transformer.from_crs(EPSG, 4326, always_xy=True)
+    center_lonlat = to_lonlat.transform((west_m + east_m) / 2, (south_m + north_m) / 2)
+    generated = Extract(file=f"{region_name(seed)}.generated", date=DATE, sha256=("0" * 64,))
+    return RegionFile(
+        id=region_name(seed),
+        title=f"Procedural regions of the SASGeo paper's experiment, seed {seed}",
+        scenes=["suburban", "agricultural"],
+        center_lonlat=center_lonlat,
+        size_m=(east_m - west_m, north_m - south_m),
+        cell_size_m=CELL_M,
+        epsg=EPSG,
+        extract=[generated],
+    )
+
+
+def _generated(seed: int, seeds: Seeds) -> Reading:
+    """The tiles in the place of what is read from an extract."""
+    return Reading(
+        features=make_tiles(seeds),
+        coverage=shapely.multipolygons(tile_boxes()),
+        coverage_source="region file",
+        osm_timestamp=None,
+        drops={},
+        hidden={},
+        notes={},
+        warnings=(f"procedural, seed {seed}: generated by sasgeo_bench.paper from no extract; no OSM data are in it",),
+    )
+
+
+def _about(region: Region) -> dict[str, Any]:
+    """What `task.json` says of how the queries came to be; nothing of where they lie."""
+    return {
+        "suite": SUITE,
+        "suite_version": VERSION,
+        "title": "The paper's synthetic proof of concept",
+        "what": "turned, magnified, cropped, occluded and changed views of procedural regions; ten candidates",
+        "separates": "global description from spatial alignment",
+        "falsifier": "none",
+        "strength_unit": STRENGTH_UNIT,
+        "region": region.manifest.id,
+        "map_date": region.manifest.extract.date.isoformat(),
+        **task_files.map_of(region.manifest),
+        "sites": TILES,
+        "views_cells": [WINDOW_CELLS],
+        "epsg": region.manifest.epsg,
+        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperDrawer:
+    """Draws the trials of one region."""
+
+    region: Region
+    seeds: Seeds
+    state: State
+    windows: Windows
+    mined: MinedWindows
+
+    @classmethod
+    def of(cls, region: Region, seeds: Seeds) -> "PaperDrawer":
+        """Describe the region's candidate crops."""
+        state = State.of(region)
+        return cls(
+            region=region,
+            seeds=seeds,
+            state=state,
+            windows=Windows.of(region),
+            mined=describe(state, side_m=WINDOW_M, clear_m=MARGIN_M - 2),
+        )
+
+    def draw(self, index: int) -> tuple[Query, Truth]:
+        """Draw one trial; it depends on its number and the seed alone."""
+        seeds = self.seeds.under("trial", index)
+        crops = draw_crops(self.windows, seeds.rng("crops"))
+        done = draw_transformation(seeds.rng("transformation"))
+        points_m = self.windows.points_m[crops.windows]
+        center_m = (float(points_m[crops.true, 0]), float(points_m[crops.true, 1]))
+        view = draw_view(self.state, center_m, done, seeds)
+        pose = true_pose(center_m, done)
+        query = Query(
+            query_id=seeds.digest("query").hex()[:24],
+            track="retrieval",
+            suite=SUITE,
+            suite_version=VERSION,
+            part="test",
+            region=self.region.manifest.id,
+            evidence=view.evidence,
+            observed_on=self.state.date,
+            season="",
+            prior=make_prior(pose, GROUP, rng=seeds.rng("prior")),
+            prior_group=GROUP.name,
+            candidates=tuple(
+                Pose(easting_m=float(east_m), northing_m=float(north_m), yaw_deg=0.0) for east_m, north_m in points_m
+            ),
+        )
+        truth = Truth(
+            query_id=query.query_id,
+            is_present=True,
+            pose=pose,
+            candidate=crops.true,
+            pair_id=seeds.digest("pair").hex()[:16],
+            role="stress",
+            kind="trial",
+            strength=done.change_probability,
+            strength_unit=STRENGTH_UNIT,
+            unknown_share=view.evidence.unknown_share,
+            changed_share=changed_share(view.mapped, view.evidence),
+            feature_density=_density(view),
+            alias_index=mine(self.mined, center_m, count=1).alias_index,
+            block=f"{self.region.manifest.id}/{self.windows.tile[crops.windows[crops.true]]}",
+            scene=",".join(self.region.manifest.scenes),
+            measured=_measured(done, view),
+        )
+        return query, truth
+
+
+def _density(view: View) -> float:
+    """Share of the place's map with a road, building or hedge."""
+    drawn = [view.mapped.layer(name) == PRESENT for name in view.mapped.classes if name in DRAWN_CLASSES]
+    return float(np.any(drawn, axis=0).mean())
+
+
+def _measured(done: Transformation, view: View) -> dict[str, float]:
+    """What was done and what came of it."""
+    return {
+        "rotation_deg": done.rotation_deg,
+        "scale": done.scale,
+        "crop_fraction": done.crop_fraction,
+        "retained_share": view.retained_share,
+        "occlusion_share": view.occlusion_share,
+        "change_probability": done.change_probability,
+        "changed_share": changed_share(view.mapped, view.world),
+        "unknown_share": view.evidence.unknown_share,
+    }

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`paper.md`: our figures beside the paper's Table II in words, a sentence on each difference."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.experiments.paper.tables import METRICS, PUBLISHED, used_interval
+from sasgeo_bench.leaderboard.text import markdown_table
+from sasgeo_bench.scoring.contrasts import Finding
+
+_LEAST_P: Final = 0.001
+
+
+def paper_markdown(
+    summary: pd.DataFrame, findings: Sequence[Finding], about: Mapping[str, str], figures: Mapping[str, str]
+) -> str:
+    """The summary as a document.
+
+    Parameters
+    ----------
+    summary : pandas.DataFrame
+        From `summary_frame`.
+    findings : sequence of Finding
+        Contrasts of this suite.
+    about : mapping
+        "trials" in words, "made_by" and "data".
+    figures : mapping of str to str
+        File -> caption.
+    """
+    known = [item.matcher for item in PUBLISHED if item.matcher in set(summary["matcher"])]
+    others = [name for name in dict.fromkeys(summary["matcher"]) if name not in known]
+    source = f"{about['trials']}. Made by {about['made_by']}. Data: {about['data']}."
+    lines = ["# The paper's experiment", "", source, "", _interval_note(summary), ""]
+    if known:
+        lines += ["## Beside the paper's Table II", "", *markdown_table(_beside(summary, known)), ""]
+        lines += ["## Each difference", "", *(f"- {line}" for line in difference_lines(summary)), ""]
+    steps = _steps(findings)
+    if len(steps):
+        lines += ["## From variant to variant", "", *markdown_table(steps), ""]
+    if others:
+        lines += ["## Controls and other matchers", "", *markdown_table(_beside(summary, others)), ""]
+    lines += ["## Figures", "", *(f"- [{caption}](figures/{name})" for name, caption in figures.items()), ""]
+    return "\n".join(lines)
+
+
+def _interval_note(summary: pd.DataFrame) -> str:
+    """What the intervals are, and what they do not say."""
+    first = summary.iloc[0]
+    if first["cluster"] == "tile":
+        return (
+            "Intervals are 95 %: Wilson's, which take trials for independent, as the paper's do. They are not: those "
+            f"of one seed share its tiles. `by tiles` resamples the {first['clusters']} tiles, then trials within "
+            "each, and is never narrower. One seed says nothing of others."
+        )
+    return (
+        f"Intervals are 95 %: {first['clusters']} seeds are resampled, then trials within each, and no interval is "
+        "narrower than Wilson's. `Wilson` takes trials for independent; they are not, for those of one seed share its "
+        "tiles."
+    )
+
+
+def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
+    """A matcher a line: each figure of the paper's and ours; of Recall@1 the other interval too."""
+    rows = []
+    for matcher in matchers:
+        mine = _by_metric(summary, matcher)
+        row = {"method": mine["recall_1"]["title"]}
+        for metric, title in METRICS.items():
+            one = mine[metric]
+            if not math.isnan(one["paper"]):
+                row[f"{title}, paper"] = shown(one["paper"], one["paper_lo"], one["paper_hi"])
+            row[f"{title}, ours"] = shown(one["value"], *used_interval(one))
+            if metric == "recall_1":
+                is_tile = one["cluster"] == "tile"
+                other = (one["cluster_lo"], one["cluster_hi"]) if is_tile else (one["lo"], one["hi"])
+                row["by tiles" if is_tile else "Wilson"] = shown(one["value"], *other).partition(" ")[2] or "-"
+        rows.append(row | {"n": str(mine["recall_1"]["n"])})
+    return pd.DataFrame(rows).fillna("-")
+
+
+def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]:
+    """Rows of one matcher."""
+    rows = summary[summary["matcher"] == matcher].to_dict("records")
+    return {str(row["metric"]): {str(name): value for name, value in row.items()} for row in rows}
+
+
+def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
+    """A figure as the paper prints it.
+
+    Examples
+    --------
+    >>> shown(0.586, 0.52, 0.649), shown(1.0)
+    ('0.586 [0.520, 0.649]', '1.000')
+    """
+    if math.isnan(value):
+        return "-"
+    return f"{value:.3f}" if math.isnan(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
+
+
+def difference_lines(summary: pd.DataFrame) -> Iterator[str]:
+    """A line for each of the paper's variants: how far each figure is from the paper's, and where that lies."""
+    for item in PUBLISHED:
+        mine = _by_metric(summary, item.matcher)
+        if mine:
+            told = [f"{title} {_difference(mine[metric])}" for metric, title in METRICS.items()]
+            yield f"**{item.title}**: {'; '.join(told)}."
+
+
+def _difference(row: Mapping[str, Any]) -> str:
+    ours, paper = shown(row["value"]), shown(row["paper"])
+    if ours == paper:
+        return f"{ours}, as in the paper"
+    apart = float(ours) - float(paper)  # of the figures as they are printed
+    said = f"{ours} is {abs(apart):.3f} {'above' if apart > 0 else 'below'} the paper's {paper}, which lies "
+    if row["is_within"]:
+        return f"{said}inside our interval"
+    if math.isnan(row["paper_lo"]):
+        return f"{said}outside our interval"
+    lo, hi = used_interval(row)
+    meet = lo <= row["paper_hi"] and row["paper_lo"] <= hi
+    return f"{said}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
+
+
+def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
+    """Consecutive variants: the paper's difference in Recall@1 and ours, paired."""
+    rows = []
+    for before, after in pairwise(PUBLISHED):
+        one = next((item for item in findings if (item.first, item.second) == (after.matcher, before.matcher)), None)
+        if one is not None:
+            rows.append(
+                {
+                    "step": f"{before.title} -> {after.title}",
+                    "paper": f"{after.recall_1 - before.recall_1:+.3f}",
+                    "ours, paired": f"{one.difference:+.3f}"
+                    + ("" if math.isnan(one.lo) else f" [{one.lo:+.3f}, {one.hi:+.3f}]"),
+                    "won and lost": f"{one.first_only} and {one.second_only} of {one.n}",
+                    "p (Holm)": "< 0.001" if one.p_holm < _LEAST_P else f"{one.p_holm:.3f}",
+                    "verdict": one.verdict,
+                }
+            )
+    return pd.DataFrame(rows)

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The procedural regions: 30 tiles at the edge of a village, all by one recipe, side by side with gaps between them."""
+
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import affinity
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.features import make_features
+from sasgeo_bench.osm.synthetic.sketch import Line, Sketch, Way, curve, house, join_streets, wobble
+from sasgeo_bench.osm.taxonomy import classify, load_taxonomy
+from sasgeo_bench.tasks.suites.base import Seeds
+
+CLASSES: Final = ("road_major", "building", "water", "road_minor", "field_boundary")
+TILES: Final = 30
+TILE_M: Final = 256.0
+CELL_M: Final = 1.0
+GAP_M: Final = 64.0  # unmapped, between tiles and around them
+ACROSS: Final = 6  # tiles from west to east
+EPSG: Final = 32631
+CORNER_M: Final = (500_000.0, 102_000.0)  # west and north of the mosaic, in the Gulf of Guinea: it must lie somewhere
+
+_DOWN: Final = TILES // ACROSS
+_HALF_M: Final = TILE_M / 2
+_BEYOND: Final = 1.5 * _HALF_M  # lines are drawn so far from the middle, so that they cross the tile at any heading
+_SHORTEST_M: Final = 8.0  # of a piece of street or hedge
+_DECIMALS: Final = 3  # as in `extract.read`
+
+Point = tuple[float, float]
+
+
+def mosaic_grid() -> Grid:
+    """The lattice that holds all tiles.
+
+    Examples
+    --------
+    >>> mosaic_grid().shape
+    (1664, 1984)
+    """
+    rows, cols = (round((count * (TILE_M + GAP_M) + GAP_M) / CELL_M) for count in (_DOWN, ACROSS))
+    return Grid(epsg=EPSG, west_m=CORNER_M[0], north_m=CORNER_M[1], cell_size_m=CELL_M, rows=rows, cols=cols)
+
+
+def tile_centre_m(tile: int) -> Point:
+    """Easting and northing of the middle of a tile; they are counted from the north-west, row by row.
+
+    Examples
+    --------
+    >>> tile_centre_m(0), tile_centre_m(1)
+    ((500192.0, 101808.0), (500512.0, 101808.0))
+    """
+    down, right = divmod(tile, ACROSS)
+    first_m = GAP_M + _HALF_M
+    return CORNER_M[0] + first_m + right * (TILE_M + GAP_M), CORNER_M[1] - first_m - down * (TILE_M + GAP_M)
+
+
+def tile_boxes() -> NDArray[np.object_]:
+    """Outlines of all tiles: what is mapped."""
+    centres = np.array([tile_centre_m(tile) for tile in range(TILES)])
+    return np.asarray(shapely.box(*(centres - _HALF_M).T, *(centres + _HALF_M).T))
+
+
+def make_tiles(seeds: Seeds) -> gpd.GeoDataFrame:
+    """Draw all tiles.
+
+    Parameters
+    ----------
+    seeds : Seeds
+        Each tile has a stream of its own.
+
+    Returns
+    -------
+    geopandas.GeoDataFrame
+        A feature table with `CLASSES` alone; no feature leaves its tile.
+
+    Examples
+    --------
+    >>> sorted(set(make_tiles(Seeds(root=1, names=("doc",)))["class"])) == sorted(CLASSES)
+    True
+    """
+    taxonomy = load_taxonomy()
+    rows: list[tuple[str, float, shapely.Geometry]] = []
+    for tile in range(TILES):
+        centre_m = tile_centre_m(tile)
+        for way in draw_tile(seeds.rng("tile", tile)):
+            labels = classify(way.tags, taxonomy)
+            label = (labels.line or labels.area)[0]
+            shape = shapely.linestrings(way.line) if labels.line else shapely.polygons(way.line)
+            width_m = float("nan") if label.width_m is None else label.width_m
+            rows.append((label.class_name, width_m, _moved(shape, centre_m)))
+    rows.sort(key=lambda row: taxonomy.names.index(row[0]))  # stable: within a class by tile, then as drawn
+    count = len(rows)
+    return make_features(
+        {
+            "osm_type": ["way"] * count,
+            "osm_id": np.arange(1, count + 1),
+            "version": np.ones(count, dtype=np.int32),
+            "timestamp": np.full(count, "NaT", dtype="datetime64[ms]"),
+            "class": [name for name, _, _ in rows],
+            "level": np.zeros(count, dtype=np.int16),
+            "is_bridge": np.zeros(count, dtype=bool),
+            "is_tunnel": np.zeros(count, dtype=bool),
+            "is_visible": np.ones(count, dtype=bool),
+            "width_m": np.array([width_m for _, width_m, _ in rows], dtype=np.float32),
+            "geometry": np.array([shape for _, _, shape in rows], dtype=object),
+        },
+        epsg=EPSG,
+    )
+
+
+def _moved(shape: shapely.Geometry, centre_m: Point) -> shapely.Geometry:
+    return shapely.transform(shape, lambda at: (at + centre_m).round(_DECIMALS) + 0.0)
+
+
+def draw_tile(rng: np.random.Generator) -> list[Way]:
+    """Draw one tile around (0, 0): a main road, a river or ponds, streets with houses on one part, fields on the rest.
+
+    Examples
+    --------
+    >>> len(draw_tile(np.random.default_rng(1))) > 50
+    True
+    """
+    sketch = Sketch(half_m=_HALF_M, rng=rng)
+    heading = float(rng.uniform(0, np.pi))
+    main = _main_roads(sketch, heading)
+    wet = _water(sketch, heading, main)
+    village = shapely.Point(*rng.uniform(-60, 60, 2)).buffer(float(rng.uniform(75, 115)))
+    streets = _streets(sketch, heading, village, wet)
+    for line in (*main, *streets):
+        _houses(sketch, line, village)
+    _barns(sketch, village)
+    _hedges(sketch, heading + float(rng.uniform(-0.3, 0.3)), village, wet)
+    return join_streets(sketch.ways)
+
+
+def _turned(points: list[Point] | Line, heading: float) -> Line:
+    """Points (across, along) of a heading, clockwise from north in radians -> points (east, north)."""
+    across, along = np.asarray(points, dtype=np.float64).T
+    sin, cos = np.sin(heading), np.cos(heading)
+    return np.column_stack((across * cos + along * sin, along * cos - across * sin))
+
+
+def _crossing(sketch: Sketch, heading: float, offset_m: float, sway_m: float) -> Line:
+    """A bent line from edge to edge of the tile."""
+    across = offset_m + sketch.rng.uniform(-sway_m, sway_m, 4)
+    along = np.linspace(-_BEYOND, _BEYOND, 4)
+    return curve(_turned(np.column_stack((across, along)), heading).tolist())
+
+
+def _inside(sketch: Sketch, line: Line) -> list[Line]:
+    """Parts of a line within the tile."""
+    return _pieces(shapely.intersection(shapely.linestrings(line), sketch.square))
+
+
+def _pieces(shape: shapely.Geometry) -> list[Line]:
+    """The longer lines of a geometry."""
+    parts = shapely.get_parts(shapely.line_merge(shape) if shape.geom_type == "MultiLineString" else shape)
+    return [
+        shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString" and part.length >= _SHORTEST_M
+    ]
+
+
+def _main_roads(sketch: Sketch, heading: float) -> list[Line]:
+    """A main road through the middle part; in one tile of three another one across it."""
+    rng = sketch.rng
+    lines = [_crossing(sketch, heading, float(rng.uniform(-45, 45)), 14.0)]
+    if rng.random() < 1 / 3:
+        lines.append(_crossing(sketch, heading + float(rng.uniform(1.1, 2.0)), float(rng.uniform(-70, 70)), 10.0))
+    found = [part for line in lines for part in _inside(sketch, line)]
+    for part in found:
+        sketch.street(part, highway="secondary")
+    return found
+
+
+def _water(sketch: Sketch, heading: float, main: list[Line]) -> shapely.Geometry:
+    """A river along the valley or, in every other tile, some ponds; nothing is built there."""
+    rng = sketch.rng
+    shapes: list[shapely.Geometry] = []
+    ponds = int(rng.integers(0, 2))
+    if rng.random() < 0.5:  # noqa: PLR2004 - one tile of two
+        side = float(rng.choice((-1.0, 1.0)))
+        line = _crossing(sketch, heading + float(rng.uniform(-0.4, 0.4)), side * float(rng.uniform(30, 85)), 22.0)
+        shapes.append(shapely.buffer(shapely.linestrings(line), float(rng.uniform(5, 9))))
+    else:
+        ponds += 2
+    roads = shapely.union_all([shapely.linestrings(line) for line in main])
+    for _ in range(ponds):
+        spot = shapely.Point(*rng.uniform(-105, 105, 2)).buffer(float(rng.uniform(8, 16)), quad_segs=5)
+        pond = affinity.rotate(affinity.scale(spot, 1.0, float(rng.uniform(0.5, 1.0))), float(rng.uniform(0, 180)))
+        if shapely.distance(pond, roads) > 6:  # noqa: PLR2004 - metres
+            shapes.append(pond)
+    # Each by itself: a union may have a hole, and what has one is no way.
+    for part in shapely.get_parts(shapely.intersection(np.array(shapes, dtype=object), sketch.square)):
+        sketch.ground(part, is_free=False, natural="water")
+    wet = shapely.union_all(shapes) if shapes else shapely.Polygon()
+    if not wet.is_empty:
+        sketch.keep_free(wet.buffer(3))
+    return wet
+
+
+def _streets(sketch: Sketch, heading: float, village: shapely.Geometry, wet: shapely.Geometry) -> list[Line]:
+    """A loose net of streets in the village, some pieces missing, and a lane or two out into the fields."""
+    rng = sketch.rng
+    net_heading = heading + float(rng.uniform(-0.15, 0.15))
+    ground = shapely.difference(shapely.intersection(village, sketch.square), wet.buffer(6))
+    found: list[Line] = []
+    for turn, least_m, most_m in ((0.0, 46.0, 62.0), (np.pi / 2, 62.0, 90.0)):
+        for offset_m in _offsets(rng, least_m, most_m):
+            line = wobble(_crossing(sketch, net_heading + turn, offset_m, 3.0), 1.0, rng)
+            for part in _pieces(shapely.intersection(shapely.linestrings(line), ground)):
+                if rng.random() < 0.85:  # noqa: PLR2004 - of the streets are there
+                    found.append(part)  # noqa: PERF401 - each draws its chance
+    centre = shapely.get_coordinates(village.centroid)[0]
+    for number in rng.permutation(len(found))[: int(rng.integers(1, 3))]:
+        start = max(found[number][[0, -1]], key=lambda end: float(np.hypot(*(end - centre))))
+        ahead = (start - centre) / max(float(np.hypot(*(start - centre))), 1.0)
+        bend = float(rng.uniform(-0.3, 0.3)) * np.array((ahead[1], -ahead[0]))
+        lane = shapely.linestrings(curve([start, start + 60 * (ahead + bend), start + 220 * ahead]))
+        found += _pieces(shapely.intersection(shapely.difference(lane, wet.buffer(6)), sketch.square))[:1]
+    for part in found:
+        sketch.street(part, highway="residential")
+    return found
+
+
+def _offsets(rng: np.random.Generator, least_m: float, most_m: float) -> list[float]:
+    """Places of parallel lines, from one side of the tile to the other."""
+    offsets = -_BEYOND + np.cumsum(rng.uniform(least_m, most_m, 2 * round(_BEYOND / least_m)))
+    return [float(offset) for offset in offsets if offset < _BEYOND]
+
+
+def _houses(sketch: Sketch, line: Line, village: shapely.Geometry) -> None:
+    """Houses on both sides of a road where it runs through the village."""
+    for part in _pieces(shapely.intersection(shapely.linestrings(line), village)):
+        sketch.houses_along(part, spacing_m=16.0, setback_m=7.5, size_m=(11.0, 9.0), chance=0.8)
+
+
+def _barns(sketch: Sketch, village: shapely.Geometry) -> None:
+    """Some larger buildings in and around the village."""
+    rng = sketch.rng
+    centre = shapely.get_coordinates(village.centroid)[0]
+    for _ in range(int(rng.integers(4, 9))):
+        spot = centre + rng.uniform(-120, 120, 2)
+        long_m, short_m, turn = (float(rng.uniform(*span)) for span in ((16, 34), (12, 18), (0, np.pi)))
+        shape = house((float(spot[0]), float(spot[1])), long_m, short_m, turn, rng)
+        sketch.build(shape, building="barn")
+
+
+def _hedges(sketch: Sketch, heading: float, village: shapely.Geometry, wet: shapely.Geometry) -> None:
+    """Parcels of fields outside of the village, their borders broken by roads, water and houses, some grubbed up."""
+    rng = sketch.rng
+    taken = shapely.union_all([village.buffer(-12), wet.buffer(2), *sketch.taken])
+    for turn, least_m, most_m in ((0.0, 30.0, 52.0), (np.pi / 2, 55.0, 95.0)):
+        for offset_m in _offsets(rng, least_m, most_m):
+            line = _crossing(sketch, heading + turn, offset_m, 5.0)
+            free = shapely.difference(shapely.intersection(shapely.linestrings(line), sketch.square), taken)
+            for part in _pieces(free):
+                if rng.random() < 0.85:  # noqa: PLR2004 - of the borders are hedged
+                    sketch.line(part, barrier="hedge")

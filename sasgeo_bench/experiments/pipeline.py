@@ -1,0 +1,505 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pipeline file -> queries, runs and a board; what is up to date is not done again."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
+from sasgeo_bench.experiments.paper.board import paper_extra
+from sasgeo_bench.experiments.paper.task import region_name
+from sasgeo_bench.leaderboard.board_figures import figures_extra
+from sasgeo_bench.leaderboard.board_pictures import pictures_extra
+from sasgeo_bench.leaderboard.build import Board, ScoreRequest, make_board
+from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, PipelineFile
+from sasgeo_bench.matching.plugins import check_names
+from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.publishing.archive import pack_board
+from sasgeo_bench.publishing.archive_folder import check_results
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.failures import Failures, log_beside
+from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
+from sasgeo_bench.running.runner import run
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.rows import YARDSTICK, is_unranked
+from sasgeo_bench.tasks.build import is_of_region, made_tasks, why_to_draw
+from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
+from sasgeo_bench.tasks.split import HALVES, Half
+from sasgeo_bench.tasks.suites.base import Choice
+from sasgeo_bench.tasks.task_batch import carry_out
+from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
+
+# Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
+CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
+CONTROL_SPLIT: Final = "crossfit"
+CONTROL_SITES: Final = 8
+CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
+REFERENCE: Final = "fft_vote"  # on the controls of every board
+MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelinePlan:
+    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board.
+
+    With a private seed all is below `out`, which then is the root of private runs.
+    """
+
+    spec: PipelineFile
+    requests: tuple[Request, ...]
+    controls: tuple[Request, ...]
+    out: Path
+    jobs: int
+    dask: str | None = None
+    private: PrivateSeed | None = None
+
+    def to_text(self) -> str:
+        """What of each stage is up to date; every matcher is loaded to find out what it was asked.
+
+        Raises
+        ------
+        MatchError, StoreError
+            As the run would.
+        """
+        queries, controls = _stage("queries", self.requests), _stage("controls", self.controls)
+        stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
+        lines = [f"{self.spec.id}: {self.spec.title}"]
+        lines += [line for stage in stages for line in stage.lines()]
+        if self.spec.learning is not None:
+            suites, most = ", ".join(self.spec.learning.suites), self.spec.learning.most
+            lines.append(
+                f"  learning: each half is asked after learning from the other ({suites}, at most {most} queries)"
+            )
+            if self.spec.learning.oracles:
+                lines.append(f"    {', '.join(self.spec.learning.oracles)}: from the half itself, never ranked")
+        lines += _run_lines(self, stages, controls)
+        lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
+        lines.append(f"  board: {board_folder(self)}")
+        return "\n".join(lines)
+
+    @property
+    def matchers(self) -> tuple[str, ...]:
+        """Those of the file, and those that every board has."""
+        return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Lacking:
+    """A task that is to be drawn, and why."""
+
+    suite: str
+    region: str
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stage:
+    """Tasks of one kind: folders of those that are up to date, request by request, and what is to be drawn."""
+
+    name: str
+    made: tuple[tuple[Path, ...], ...]
+    lacking: tuple[_Lacking, ...]
+
+    def lines(self) -> list[str]:
+        """How many are up to date, why the others are not, and the first of these by name."""
+        state = f"{len(self.made)} of {counted(len(self.made) + len(self.lacking), 'task')} up to date"
+        if self.lacking:
+            reasons = Counter(item.why for item in self.lacking)
+            told = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
+            state = f"{state}, {len(self.lacking)} to be drawn ({told})"
+        lines = [f"  {self.name}: {state}"]
+        lines += [f"    to be drawn: {item.suite} on {item.region}" for item in self.lacking[:MOST_LINES]]
+        more = len(self.lacking) - MOST_LINES
+        return [*lines, f"    and {more} more"] if more > 0 else lines
+
+
+def _stage(name: str, requests: Sequence[Request]) -> _Stage:
+    """What of some requests is up to date."""
+    found = [(request, made_tasks(request)) for request in requests]
+    return _Stage(
+        name=name,
+        made=tuple(made for _, made in found if made is not None),
+        lacking=tuple(
+            _Lacking(suite=request.suite, region=request.region.id, why=why_to_draw(request))
+            for request, made in found
+            if made is None
+        ),
+    )
+
+
+def _paper_stage(plan: PipelinePlan) -> _Stage:
+    """What of the paper's experiment is up to date: a task for each seed."""
+    paper = plan.spec.paper
+    if paper is None:
+        return _Stage(name="", made=(), lacking=())
+    made = partial(made_paper_task, trials=paper.trials, out=plan.out, private=plan.private)
+    found = {seed: made(seed=seed) for seed in paper.seeds}
+    tasks = plan.out / "tasks" / PAPER_SUITE
+    there = {seed: (tasks / region_name(seed)).is_dir() for seed in paper.seeds}
+    return _Stage(
+        name=f"the paper's experiment, {counted(paper.trials, 'trial')} of each seed",
+        made=tuple((made,) for made in found.values() if made is not None),
+        lacking=tuple(
+            _Lacking(
+                suite=PAPER_SUITE,
+                region=region_name(seed),
+                why="drawn otherwise or damaged" if there[seed] else "not there yet",
+            )
+            for seed, made in found.items()
+            if made is None
+        ),
+    )
+
+
+def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -> list[str]:
+    """By matcher what is answered and what is to be asked, and what answers lie with tasks that are drawn anew."""
+    asked = [(spec, list(stages)) for spec in plan.matchers]
+    asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
+    lines, all_done, all_left, all_behind = [], 0, 0, 0
+    for spec, mine in asked:
+        try:
+            goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
+        except (MatchError, StoreError) as error:
+            lines.append(f"    {spec}: cannot be asked ({error})")
+            continue
+        left, done = _count(goes)
+        planned = goes[0].plan
+        lacking = [item for stage in mine for item in stage.lacking if _is_asked(plan, spec, item.suite)]
+        run_folder = plan.out / "runs" / planned.card.name / planned.hash
+        behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
+        more = f", and what is drawn; {behind} answered there before" if lacking else ""
+        where = " (controls alone)" if mine == [controls] and len(stages) > 1 else ""
+        lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
+        lines += [f"      {go.name}: {line}" for go in goes for line in go.lines()]
+        all_done, all_left, all_behind = all_done + done, all_left + left, all_behind + behind
+    lines.insert(0, f"  run: {counted(len(asked), 'matcher')}, {all_done} answered, {all_left} to ask")
+    if all_behind:
+        lines.append(
+            f"    drawing anew leaves {counted(all_behind, 'answer')} where they are: those to the same queries "
+            "count again, the others are set aside"
+        )
+    return lines
+
+
+def _count_rows(run: Path, suite: str, region: str) -> int:
+    """How many answers the folder of a matcher's runs holds to queries of a suite on a region, whenever drawn."""
+    folders = [path for path in (run / suite).glob(f"{region}*") if path.is_dir() and is_of_region(path.name, region)]
+    return sum(len({(tie.query_id, tie.asked) for tie in prediction_files.read_ties(folder)}) for folder in folders)
+
+
+def board_folder(plan: PipelinePlan) -> Path:
+    """Where the board goes."""
+    return plan.out / "boards" / plan.spec.id
+
+
+def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may choose
+    spec: PipelineFile,
+    *,
+    out: Path,
+    tell: Tell,
+    extract_folders: tuple[Path, ...] = (),
+    region_folders: tuple[Path, ...] = (),
+    jobs: int = 1,
+    dask: str | None = None,
+    private: PrivateSeed | None = None,
+) -> PipelinePlan:
+    """Turn a pipeline file into requests; nothing is read but files of settings.
+
+    Parameters
+    ----------
+    spec : PipelineFile
+        The file.
+    out : Path
+        Root of what is built.
+    tell : callable
+        Gets a line for what is left out.
+    extract_folders, region_folders : tuple of Path
+        For regions that are not built yet, and of files of one's own.
+    jobs : int
+        Processes of each matcher.
+    dask : str, optional
+        A cluster to run on instead.
+    private : PrivateSeed, optional
+        Draws all queries instead of the file's seed, into the folder `private` of the root.
+
+    Raises
+    ------
+    ConfigError
+        If a suite, region or split is unknown, or no region can be built here.
+    MatchError
+        If no installed package has a matcher or a rejector of a name.
+    """
+    check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
+    out, seed = root_of(out, private), private or spec.seed
+    requests: list[Request] = []
+    for number, task in enumerate(spec.task):
+        wanted = Wanted(
+            suites=tuple(task.suites),
+            regions=tuple(spec.regions),
+            split=str(spec.split),  # a file with tasks names one
+            count=task.sites,
+            seed=seed,
+            out=out,
+            group=None if task.prior is None else PriorGroup.parse(task.prior),
+            extract_folders=extract_folders,
+            region_folders=region_folders,
+            may_be_fewer=True,
+            choice=Choice(views_cells=tuple(task.views_cells), kinds=tuple(task.kinds), tracks=tuple(task.tracks)),
+        )
+        try:
+            requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
+        except ConfigError as error:
+            message = f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}"
+            raise ConfigError(message) from error
+    if spec.task and not requests:
+        message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
+        raise ConfigError(message)
+    if spec.learning is not None and not requests[0].split.half_of:
+        message = f"[learning] needs halves, and split {spec.split!r} is a hold-out: name a cross-fit, or leave it out"
+        raise ConfigError(message)
+    controls = Wanted(
+        suites=(CONTROLS,),
+        regions=CONTROL_REGIONS,
+        split=CONTROL_SPLIT,
+        count=CONTROL_SITES,
+        seed=seed,
+        out=out,
+        may_be_fewer=True,
+    )
+    return PipelinePlan(
+        spec=spec,
+        requests=tuple(requests),
+        controls=plan_requests(controls, tell=_silent),
+        out=out,
+        jobs=jobs,
+        dask=dask,
+        private=private,
+    )
+
+
+def _silent(line: str) -> None:
+    """Say once what is left out, not for every group of suites."""
+    del line
+
+
+def run_pipeline(
+    plan: PipelinePlan,
+    *,
+    tell: Tell,
+    progress: Progress | None = None,
+    results: Path | None = None,
+    has_cases: bool = True,
+    private: Path | None = None,
+) -> Board:
+    """Draw what is missing, run what has no row, score all of it and write the board.
+
+    Parameters
+    ----------
+    plan : PipelinePlan
+        From `plan_pipeline`.
+    tell : callable
+        Gets a line for every step.
+    progress : Progress, optional
+        Is told of every answer.
+    results : Path, optional
+        Folder to store the board in, with the answers and truths it was made of, as <id>/.
+    has_cases : bool
+        Whether the board shows queries that went wrong, with their truths.
+    private : Path, optional
+        The board of a private seed of this pipeline, which the rows are held against.
+
+    Returns
+    -------
+    Board
+        As it was written to out/boards/<id>/.
+
+    Raises
+    ------
+    ConfigError
+        If no region can carry any of the suites.
+    StoreError
+        If the board cannot be stored where it should, before anything is done; or as `archive.pack_board` does, when
+        the board itself is written.
+    """
+    if results is not None:
+        check_results(results / plan.spec.id, board_folder(plan))
+    tasks = [*_draw(plan.requests, tell, jobs=plan.jobs), *_draw_paper(plan, tell)]
+    if not tasks:
+        message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
+        raise ConfigError(message)
+    controls = _draw(plan.controls, tell, jobs=1)
+    failures = Failures(log_beside(board_folder(plan)), tell=tell)
+    folders: list[Path] = []
+    for spec, mine in ({spec: [*tasks, *controls] for spec in (*plan.matchers, REFERENCE)}).items():
+        with failures.of(spec, but=(ConfigError,)):
+            folders += _run(plan, spec, mine if spec in plan.matchers else controls, tell, progress)
+    if not folders and failures.first is not None:
+        raise failures.first
+    split = plan.requests[0].split if plan.requests else None
+    contrasts = _contrasts(plan.spec)
+    figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
+    pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
+    request = ScoreRequest(
+        predictions=folders,
+        tasks=[*tasks, *controls],
+        root=plan.out,
+        board=board_folder(plan),
+        split=split,
+        rejectors=plan.spec.rejectors,
+        contrasts=contrasts,
+        draws=plan.spec.draws,
+        pipeline=plan.spec.said,
+        extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
+        by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
+        jobs=plan.jobs,
+        private=private,
+        failed=failures.found,
+    )
+    board = make_board(request, tell=tell, progress=progress)
+    if results is not None:
+        tell(pack_board(board, request, results / plan.spec.id).to_text())
+    return board
+
+
+def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress: Progress | None) -> list[Path]:
+    """Folders of the runs of one matcher, after whatever had no row was asked."""
+    folders: list[Path] = []
+    for go in _plan_goes(plan, spec, tasks):
+        left, done = _count([go])
+        label = f"{spec}, {go.name}" if go.name else spec
+        tell(f"{label}: {left} queries to ask, {done} answered before")
+        for line in () if go.plan.lesson is not None else go.lines():
+            tell(f"{label}: {line}")
+        run(go.plan, tell=tell if left else _silent, progress=progress)
+        folders += [part.folder for part in go.plan.parts]
+    return folders
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Go:
+    """One run of a matcher; one that learns has one for each half, and its name says which."""
+
+    name: str
+    plan: RunPlan
+
+    def lines(self) -> list[str]:
+        """What is learnt for it."""
+        if self.name and self.plan.lesson is None:
+            return ["nothing to learn from, asked untaught"]
+        return self.plan.lesson_lines()
+
+
+def _count(goes: Sequence[_Go]) -> tuple[int, int]:
+    """Queries to ask, and those that are answered."""
+    parts = [part for go in goes for part in go.plan.parts]
+    return sum(len(part.left) for part in parts), sum(part.done for part in parts)
+
+
+def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
+    """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other.
+
+    An oracle learns from the half itself.
+    """
+    mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
+    whole = plan_run(_run_request(plan, spec, mine))
+    learning = plan.spec.learning
+    is_oracle = learning is not None and spec in learning.oracles
+    if is_oracle and not is_unranked(whole.card.name):
+        message = (
+            f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
+            f"oracles begin with {YARDSTICK}, so that no board ranks them"
+        )
+        raise ConfigError(message)
+    if learning is None or not whole.learns or not mine:
+        return [_Go(name="", plan=whole)]
+    halves = {task: _half_of(plan, task) for task in tasks}
+    goes = []
+    for half in (*HALVES, None):
+        asked = [task for task in mine if halves[task] == half]
+        train = [
+            task
+            for task in tasks
+            if task.parent.name in learning.suites
+            and None not in {half, halves[task]}
+            and (halves[task] == half) == is_oracle
+        ]
+        request = replace(
+            whole.request,
+            tasks=asked,
+            train=train,
+            most_trained=learning.most,
+            split=plan.requests[0].split,
+            is_oracle=is_oracle,
+        )
+        if asked:
+            goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
+    return goes
+
+
+def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
+    """Whether a matcher is asked on a suite: controls of all, all of the controls, else as the file says."""
+    return suite in {CONTROLS, PAPER_SUITE} or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
+
+
+def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
+    """The half of a task's region, in the pipeline's split or else in that of the controls; None for the paper's."""
+    region = base_of(task.name)
+    for request in (*plan.requests[:1], *plan.controls[:1]):
+        for place in request.split.places_in(region):
+            return request.split.half_of.get(place)
+    return None
+
+
+def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest:
+    """What one matcher is asked."""
+    return RunRequest(
+        spec=spec,
+        tasks=tasks,
+        out=plan.out,
+        top_k=plan.spec.top_k,
+        limits=Limits(match_s=plan.spec.match_s),
+        jobs=plan.jobs,
+        dask=plan.dask,
+        hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
+    )
+
+
+def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
+    """Task folders of every request that a region carries; those that are up to date are left as they are."""
+    tasks: list[Path] = []
+    lacking: list[str] = []
+    for drawn in carry_out(requests, jobs=jobs):
+        for line in drawn.lines:
+            tell(line)
+        tasks += drawn.folders
+        lacking += [] if drawn.lack is None else [drawn.lack]
+    for line in lacking[:MOST_LINES]:
+        tell(f"left out: {line}")
+    if len(lacking) > MOST_LINES:
+        tell(f"left out: {len(lacking) - MOST_LINES} more")
+    return tasks
+
+
+def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
+    """Task folders of every seed of the paper's experiment; those that are up to date are left as they are."""
+    paper = plan.spec.paper
+    if paper is None:
+        return []
+    asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
+    made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
+    return [made(seed=seed) or draw(seed=seed) for seed in paper.seeds]
+
+
+def _contrasts(spec: PipelineFile) -> tuple[Contrast, ...]:
+    return tuple(
+        Contrast(
+            **item.model_dump(exclude={"why", "suites", "kinds"}), suites=tuple(item.suites), kinds=tuple(item.kinds)
+        )
+        for item in spec.contrast
+    )

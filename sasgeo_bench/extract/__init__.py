@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Everything that knows OSM files: finding, cutting, reading and writing them."""

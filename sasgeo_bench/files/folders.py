@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Folders that are written whole or not at all, by one run at a time."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.files.removal import remove_tree
+
+
+@contextmanager
+def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
+    """Hold the lock of a region, or of something else that is written; a second run says so and waits.
+
+    Raises
+    ------
+    StoreError
+        If there is no right or no room for a lock.
+    """
+    lock = FileLock(folder.parent / f".{folder.name}.lock")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            tell(f"{folder} is being written by another run, waiting for it")
+            lock.acquire()
+    except OSError as error:
+        message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        raise StoreError(message) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def fresh_folder(target: Path) -> Iterator[Path]:
+    """Yield an empty folder beside `target` that takes its place when the block ends well, and goes when it does not.
+
+    Call it under `locked`: leftovers of a build that was killed are cleared first.
+    """
+    scratch = target.parent / f".{target.name}.partial"
+    replaced = target.parent / f".{target.name}.replaced"
+    if replaced.exists() and not target.exists():
+        replaced.rename(target)  # killed between the two renames below: the old region is still whole
+    for leftover in (scratch, replaced):
+        _clear(leftover)
+    scratch.mkdir(parents=True)
+    try:
+        yield scratch
+        for path in scratch.rglob("*"):
+            _flush(path)
+        if os.path.lexists(target):  # a link that leads nowhere stands in the way too
+            target.rename(replaced)
+        scratch.rename(target)
+    finally:
+        _clear(scratch)
+        _clear(replaced)
+
+
+def _clear(path: Path) -> None:
+    """Remove a folder, or a file or link where a folder was expected; what a link leads to stays."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    else:
+        remove_tree(path)
+
+
+def _flush(path: Path) -> None:
+    """Force a file to the disk before the folder gets its name."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

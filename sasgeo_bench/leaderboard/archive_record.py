@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `pack.json`, `board.json` and `pictures.json` may say, held by type before anything is made of them."""
+
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.texts import FOLDER
+
+Model = TypeVar("Model", bound=BaseModel)
+Plain = Annotated[str, Field(pattern=FOLDER)]  # of what may become a folder
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_MOST_DRAWS: Final = 1_000_000
+
+
+class _Said(BaseModel):
+    """No silent conversion; what a later version says besides is kept."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
+
+
+class ContrastSaid(_Said):
+    """A registered contrast; see `scoring.contrasts.Contrast`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    first: str
+    second: str
+    suites: list[str]
+    kinds: list[str] = []
+    metric: Literal["primary", "aurc"] = "primary"
+    track: Literal["localization", "retrieval"] = "localization"
+    min_effect: Annotated[float, Field(ge=0, le=1)] = 0.03
+
+
+class PipelineSaid(_Said):
+    """Which pipeline a board is of."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: Plain
+    sha256: str
+
+
+class VersionSaid(_Said):
+    """Which schema a file is of; whatever else it says is for those who know that schema."""
+
+    schema_version: int
+
+
+class PackSaid(_Said):
+    """What `pack.json` says, and nothing else: how the results were scored, and the hash of every file.
+
+    Examples
+    --------
+    >>> "files" in PackSaid.model_fields
+    True
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    schema_version: Literal[1, 2]
+    split: Plain | None
+    rejectors: list[str]
+    contrasts: list[ContrastSaid]
+    draws: Annotated[int, Field(ge=1, le=_MOST_DRAWS)]
+    by_region: list[str]
+    pipeline: PipelineSaid | Annotated[dict[str, Any], Field(max_length=0)]  # empty where there was none
+    contestants: list[str]
+    dropped: str
+    files: dict[str, Sha256] | None = None  # of the first version there are none
+    licence: str = LICENCE
+    attribution: str = ATTRIBUTION
+
+
+class _Learned(_Said):
+    file: str | None
+    trained_on: list[str]
+    pairs: int
+    asked: list[str]
+
+
+class _Card(_Said):
+    title: str | None = None
+    source: str | None = None
+    ours: str | None = None
+    licence: str | None = None
+    limits: str | None = None
+    tracks: list[str] | None = None
+    needs: list[str] | None = None
+
+
+class PrivateSaid(_Said):
+    """A private seed: what tells that two boards are of the same one, and how many bits it has."""
+
+    commitment: Sha256
+    bits: Annotated[int, Field(ge=1)]
+
+
+class SeedSaid(_Said):
+    """One figure of one matcher on both seeds.
+
+    Parameters
+    ----------
+    suite, track, prior_group, metric : str
+        Of which queries, and of what: success or recall under stress, or false fixes at absent places.
+    public, private : float
+        The figure on each seed.
+    difference, lo, hi : float
+        Private less public; all intervals of a matcher hold at once (95 %, Bonferroni).
+    n_public, n_private : int
+        Queries.
+    blocks_public, blocks_private, blocks_shared : int
+        Blocks of ground that they come from, and that hold queries of both.
+    is_worse : bool
+        Whether the private figure is shown to be worse.
+    """
+
+    suite: str
+    track: str
+    prior_group: str
+    metric: str
+    public: float
+    private: float
+    difference: float
+    lo: float
+    hi: float
+    n_public: int
+    n_private: int
+    blocks_public: int
+    blocks_private: int
+    blocks_shared: int
+    is_worse: bool
+
+
+class _OnBothSeeds(_Said):
+    verdict: Literal["run here", "reproduced", "not reproduced"]
+    why: str
+    figures: list[SeedSaid]
+
+
+class _Entry(_Said):
+    name: str
+    version: str | None = None
+    hash: str | None = None
+    how: str | None = None
+    card: _Card | None = None
+    trained_on: list[str] | None = None
+    set_apart: str | None = None
+    isolation: dict[str, str] | None = None
+    private: _OnBothSeeds | None = None
+    learned: list[_Learned] = []
+
+
+class _Task(_Said):
+    region: str
+    suite: str
+    map_date: str | None = None
+    queries_sha256: str | None = None
+
+
+class BoardSaid(_Said):
+    """What `board.json` says, as far as pages go through it.
+
+    Examples
+    --------
+    >>> BoardSaid.model_validate({"remarks": ["one"]}).remarks
+    ['one']
+    """
+
+    scorer_version: int | None = None
+    task_version: int | None = None
+    data_version: int | None = None
+    made_by: str | None = None
+    libraries: dict[str, str] = {}
+    pipeline: PipelineSaid | None = None
+    private_seed: PrivateSaid | None = None
+    private: PrivateSaid | None = None
+    split: str | None = None
+    draws: int | None = None
+    contrasts: list[ContrastSaid] | None = None
+    by_region: list[str] = []
+    without: list[str] = []
+    rejectors: list[dict[str, str | bool | None]] = []
+    remarks: list[str] = []
+    failed: dict[str, str] = {}
+    entries: list[_Entry] = []
+    tasks: list[_Task] = []
+
+
+class _Picture(_Said):
+    file: str
+    alt: str = ""
+    region: str = ""
+    suite: str = ""
+
+
+class _Case(_Picture):
+    query_id: str = ""
+    matcher: str = ""
+    failure: str = ""
+    kind: str = ""
+    said: dict[str, str | float | int | bool | None] | None = None
+
+
+class PicturesSaid(_Said):
+    """What `pictures.json` says.
+
+    Examples
+    --------
+    >>> PicturesSaid.model_validate({}).cases
+    []
+    """
+
+    regions: list[_Picture] = []
+    suites: list[_Picture] = []
+    cases: list[_Case] = []
+
+
+def parse_said(data: bytes | str, model: type[Model]) -> Model:
+    """JSON that anybody may have written.
+
+    Raises
+    ------
+    ValueError
+        Naming the first fault in a line: no JSON, nested without end, or a value of another type.
+
+    Examples
+    --------
+    >>> parse_said('{"remarks": 5}', BoardSaid)
+    Traceback (most recent call last):
+        ...
+    ValueError: remarks is 5: Input should be a valid list
+    """
+    try:
+        return model.model_validate(parse_json(data))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        found = "" if not where or first["type"] == "missing" else f" is {first['input']!r}"[:80]
+        fault = "Input should be an object" if first["type"] == "model_type" else first["msg"]
+        message = one_line(f"{where}{found}: {fault}" if where else fault)
+        raise ValueError(message) from error

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures that a board has, by name: what there are data for is drawn, and of the rest a line says why not."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.leaderboard.build import Board
+from sasgeo_bench.leaderboard.plot_tables import (
+    ages_frame,
+    reliability_frame,
+    risk_frame,
+    shown_matchers,
+    stress_frame,
+)
+from sasgeo_bench.leaderboard.plots import (
+    draw_ages,
+    draw_bars,
+    draw_forest,
+    draw_reliability,
+    draw_risk,
+    draw_stanford,
+    draw_steps,
+)
+from sasgeo_bench.leaderboard.pooled_plots import draw_ablation, draw_costs, draw_errors, draw_prices, draw_recall
+from sasgeo_bench.leaderboard.pooled_tables import (
+    COSTS,
+    ablation_frame,
+    cost_frame,
+    errors_frame,
+    price_frame,
+    recall_frame,
+)
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.scoring.contrasts import Contrast, by_place
+from sasgeo_bench.scoring.protection import ToldLevels, told_levels
+from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
+from sasgeo_bench.tasks.split import Split
+
+Draw = Callable[[Path], None]
+Named = Iterator[tuple[str, Draw]]
+
+MOST_STANFORD: Final = 5  # matchers
+_PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
+
+
+def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
+    """Figures of a board, as SVG.
+
+    Parameters
+    ----------
+    board : Board
+        In memory.
+    tell : callable
+        Gets a line that names the kinds of figures there are no data for, if any.
+    contrasts : sequence of Contrast
+        Those that were registered, as of the board.
+    split : Split, optional
+        Of the board: says which places calibrate conformal protection levels.
+    """
+    shown = shown_matchers(board.table, contrasts)
+    queries = queries_of(board.scores)
+    steps = steps_frame(board.table, queries, shown)
+    if steps.empty:  # a table without a row does not know its types, by which it is held against others
+        steps = steps.astype({name: queries[name].dtype for name in ("strength", "view_cells")})
+    ages = ages_frame(steps, queries, board.measured)
+    # An age is no other strength: where maps have ages, those are the axis.
+    others = steps[~steps["suite"].isin(set(ages["suite"]))]
+    calibrated = _calibrated(board.table)
+    kinds: dict[str, Callable[[], Named]] = {
+        "success against the age of the map": lambda: _each("age", ages, GROUP, draw_ages, shown),
+        "success against strength": lambda: _each("strength", others, GROUP, draw_steps, shown),
+        "success under stress": lambda: _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
+        "arms beside each other": lambda: _each(
+            "ablation", ablation_frame(board.scores, contrasts, shown), GROUP[1:], draw_ablation, shown
+        ),
+        "differences by place": lambda: _forests(board, contrasts),
+        "recall against K": lambda: _each(
+            "recall",
+            recall_frame(board.scores, board.predictions, board.truths, shown),
+            GROUP[1:],
+            draw_recall,
+            shown,
+        ),
+        "the distribution of errors": lambda: _each(
+            "errors", errors_frame(board.scores, board.table, shown), GROUP[1:], draw_errors, shown
+        ),
+        "worth against cost": lambda: _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
+        "risk against coverage": lambda: _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
+        "reliability": lambda: _each(
+            "reliability",
+            reliability_frame(board.judged, calibrated, shown),
+            GROUP[1:],
+            draw_reliability,
+            shown,
+        ),
+        "the cost of decisions": lambda: _each(
+            "cost", cost_frame(board.judged, calibrated, shown), GROUP[1:], draw_costs, shown
+        ),
+        "protection levels against errors": lambda: _stanfords(board, shown, split),
+    }
+    drawn: dict[str, dict[str, Draw]] = {}
+    for kind, make in kinds.items():
+        with board.failures.of(f"figures of {kind}"):
+            drawn[kind] = {f"{name}.svg": draw for name, draw in make()}
+    empty = [kind for kind, named in drawn.items() if not named]
+    if empty:
+        tell(f"figures left out, for nothing on this board is seen in them: {', '.join(empty)}")
+    return Extra(figures={name: draw for named in drawn.values() for name, draw in named.items()})
+
+
+def _file_name(*parts: str) -> str:
+    return _PLAIN.sub("-", "-".join(parts)).strip("-").lower()
+
+
+def _each(
+    name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., None], shown: Sequence[str]
+) -> Named:
+    """A figure for each group of rows; prior groups are never together."""
+    for key, part in rows.groupby(list(columns), sort=True):
+        yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
+
+
+def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
+    """Matcher x rejector that gives probabilities: it is judged as such."""
+    rows = table[table["metric"] == "ece"]
+    return set(zip(rows["matcher"], rows["rejector"], strict=True))
+
+
+def _priced(board: Board, shown: Sequence[str]) -> pd.DataFrame:
+    """Matchers of which some cost is known."""
+    rows = price_frame(board.table, board.scores, shown)
+    known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
+    return known
+
+
+def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
+    for contrast, finding in zip(contrasts, board.findings, strict=True):
+        places = by_place(contrast, board.scores, board.judged) if finding.n else ()
+        if places:
+            yield (
+                _file_name("contrast", contrast.name),
+                partial(draw_forest, contrast=contrast, finding=finding, places=places),
+            )
+
+
+def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named:
+    """A panel for each matcher and method: of few matchers, those of contrasts first; nobody reads forty panels."""
+    found: dict[tuple[str, float], dict[tuple[str, str], ToldLevels]] = {}
+    for matcher in (name for name in shown if name in board.scores):
+        for item in told_levels(board.scores[matcher], board.predictions[matcher], split):
+            key = item.prior_group, item.risk
+            rows = {name for name, _ in found.get(key, ())} | {matcher}
+            if len(item.level_m) and len(rows) <= MOST_STANFORD:
+                found.setdefault(key, {})[matcher, item.method] = item
+    for (prior_group, risk), told in sorted(found.items()):
+        yield (
+            _file_name("stanford", f"{risk:g}", prior_group),
+            partial(draw_stanford, told=told, limit_m=FIX_M),
+        )

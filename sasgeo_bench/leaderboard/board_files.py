@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards on disk: `leaderboard.parquet` is the master, all others say the same for other readers."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+import pyarrow as pa
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.files.file_manifest import (
+    FIGURE_FILES,
+    PICTURE_FILES,
+    SITE,
+    SITE_FOLDERS,
+    check_known,
+    check_site,
+    list_files,
+)
+from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
+from sasgeo_bench.leaderboard.archive_record import BoardSaid, parse_said
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.texts import csv_cell, json_text
+
+LEADERBOARD: Final = "leaderboard"
+PROTECTION: Final = "protection"
+SCORES: Final = "scores"
+BOARD: Final = "board.json"
+FIGURES: Final = "figures"
+PICTURES: Final = "pictures"
+PICTURES_SAID: Final = "pictures.json"
+_AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a spreadsheet
+_VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
+BOARD_FILES: Final = (
+    *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
+    *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
+    *("contrasts.md", "controls.md"),
+    *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
+    *("paper.parquet", "trials.parquet", "paper.md"),
+)
+MEND: Final = "score it again"
+_TOP: Final = (*BOARD_FILES, FIGURES, PICTURES, *SITE_FOLDERS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extra:
+    """Files of a board besides its own.
+
+    Parameters
+    ----------
+    tables : mapping of str to pandas.DataFrame
+        Each becomes <name>.parquet.
+    texts : mapping of str to str
+        File name -> text.
+    figures : mapping of str to callable
+        Name in `figures/` -> what draws it to a path.
+    pictures : mapping of str to bytes
+        Name in `pictures/`, with the folder there -> its content.
+    """
+
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+
+
+def write_board(
+    folder: Path,
+    *,
+    tables: Mapping[str, pd.DataFrame],
+    texts: Mapping[str, str],
+    about: Mapping[str, Any],
+    extras: Sequence[Extra] = (),
+) -> None:
+    """Write a board, whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+        out/boards/<name>; an older board of the same scorer version there is replaced.
+    tables : mapping of str to pandas.DataFrame
+        Each becomes <name>.parquet; "leaderboard" and "protection" also a csv.
+    texts : mapping of str to str
+        File name -> text.
+    about : mapping
+        What `board.json` says: versions, hashes, what was scored.
+    extras : sequence of Extra
+        Files besides.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds a board of another scorer version, or something that is no part of a board, or cannot be
+        written; an older board is then as it was.
+    """
+    versions = {name: str(about[name]) for name in _VERSIONS if name in about}
+    said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
+    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
+    try:
+        with locked(folder, tell=lambda _: None):
+            check_board(folder, scorer_version=int(about["scorer_version"]))
+            with fresh_folder(folder) as scratch:
+                for part in (Extra(tables=tables, texts=texts), *extras):
+                    _write_part(scratch, part, said)
+                for name in (one for one in _AS_CSV if one in tables):
+                    tables[name].map(csv_cell).to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
+                content = {name: value for name, value in content.items() if name != "failed" or value}
+                (scratch / BOARD).write_text(json_text(content), encoding="utf-8")
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = (
+            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights, and score "
+            "again; a board that was there is as it was"
+        )
+        raise StoreError(message) from error
+
+
+def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
+    for name, frame in part.tables.items():
+        write_frame(frame, folder / f"{name}.parquet", attrs=said, **said)
+    for name, text in part.texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    for name, draw in part.figures.items():
+        (folder / FIGURES).mkdir(exist_ok=True)
+        draw(folder / FIGURES / name)
+    for name, content in part.pictures.items():
+        path = folder / PICTURES / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def check_board(folder: Path, *, scorer_version: int) -> None:
+    """Refuse a folder that a board of this scorer version cannot replace.
+
+    Raises
+    ------
+    StoreError
+        If it holds a board of another scorer version, or something that is no part of a board.
+    """
+    if folder.exists() and not folder.is_dir():
+        message = f"{folder} is a file: move it away, a board goes there"
+        raise StoreError(message)
+    other = next((path for path in sorted(folder.glob("*")) if path.name not in _TOP), None)
+    if other is not None:
+        message = f"{other} is no part of a board and would be lost: move it away, or name another board"
+        raise StoreError(message)
+    check_known(folder, BOARD_FILES, "a board", patterns=(*FIGURE_FILES, *PICTURE_FILES), without=SITE_FOLDERS)
+    check_site(folder / SITE)
+    # A file that is gone by now went with the board that another writer has just replaced.
+    versions = ((path, _version(path)) for path in sorted(folder.glob("*.parquet")))
+    found = next((version for path, version in versions if version != str(scorer_version) and path.exists()), None)
+    if found is not None:
+        message = (
+            f"{folder} holds rows of scorer version {found}, this one is {scorer_version}: figures of two never share "
+            "a board; name another one, or move it away and score again"
+        )
+        raise StoreError(message)
+
+
+def _version(path: Path) -> str:
+    try:
+        said = dict(read_schema(path, mend=MEND).metadata or {})
+        return str(said.get(b"scorer_version", b"unknown"), encoding="utf-8")
+    except (StoreError, UnicodeDecodeError):
+        return "unknown"
+
+
+def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
+    """What `board.json` says, and the leaderboard.
+
+    Raises
+    ------
+    StoreError
+        If there is none, or a file is damaged.
+    """
+    try:
+        data = (folder / BOARD).read_bytes()
+        parse_said(data, BoardSaid)
+        return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
+    except StoreError:
+        raise
+    except FileNotFoundError as error:
+        message = f"{folder} holds no board: score some runs first"
+        raise StoreError(message) from error
+    except (OSError, ValueError, TypeError, KeyError, MemoryError, pa.ArrowException) as error:
+        message = f"{folder} holds a damaged board ({one_line(str(error))}): score it again"
+        raise StoreError(message) from error
+
+
+def read_scores(folder: Path) -> pd.DataFrame:
+    """Scored rows of a board, those of all contestants.
+
+    Raises
+    ------
+    StoreError
+        If they are missing or damaged.
+
+    Examples
+    --------
+    >>> read_scores(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere/scores.parquet cannot be read (No such file or directory): score it again
+    """
+    return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
+
+
+def read_pictures(folder: Path) -> dict[str, bytes]:
+    """Pictures of a board, or of stored results, as they were written: name in `pictures/` -> content.
+
+    Raises
+    ------
+    StoreError
+        If one cannot be read.
+
+    Examples
+    --------
+    >>> read_pictures(Path("nowhere"))
+    {}
+    """
+    place = folder / PICTURES
+    try:
+        return {name: (place / name).read_bytes() for name in list_files(place)}
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = f"{place} cannot be read ({error.strerror or error}): remove it, or fetch it again"
+        raise StoreError(message) from error

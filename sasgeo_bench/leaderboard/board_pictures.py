@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pictures of a board: regions as thumbnails, an example of each suite, and queries that went wrong."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import SasgeoError, StoreError, counted
+from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.leaderboard.board_files import PICTURES, PICTURES_SAID, Extra, read_pictures
+from sasgeo_bench.leaderboard.build import Board
+from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
+from sasgeo_bench.leaderboard.case_plot import case_pixels
+from sasgeo_bench.leaderboard.cases import COLUMNS, MOST_CASES, OPERATING, find_cases, operating_rejector, sample_cases
+from sasgeo_bench.leaderboard.picture import WEBP, fitted, pixels_of, thumbnail
+from sasgeo_bench.leaderboard.plot_tables import shown_matchers
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.layer_file import read_overview
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.running.failures import Failures, stops_all
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.panels import panels
+from sasgeo_bench.tasks.query import CONTROLS, Truth
+from sasgeo_bench.tasks.sheet import sheet_figure
+from sasgeo_bench.texts import json_text
+
+REGION_BYTES: Final = 15_000
+SUITE_BYTES: Final = 38_000
+CASE_BYTES: Final = 31_000
+MOST_BYTES: Final = 3_000_000  # of all pictures of a board
+_THUMB_CELLS: Final = 1100  # a level of the layers that is not much finer than a thumbnail
+_SHEET_DPI: Final = 72
+_EACH: Final = 4  # cases of one class and matcher
+_CLASSED: Final = ("matcher", "query_id", "failure")  # of a case
+_PLAIN: Final = re.compile(r"[^A-Za-z0-9.@+]+")
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """Pictures so far, what `pictures.json` says of them, and why others are not among them."""
+
+    files: dict[str, bytes] = field(default_factory=dict)
+    said: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"regions": [], "suites": [], "cases": []})
+    lacking: Counter[str] = field(default_factory=Counter)
+    failures: Failures
+
+    def add(self, kind: str, name: str, draw: Callable[[], bytes], about: Mapping[str, Any]) -> None:
+        """Draw one, or note why not: a board is not lost for a picture."""
+        try:
+            data = draw()
+        except SasgeoError as error:
+            self.lacking[one_line(str(error))] += 1
+            return
+        except Exception as error:
+            if stops_all(error):
+                raise
+            self.failures.note(f"picture {name}", error)
+            return
+        if sum(map(len, self.files.values())) + len(data) > MOST_BYTES:
+            self.lacking[f"all pictures together take {MOST_BYTES / 1e6:g} MB at most"] += 1
+            return
+        file = f"{kind}/{_PLAIN.sub('-', name).strip('-')}{WEBP}"
+        self.files[file] = data
+        self.said[kind].append({**about, "file": file})
+
+
+def pictures_extra(
+    board: Board,
+    *,
+    tell: Tell,
+    root: Path,
+    contrasts: Sequence[Contrast] = (),
+    kept: Path | None = None,
+    has_cases: bool = True,
+) -> Extra:
+    """Pictures of a board, and `pictures.json` that lists them.
+
+    Parameters
+    ----------
+    board : Board
+        In memory.
+    tell : callable
+        Gets a line for what cannot be drawn, and how many there are.
+    root : Path
+        Where regions/, tasks/ and truth/ are.
+    contrasts : sequence of Contrast
+        Those that were registered.
+    kept : Path, optional
+        Stored results that the board is made of: they hold no views, so that their pictures are taken as they are, but
+        for cases whose class of failure is another one now.
+    has_cases : bool
+        Whether queries that went wrong are shown, with their truths.
+
+    Returns
+    -------
+    Extra
+        Without a picture where there is none.
+    """
+    if kept is not None:
+        return _kept(kept, tell, _failures(board, contrasts) if has_cases else None)
+    found = _Found(failures=board.failures)
+    asked = [about for about in board.tasks if about["suite"] != CONTROLS]
+    _add_regions(found, asked, root)
+    _add_suites(found, asked, board, root)
+    if has_cases:
+        _add_cases(found, board, contrasts, root)
+    for reason, count in found.lacking.items():
+        tell(f"left out: {counted(count, 'picture')}, {reason}")
+    listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.said.items())
+    tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
+    return Extra(pictures=_with_list(found.files, found.said) if found.files else {})
+
+
+def _with_list(files: Mapping[str, bytes], said: Mapping[str, Any]) -> dict[str, bytes]:
+    content = {**said, "licence": LICENCE, "attribution": ATTRIBUTION}
+    return {**files, PICTURES_SAID: json_text(content).encode()}
+
+
+def _kept(folder: Path, tell: Tell, failures: pd.DataFrame | None) -> Extra:
+    """Pictures of stored results as they are; of cases, where some are wanted, those that are still of their class."""
+    files = read_pictures(folder)
+    if PICTURES_SAID not in files:
+        tell(f"no pictures: {folder} holds none, and no views to draw them of")
+        return Extra()
+    tell(f"pictures are those that {folder} holds: there are no views to draw them anew")
+    named = () if failures is None else zip(*(failures[name] for name in _CLASSED), strict=True)
+    classed = {tuple(map(str, names)) for names in named}
+    try:
+        said = parse_json(files[PICTURES_SAID])
+        cases = list(said["cases"])
+        said["cases"] = [one for one in cases if tuple(str(one[name]) for name in _CLASSED) in classed]
+        lost = {str(one["file"]) for one in cases} - {str(one["file"]) for one in said["cases"]}
+    except (ValueError, TypeError, KeyError) as error:
+        message = f"{folder / PICTURES / PICTURES_SAID} is damaged: remove the folder, or fetch it again"
+        raise StoreError(message) from error
+    if lost and failures is not None:
+        tell(f"left out: {counted(len(lost), 'picture')} of cases whose class of failure is another one now")
+    left = {name: data for name, data in files.items() if name not in lost and name != PICTURES_SAID}
+    return Extra(pictures=_with_list(left, said))
+
+
+# --- regions and suites -----------------------------------------------------------------------------------------------
+
+
+def base_region(name: str) -> str:
+    """A region without what a date or a suite made of it.
+
+    Examples
+    --------
+    >>> base_region("vaduz@2015-07-27"), base_region("vaduz+growth")
+    ('vaduz', 'vaduz')
+    """
+    return name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+
+
+def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
+    """Each region once: as it is, or where that is not here, as the first of its maps."""
+    maps: dict[str, list[str]] = {}
+    for about in asked:
+        maps.setdefault(base_region(str(about["region"])), []).append(str(about["region"]))
+    for base, variants in sorted(maps.items()):
+        there = (name for name in (base, *sorted(variants)) if (root / "regions" / name).is_dir())
+        folder = root / "regions" / next(there, base)
+        alt = f"Map of {base}: semantic classes in colours"
+        found.add("regions", base, partial(_thumbnail, folder), {"region": base, "alt": alt})
+
+
+def _thumbnail(folder: Path) -> bytes:
+    manifest = region_files.read_manifest(folder)
+    overview = read_overview(folder / region_files.LAYERS, longest_cells=_THUMB_CELLS)
+    return fitted(thumbnail(manifest, overview), REGION_BYTES)
+
+
+def _add_suites(found: _Found, asked: Sequence[Mapping[str, Any]], board: Board, root: Path) -> None:
+    """Of each suite a control and its strongest stress at one site, from the first task that has both, or a stress."""
+    drawn: dict[tuple[str, str], set[str]] = {}
+    for frame in board.scores.values():
+        for suite, region, role in zip(frame["suite"], frame["region"], frame["role"], strict=True):
+            drawn.setdefault((suite, region), set()).add(role)
+    best: dict[str, tuple[int, str, Mapping[str, Any]]] = {}
+    for about in asked:
+        suite, region = str(about["suite"]), str(about["region"])
+        roles = drawn.get((suite, region), set())
+        rank = -sum(weight for role, weight in (("stress", 2), ("control", 1)) if role in roles)
+        best[suite] = min(best.get(suite, (1, "", about)), (rank, region, about), key=lambda item: item[:2])
+    for suite, (_, region, about) in sorted(best.items()):
+        alt = f"Example of {suite} on {region}: view, map at the true place, difference, twin or hardest decoy"
+        found.add("suites", suite, partial(_example, about, root), {"suite": suite, "alt": alt})
+
+
+def _example(about: Mapping[str, Any], root: Path) -> bytes:
+    folder, hidden = (root / kind / str(about["suite"]) / str(about["region"]) for kind in ("tasks", "truth"))
+    shown = panels(folder, hidden, out=root, choose=control_and_stress)
+    title = f"{about['title']}: {about['region']}"
+    return fitted(pixels_of(sheet_figure(title, shown, dpi=_SHEET_DPI)), SUITE_BYTES)
+
+
+def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
+    """A control and the strongest stress of its site; where no site has both, the strongest stress and another query.
+
+    Examples
+    --------
+    >>> control_and_stress([])
+    []
+    """
+    order = sorted(truths, key=lambda item: (item.pair_id, item.kind, -item.strength, item.query_id))
+    for one in (item for item in order if item.role == "control"):
+        beside = [item for item in order if item.pair_id == one.pair_id and item.role == "stress"]
+        if beside:
+            return [one, max(beside, key=lambda item: item.strength)]
+    rank = {"stress": 0, "control": 1, "falsifier": 2}
+    return sorted(order, key=lambda item: (rank[item.role], -item.strength))[:2]
+
+
+# --- cases ------------------------------------------------------------------------------------------------------------
+
+
+def _add_cases(found: _Found, board: Board, contrasts: Sequence[Contrast], root: Path) -> None:
+    failures = _failures(board, contrasts)
+    if not len(failures):
+        return
+    chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
+    words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
+    about = {(str(item["suite"]), str(item["region"])): item for item in board.tasks}
+    drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
+    for case in _cases(drawn, board, words, root, found):
+        row = drawn[case.query.query_id, case.matcher]
+        said = said_of(case)
+        off = f", {said['error_m']:.0f} m off" if "error_m" in said else ""
+        alt = f"{case.failure}: view, true place and answer of {case.matcher} on {row['suite']}, {row['region']}{off}"
+        task = about[row["suite"], row["region"]]
+        region = root / "regions" / row["region"]
+        found.add(
+            "cases",
+            f"{case.matcher}-{case.query.query_id}",
+            partial(_drawn, case, region, task),
+            {**{str(name): value for name, value in row.items()}, "alt": alt, "said": said},
+        )
+    order = {key: at for at, key in enumerate(drawn)}
+    found.said["cases"].sort(key=lambda one: order[one["query_id"], one["matcher"]])
+
+
+def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
+    """Every failure of the matchers that a board shows, with its class."""
+    frames = [pd.DataFrame(columns=list(COLUMNS))]
+    for name in shown_matchers(board.table, contrasts):
+        with board.failures.of(f"cases of {name}"):
+            if name in board.scores:
+                rejector = operating_rejector(board.judged, name, contrasts)
+                judged = None if rejector is None else board.judged[name, rejector]
+                frames.append(find_cases(board.scores[name], name, judged))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _drawn(case: Case, region: Path, about: Mapping[str, Any]) -> bytes:
+    return fitted(case_pixels(read_picture(case, region, about)), CASE_BYTES)
+
+
+def _cases(
+    drawn: Mapping[tuple[Any, Any], Mapping[Any, Any]],
+    board: Board,
+    words: Mapping[tuple[str, str], pd.DataFrame],
+    root: Path,
+    found: _Found,
+) -> Iterator[Case]:
+    """Each chosen case with its view, task by task."""
+    by_task: dict[tuple[str, str], list[Mapping[Any, Any]]] = {}
+    for row in drawn.values():
+        by_task.setdefault((row["suite"], row["region"]), []).append(row)
+    for (suite, region), rows in sorted(by_task.items()):
+        folder = root / "tasks" / suite / region
+        try:
+            some = list(task_files.read_some(folder, {row["query_id"] for row in rows}))
+        except SasgeoError as error:
+            found.lacking[one_line(str(error))] += len(rows)
+            continue
+        views = {query.query_id: query for query, _, _ in some}
+        for row in rows:
+            query_id, matcher = row["query_id"], row["matcher"]
+            yield Case(
+                matcher=matcher,
+                failure=row["failure"],
+                query=views[query_id],
+                truth=board.truths[query_id],
+                prediction=board.predictions[matcher].get(query_id),
+                **words_of(words, matcher, query_id),
+            )
+
+
+def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
+    """What rejectors say of one answer: how likely it is false, or only in which order; and whether they accept it.
+
+    Parameters
+    ----------
+    words : mapping of (matcher, rejector) to pandas.DataFrame
+        Judged rows by query id.
+    matcher, query_id : str
+        Whose answer to what.
+    """
+    p_false: dict[str, float] = {}
+    orders: dict[str, float] = {}
+    accepted: dict[str, bool] = {}
+    for (name, rejector), frame in words.items():
+        if name != matcher or query_id not in frame.index:
+            continue
+        row: Any = frame.loc[query_id]
+        if pd.notna(row["p_right"]):
+            is_chance = bool(row.get("is_calibrated", True))
+            (p_false if is_chance else orders)[rejector] = 1.0 - float(row["p_right"])
+        if pd.notna(row[OPERATING]) and row["is_answered"]:
+            accepted[rejector] = bool(row[OPERATING])
+    return {"p_false": p_false, "orders": orders, "accepted": accepted}

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages that figures of a board are drawn on, written as SVG or PNG: the same bytes for the same figures."""
+
+import io
+import math
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.lines import Line2D
+
+from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.regions.region import ATTRIBUTION
+
+# Okabe and Ito's colours without the yellow, which is too pale on white; dashes and marks differ, too.
+_COLOURS: Final = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_DASHES: Final = ("-", "--", "-.", ":")
+_MARKS: Final = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "h")
+GREY: Final = "#555555"
+FAINT: Final = "#dddddd"
+_DPI: Final = 110
+_TAGS: Final = re.compile(r"<[^>]+>")  # texts between them hold no bracket, and are not touched
+_NUMBERS: Final = re.compile(r' (?:d|x|y|x1|x2|y1|y2|points)="[^"]*"')
+_GROUP_NAMES: Final = re.compile(r' id="[A-Za-z2.]+_\d+"')  # nothing refers to them; what is referred to has a hash
+_STYLE_OF: Final = re.compile(r' style="([^"]*)"')
+_INDENTS: Final = re.compile(r"\n +")
+_DIGITS: Final = re.compile(r"(\.\d\d)\d+")
+_LABEL_POINTS: Final = 8.5
+_LINE_INCHES: Final = 0.155  # of a note
+_KEY_INCHES: Final = 0.2
+_LABEL_LETTERS: Final = 13.0  # of a label of axes, on an inch
+_LETTERS: Final = 15.5  # of a note, on an inch
+_STYLE: Final[dict[Any, Any]] = {
+    "svg.fonttype": "none",  # text stays text, so that it can be searched for
+    "svg.hashsalt": "sasgeo-bench",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """How one of several things that are drawn beside each other looks."""
+
+    colour: str
+    dash: str
+    mark: str
+
+
+def look_of(number: int) -> Look:
+    """The look of the thing of a number; no two of the first 28 have colour and dash in common.
+
+    Examples
+    --------
+    >>> look_of(0).colour, look_of(7).dash
+    ('#000000', ':')
+    """
+    return Look(
+        colour=_COLOURS[number % len(_COLOURS)],
+        dash=_DASHES[number % len(_DASHES)],
+        mark=_MARKS[number % len(_MARKS)],
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Page:
+    """What is around the panels of a figure, and how large these are.
+
+    Parameters
+    ----------
+    title, note : str
+        Above and below; both are broken into lines.
+    below : str
+        What the axes across are of; written once, under the middle of the panels.
+    rows, columns : int
+        Panels down and across.
+    panel_inches : (float, float)
+        Width and height of a panel.
+    left_inches, gap_inches : float
+        Room for what is written left of the panels, and of each but the first column.
+    row_gap_inches : float
+        Room between rows: for a panel's title, and where each has its own axis, for that.
+    keys : sequence of str
+        Legend, by the numbers of `look_of`; above the panels, never over them.
+    has_marks : bool
+        Whether the legend shows marks on its lines.
+    """
+
+    title: str
+    note: str
+    below: str
+    rows: int = 1
+    columns: int = 1
+    panel_inches: tuple[float, float] = (2.4, 2.1)
+    left_inches: float = 0.75
+    gap_inches: float = 0.2
+    row_gap_inches: float = 0.55
+    keys: Sequence[str] = field(default=())
+    has_marks: bool = True
+
+
+@contextmanager
+def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
+    """Yield the panels of a figure, row by row; it is written when the block ends.
+
+    Parameters
+    ----------
+    path : Path
+        A .svg or .png to write.
+    about : Page
+        What is around the panels.
+    """
+    wide, high = about.panel_inches
+    width = max(6.4, about.left_inches + about.columns * (wide + about.gap_inches) + 0.2)
+    title = textwrap.wrap(about.title, int(width * 10.5))
+    note = textwrap.wrap(about.note, int(width * _LETTERS))
+    across = _keys_across(about.keys, width)
+    legend = _KEY_INCHES * math.ceil(len(about.keys) / across) + 0.1 if about.keys else 0.0
+    top = 0.14 + 0.2 * len(title) + legend + 0.36
+    bottom = 0.62 + _LINE_INCHES * len(note) + 0.3
+    height = top + about.rows * high + (about.rows - 1) * about.row_gap_inches + bottom
+    with mpl.rc_context(_STYLE):
+        figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
+        FigureCanvasAgg(figure)
+        figure.text(0.12 / width, 1 - 0.1 / height, "\n".join(title), fontsize=10.5, weight="bold", va="top")
+        figure.text(
+            0.12 / width, 0.26 / height, "\n".join(note), fontsize=7.5, color=GREY, va="bottom", linespacing=1.3
+        )
+        figure.text(0.12 / width, 0.09 / height, f"Data: {ATTRIBUTION}", fontsize=7.5, color=GREY, va="bottom")
+        if about.keys:
+            figure.legend(
+                handles=[_key(number, name, has_mark=about.has_marks) for number, name in enumerate(about.keys)],
+                loc="upper left",
+                bbox_to_anchor=(0.06 / width, 1 - (0.14 + 0.2 * len(title)) / height),
+                ncols=across,
+                frameon=False,
+                fontsize=8,
+                borderaxespad=0.2,
+                handlelength=2.6,
+            )
+        charts = []
+        for row in range(about.rows):
+            low = height - top - (row + 1) * high - row * about.row_gap_inches
+            boxes = [
+                (about.left_inches + column * (wide + about.gap_inches), low, wide, high)
+                for column in range(about.columns)
+            ]
+            charts.append([figure.add_axes(_share_of(box, width, height)) for box in boxes])
+        middle = about.left_inches + (about.columns * (wide + about.gap_inches) - about.gap_inches) / 2
+        label = "\n".join(textwrap.wrap(about.below, int(2 * min(middle, width - middle) * _LABEL_LETTERS)))
+        figure.text(middle / width, (bottom - 0.42) / height, label, ha="center", va="center", fontsize=_LABEL_POINTS)
+        yield charts
+        if path.suffix == ".svg":
+            drawn = io.StringIO()
+            said = {"Date": None, "Creator": None, "Rights": ATTRIBUTION, "Title": about.title}
+            figure.savefig(drawn, format="svg", metadata=said)
+            path.write_text(_rounded(drawn.getvalue()), encoding="utf-8")
+        else:
+            figure.savefig(path, metadata={"Software": None, "Title": about.title})
+
+
+def _rounded(svg: str) -> str:
+    """An SVG with hundredths of a point at most, without indents and names of groups, and each style written once.
+
+    Half of what is drawn with says no more.
+    """
+    return _classed(_TAGS.sub(lambda tag: _short(tag[0]), _INDENTS.sub("\n", svg)))
+
+
+def _short(tag: str) -> str:
+    return _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), _GROUP_NAMES.sub("", tag))
+
+
+def _classed(svg: str) -> str:
+    """Styles that stand more than once as classes, numbered as they first stand."""
+    counts = Counter(style for tag in _TAGS.findall(svg) for style in _STYLE_OF.findall(tag))
+    names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
+    rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
+    classes = {f' style="{style}"': f' class="{name}"' for style, name in names.items()}
+    short = _TAGS.sub(lambda tag: _STYLE_OF.sub(lambda one: classes.get(one[0], one[0]), tag[0]), svg)
+    return short.replace("</style>", f"{rules}</style>", 1)
+
+
+def _share_of(box: tuple[float, float, float, float], width: float, height: float) -> tuple[float, float, float, float]:
+    """Inches -> shares of a figure."""
+    left, low, wide, high = box
+    return (left / width, low / height, wide / width, high / height)
+
+
+def _keys_across(keys: Sequence[str], width: float) -> int:
+    """How many keys of a legend stand beside each other."""
+    longest = max((len(name) for name in keys), default=1)
+    return max(1, min(len(keys), int(width / (0.6 + 0.075 * longest))))
+
+
+def _key(number: int, name: str, *, has_mark: bool) -> Line2D:
+    look = look_of(number)
+    return Line2D(
+        [], [], color=look.colour, ls=look.dash, marker=look.mark if has_mark else "", ms=4.5, lw=1.5, label=name
+    )

@@ -1,0 +1,569 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs, files of predictions and truths -> a board: the order of the steps."""
+
+import platform
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.leaderboard.board_files import PROTECTION, Extra, check_board, read_board, write_board
+from sasgeo_bench.leaderboard.latex import board_latex
+from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
+from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
+from sasgeo_bench.leaderboard.text import board_markdown
+from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.progress import Lines, Progress, Tell
+from sasgeo_bench.regions.region import DATA_VERSION
+from sasgeo_bench.running.failures import LOG, Failures, log_beside, stops_all
+from sasgeo_bench.running.sandbox import joined
+from sasgeo_bench.scoring.contestants import Told, read_told, score_told
+from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
+from sasgeo_bench.scoring.controls import Verdict, hold_controls, is_control, verdict_frame
+from sasgeo_bench.scoring.costs import cost_rows
+from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out
+from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
+from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
+from sasgeo_bench.scoring.protection import protection_frame
+from sasgeo_bench.scoring.rejection import OWN, Rule, remarks_of, rules_of
+from sasgeo_bench.scoring.rejector_evaluation import Judging, carry_out
+from sasgeo_bench.scoring.rows import Contestant, name_alone, to_frame, with_contestants
+from sasgeo_bench.scoring.score import SCORER_VERSION
+from sasgeo_bench.scoring.scored_tasks import ScoredTask, read_scored_task
+from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
+from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.scoring.train_test_overlap import set_apart
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, Truth, base_of
+from sasgeo_bench.tasks.split import Split
+
+_LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+INTERVALS: Final = "intervals of suites"  # what progress is shown of
+JUDGED: Final = "rejectors"
+_CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreRequest:
+    """What is to be put on a board.
+
+    Parameters
+    ----------
+    predictions : sequence of Path
+        Folders of runs (any folder with runs in it), and files of predictions.
+    tasks : sequence of Path
+        Task folders; without any, those that the runs and files answer. A matcher that was asked nothing of one of them
+        has no figures on its suite.
+    root : Path
+        Where tasks/ and truth/ are.
+    truth : Path, optional
+        Folder of the truths, where it is another one.
+    split : Split, optional
+        Says which blocks are one place, and which calibrate; needed for rejectors.
+    contrasts : sequence of Contrast
+        Those that were registered.
+    rejectors : sequence of str
+        Names, or module:Class.
+    board : Path
+        Folder to write.
+    draws : int
+        Of the bootstrap.
+    by_region : collection of str
+        Suites whose regions are resampled, not their blocks: those of which each region is a draw of its own.
+    pipeline : mapping of str to str
+        Name and hash of the pipeline that asks for it; none for a board of `score`.
+    extras : sequence of callable
+        Each makes, of the finished board, files that are written with it.
+    without : collection of str
+        Regions that are left out, on each of their maps.
+    submissions : sequence of Path
+        Folders of submissions, scored as files are, but held to more (`validate.submission_faults`).
+    jobs : int
+        Processes that fit rejectors.
+    private : Path, optional
+        A board of a private seed of the same pipeline, which the rows are held against.
+    kept : mapping, optional
+        What `board.json` of stored results says: the version of their maps is kept, and what came of a private seed
+        where no other board is named.
+    failed : mapping of str to str
+        Contestants that failed before anything was scored, and why.
+    """
+
+    predictions: Sequence[Path]
+    root: Path
+    board: Path
+    tasks: Sequence[Path] = ()
+    truth: Path | None = None
+    split: Split | None = None
+    contrasts: Sequence[Contrast] = ()
+    rejectors: Sequence[str] = ()
+    draws: int = DRAWS
+    by_region: Collection[str] = ()
+    pipeline: Mapping[str, str] = field(default_factory=dict)
+    extras: Sequence[Callable[["Board"], Extra]] = ()
+    without: Collection[str] = ()
+    submissions: Sequence[Path] = ()
+    jobs: int = 1
+    private: Path | None = None
+    kept: Mapping[str, Any] = field(default_factory=dict)
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
+
+    `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
+    `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id,
+    `truths` all that is known of it, controls among them. `everyone` are the entries with those who were asked nothing
+    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are,
+    `on_private` what came of the rows on a private seed, `failures` who failed and why.
+    """
+
+    entries: tuple[Entry, ...]
+    scores: dict[str, pd.DataFrame]
+    predictions: dict[str, dict[str, Prediction]]
+    table: pd.DataFrame
+    findings: tuple[Finding, ...] = ()
+    falsifiers: tuple[Falsifier, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
+    tasks: tuple[dict[str, Any], ...] = field(default=())
+    remarks: tuple[str, ...] = ()
+    protection: pd.DataFrame = field(default_factory=pd.DataFrame)
+    judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
+    measured: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    truths: Mapping[str, Truth] = field(default_factory=dict)
+    everyone: tuple[Entry, ...] = ()
+    apart: Mapping[str, str] = field(default_factory=dict)
+    on_private: OnPrivate = field(default_factory=OnPrivate)
+    failures: Failures = field(default_factory=lambda: Failures(Path(LOG), tell=lambda _: None))
+
+
+def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
+    """Score everything and write the board.
+
+    Parameters
+    ----------
+    request : ScoreRequest
+        What is asked for.
+    tell : callable
+        Gets a line now and then.
+    progress : Progress, optional
+        Shows how far the intervals and the rejectors are; lines by `tell` unless given.
+
+    Returns
+    -------
+    Board
+        What was written.
+
+    Raises
+    ------
+    StoreError
+        If predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by itself
+        answers none of the queries; nothing is written.
+    ConfigError
+        If there is nothing to score, or rejectors are asked for without a split.
+    """
+    progress = progress or Lines(tell)
+    check_board(request.board, scorer_version=SCORER_VERSION)
+    failures = Failures(log_beside(request.board), tell=lambda _: None)  # told when the board is there, or raised
+    while (board := _made(request, failures, tell, progress)) is None:
+        tell("scored again without those that failed")
+    return board
+
+
+def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress) -> Board | None:
+    """A board of all that have not failed; None where one fails only now, and was counted with the others."""
+    rules = rules_of(request.rejectors, request.split)
+    entries = leave_out(find_entries(request.predictions, request.submissions, failures=failures), request.without)
+    names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
+    failures.found |= {name: why for name, why in request.failed.items() if name not in names}
+    wanted = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
+    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell, failures=failures)
+    folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
+    tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
+    seed_of([task.about for task in tasks])
+    everything = score_told(told, tasks, split=request.split, by_region=request.by_region, failures=failures)
+    told = [item for item in told if item.entry.name in everything]
+    predictions = {item.entry.name: item.predictions for item in told}
+    verdicts = hold_controls(everything)
+    whole = _asked_whole(told, tasks, tell)
+    scores = {name: _ranked(frame, whole[name]) for name, frame in everything.items()}
+    scores = {name: frame for name, frame in scores.items() if len(frame)}
+    entries = tuple(item.entry for item in told if item.entry.name in scores)
+    _check_some(scores)
+    apart = _apart(entries, scores, request.split, tell)
+    on_private = _on_private(request, entries, scores, tasks, tell)
+    entries = tuple(replace(entry, how=on_private.how(entry)) for entry in entries)
+    compare = partial(_leaderboards, whole=whole, draws=request.draws, apart=apart, progress=progress)
+    rows = _compared(scores, compare, failures)
+    if rows is None:
+        return None
+    rows += _costs(entries, scores, tasks, failures, tell)
+    all_judged, more = _all_judged(
+        _judgings(entries, scores, predictions, rules, request.split), request, failures, tell, progress
+    )
+    rows += more
+    _check_rejectors(rules, entries, failures)
+    remarks = _remarks(all_judged, tell)
+    figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
+    table = with_contestants(figures, _contestants(entries, apart))
+    findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws, failed=failures.found)
+    held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failures.found]
+    board = Board(
+        entries=entries,
+        scores=scores,
+        predictions=predictions,
+        table=table,
+        findings=findings,
+        falsifiers=hold_falsifiers(held, scores, draws=request.draws),
+        verdicts=verdicts,
+        tasks=tuple(task.about for task in tasks),
+        remarks=remarks,
+        protection=_protection(scores, predictions, request.split, failures),
+        judged={key: frame for key, frame in all_judged.items() if len(frame)},
+        measured={truth.query_id: truth.measured for task in tasks for truth in task.truths},
+        truths={truth.query_id: truth for task in tasks for truth in task.truths},
+        everyone=tuple(item.entry for item in told),
+        apart=apart,
+        on_private=on_private,
+        failures=failures,
+    )
+    _tell_gone(request.board, board.everyone, tell)
+    _write(request, board, _extras(request, board, tell), [rule.card for rule in rules.values()])
+    return board
+
+
+Compare = Callable[[Mapping[str, pd.DataFrame]], list[pd.DataFrame]]
+
+
+def _compared(scores: Mapping[str, pd.DataFrame], compare: Compare, failures: Failures) -> list[pd.DataFrame] | None:
+    """Figures of all contestants beside each other; None where one of them fails, who is noted."""
+    try:
+        return compare(scores)
+    except Exception as error:
+        if stops_all(error) or not failures.blame(scores, compare):
+            raise
+        return None
+
+
+def _costs(
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    tasks: Sequence[ScoredTask],
+    failures: Failures,
+    tell: Tell,
+) -> list[pd.DataFrame]:
+    """What the answers of each contestant took; how many there are is told."""
+    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
+    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
+    rows = []
+    for entry in entries:
+        frame = scores[entry.name]
+        with failures.of(f"costs of {entry.name}"):
+            rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+        tell(f"{entry.name}: {_in_words(frame)}")
+    return rows
+
+
+Judgement = dict[tuple[str, str], pd.DataFrame]
+
+
+def _all_judged(
+    judgings: Sequence[Judging], request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress
+) -> tuple[Judgement, list[pd.DataFrame]]:
+    """What rejectors say by matcher and rejector, and rows of the board."""
+    said: Judgement = {}
+    rows: list[pd.DataFrame] = []
+    progress.begin(JUDGED, len(judgings))
+    for judged in carry_out(judgings, jobs=request.jobs):
+        rows += judged.rows
+        progress.advance(JUDGED, 1)
+        said |= {(judged.matcher, name): frame for name, frame in judged.said.items()}
+        for line in judged.lines:
+            tell(line)
+        for name, fault in judged.failed.items():
+            failures.note(f"{judged.matcher} x {name}", fault)
+    return said, rows
+
+
+def _extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:
+    """Files besides; what cannot be made is left out, and so is a figure that cannot be drawn."""
+    if request.extras:
+        tell("drawing figures and pictures")
+    found: list[Extra] = []
+    for make in request.extras:
+        with board.failures.of("more of the board"):
+            extra = make(board)
+            guarded = {name: partial(_draw, draw, name, board.failures) for name, draw in extra.figures.items()}
+            found.append(replace(extra, figures=guarded))
+    return found
+
+
+def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: Path) -> None:
+    """Draw a figure; of one that fails nothing is left."""
+    with failures.of(f"figure {name}"):
+        draw(path)
+        return
+    path.unlink(missing_ok=True)
+
+
+def _check_rejectors(rules: Mapping[str, Rule], entries: Sequence[Entry], failures: Failures) -> None:
+    """Raise what a rejector raises that fails with everybody: then it is at fault, not their answers."""
+    for name in rules:
+        errors = [failures.errors.get(f"{entry.name} x {name}") for entry in entries]
+        if errors and errors[0] is not None and None not in errors:
+            raise errors[0]
+
+
+def _tell_gone(folder: Path, everyone: Sequence[Entry], tell: Tell) -> None:
+    """Say which rows an older board of that name had and this one has not: their author may look for them."""
+    try:
+        about, _ = read_board(folder)
+        had = [str(entry["name"]) for entry in about["entries"]]
+    except (StoreError, KeyError, TypeError):  # none, or nothing that can be read
+        return
+    gone = sorted(set(had) - {entry.name for entry in everyone})
+    if gone:
+        tell(f"{folder} had rows of {', '.join(gone)}, which this board has not; their answers are where they were")
+
+
+def _judgings(
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    predictions: Mapping[str, Mapping[str, Prediction]],
+    rules: Mapping[str, Rule],
+    split: Split | None,
+) -> list[Judging]:
+    """What rejectors are to judge: the answers of each contestant."""
+    return [
+        Judging(
+            matcher=entry.name,
+            scores=scores[entry.name],
+            predictions=predictions[entry.name],
+            rules=rules,
+            split=split,
+            is_taught=entry.is_taught,
+        )
+        for entry in entries
+    ]
+
+
+def _apart(
+    entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None, tell: Tell
+) -> dict[str, str]:
+    """Why rows are set apart; told, too."""
+    found = set_apart(entries, scores, split)
+    for name, why in found.items():
+        tell(f"{name}: set apart, {why}")
+    return found
+
+
+def _on_private(
+    request: ScoreRequest,
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    tasks: Sequence[ScoredTask],
+    tell: Tell,
+) -> OnPrivate:
+    """What came of the rows on a private seed: of the board that is named, else as stored results say."""
+    if request.private is None:
+        return OnPrivate() if request.without else kept_private(request.kept, entries, request.root)
+    found = hold_private(
+        request.private,
+        entries=entries,
+        scores=scores,
+        tasks=[task.about for task in tasks],
+        pipeline=request.pipeline,
+        draws=request.draws,
+        tell=tell,
+    )
+    for name, row in found.rows.items():
+        tell(f"{name}: {row['verdict']} ({row['why']})")
+    return found
+
+
+def _contestants(entries: Sequence[Entry], apart: Mapping[str, str]) -> dict[str, Contestant]:
+    return {entry.name: Contestant(entry.version, entry.hash, entry.how, apart.get(entry.name)) for entry in entries}
+
+
+def _check_some(scores: Mapping[str, pd.DataFrame]) -> None:
+    if not scores:
+        message = (
+            f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
+            "its tasks (--tasks names some)"
+        )
+        raise ConfigError(message)
+
+
+def _remarks(all_judged: Mapping[tuple[str, str], pd.DataFrame], tell: Tell) -> tuple[str, ...]:
+    """What rejectors said of their fits; told, too."""
+    judged = ((key, frame) for key, frame in all_judged.items() if key[1] != OWN)
+    said = tuple(f"{name} on {matcher}: {item}" for (matcher, name), frame in judged for item in remarks_of(frame))
+    for remark in said:
+        tell(remark)
+    return said
+
+
+def _protection(
+    scores: Mapping[str, pd.DataFrame],
+    predictions: Mapping[str, Mapping[str, Prediction]],
+    split: Split | None,
+    failures: Failures,
+) -> pd.DataFrame:
+    """Protection levels of all contestants; empty where none tells any."""
+    frames = []
+    for name, frame in scores.items():
+        with failures.of(f"protection levels of {name}"):
+            frames.append(protection_frame(name, frame, predictions[name], split))
+    told = [frame for frame in frames if len(frame)]
+    return pd.concat(told, ignore_index=True) if told else pd.DataFrame(columns=list(PROTECTION_COLUMNS))
+
+
+def _in_words(scores: pd.DataFrame) -> str:
+    """How many queries of a contestant have a fix, and what became of the others."""
+    answered = scores["is_answered"].to_numpy(bool)
+    rest = scores.loc[~answered, "status"].replace("ok", "withheld").value_counts()
+    others = "".join(f", {count} {status}" for status, count in sorted(rest.items()))
+    return f"{int(answered.sum())} of {len(scores)} queries answered{others}"
+
+
+def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
+    """Scored rows that make figures: those of some suites, and of no control."""
+    return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
+
+
+def _asked_whole(told: Sequence[Told], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
+    """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
+    suites = {task.about["suite"] for task in tasks}
+    found = {}
+    for item in told:
+        spared = {task.about["suite"] for task in tasks if task.folder not in item.asked}
+        found[item.entry.name] = frozenset(suites - spared)
+        lost = sorted({task.about["suite"] for task in tasks if task.folder in item.asked} & spared - {CONTROLS})
+        if lost:
+            tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
+    return found
+
+
+def _leaderboards(
+    scores: Mapping[str, pd.DataFrame],
+    *,
+    whole: Mapping[str, Collection[str]],
+    draws: int,
+    apart: Collection[str],
+    progress: Progress,
+) -> list[pd.DataFrame]:
+    """Figures of suites by those who were asked all of them: in most cases one table of everything."""
+    asked_by: dict[tuple[str, ...], set[str]] = {}
+    progress.begin(
+        INTERVALS, len({key for frame in scores.values() for key in frame[[*GROUP]].itertuples(index=False)})
+    )
+    for suite in sorted({suite for frame in scores.values() for suite in frame["suite"]}):
+        asked_by.setdefault(tuple(name for name in scores if suite in whole[name]), set()).add(suite)
+    return [
+        leaderboard(
+            {name: _ranked(scores[name], suites) for name in names},
+            draws=draws,
+            apart=apart,
+            done=lambda: progress.advance(INTERVALS, 1),
+        )
+        for names, suites in asked_by.items()
+    ]
+
+
+def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
+    """What `board.json` says."""
+    seed = seed_of(board.tasks)
+    return {
+        "scorer_version": SCORER_VERSION,
+        "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
+        "data_version": request.kept.get("data_version") or DATA_VERSION,  # of the maps that were asked about
+        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
+        "libraries": _libraries(),
+        "pipeline": dict(request.pipeline) or None,
+        **{name: said for name, said in ((task_files.PRIVATE, seed), ("private", board.on_private.seed)) if said},
+        "split": None if request.split is None else request.split.spec.id,
+        "draws": request.draws,
+        "contrasts": [asdict(item) for item in request.contrasts],
+        "by_region": sorted(request.by_region),
+        "without": sorted(set(request.without)),
+        "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
+        "remarks": list(board.remarks),
+        "failed": board.failures.found,  # what fails while figures are drawn is added until the file is written
+        "entries": [
+            {
+                "name": entry.name,
+                "version": entry.version,
+                "hash": entry.hash,
+                "how": entry.how,
+                "card": entry.card,
+                "trained_on": entry.declared,
+                "set_apart": board.apart.get(entry.name),
+                "isolation": joined(run.get("isolation") or {} for run in entry.runs) if entry.runs else None,
+                "learned": entry.learned(),
+                **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
+            }
+            for entry in board.entries
+        ],
+        "tasks": [
+            {
+                "suite": item["suite"],
+                "suite_version": item.get("suite_version"),
+                "region": item["region"],
+                "map_date": item.get("map_date"),
+                "queries_sha256": item["files"][task_files.QUERIES]["sha256"],
+                "map_fingerprint": item["map_fingerprint"],
+            }
+            for item in board.tasks
+        ],
+    }
+
+
+def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
+    about = _about(request, board, cards)
+    scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
+    queries = queries_of(board.scores)
+    steps = steps_frame(board.table, queries, sorted(board.scores))
+    write_board(
+        request.board,
+        tables={
+            "leaderboard": board.table,
+            "scores": scores,
+            "contrasts": contrast_frame(board.findings),
+            "falsifiers": falsifier_frame(board.falsifiers),
+            "controls": verdict_frame(board.verdicts),
+            **({PROTECTION: board.protection} if len(board.protection) else {}),
+        },
+        texts={
+            "leaderboard.md": board_markdown(
+                board.table,
+                about,
+                board.findings,
+                board.falsifiers,
+                board.verdicts,
+                steps,
+                age_names(ages_frame(steps, queries, board.measured)),
+            ),
+            "leaderboard.tex": board_latex(board.table, about, board.findings, board.verdicts),
+        },
+        about=about,
+        extras=extras,
+    )
+
+
+def _libraries() -> dict[str, str]:
+    """Versions of what figures and fits hang on, Python's among them; of those that are installed."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture of one query and its answer: the view, both places on the map, the modes, and what is known of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import shapely
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
+
+from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.picture import pixels_of
+from sasgeo_bench.regions.evidence import Evidence, footprint
+from sasgeo_bench.regions.preview import scale_bar
+from sasgeo_bench.tasks.sheet import HIDDEN, paint
+
+MOST_MODES: Final = 8  # bars of an answer; a list may be longer
+TRUE: Final = "#000000"
+ANSWERED: Final = "#d55e00"
+_OTHER: Final = "#0072b2"
+_GREY: Final = "#444444"
+_SIDE: Final = 1.72  # of a small panel, inches
+_MAP: Final = 3.9
+_WIDTH: Final = 0.12 + 3 * (_SIDE + 0.08) + 0.1 + _MAP + 0.1
+_HEIGHT: Final = 0.62 + _MAP + 0.26
+_DPI: Final = 100
+_HALO: Final = (patheffects.withStroke(linewidth=2.6, foreground="white"),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapPart:
+    """A piece of a map as it is drawn: colours of shape (rows, cols, 3), and its edges in metres."""
+
+    colours: NDArray[np.float64]
+    west_m: float
+    south_m: float
+    east_m: float
+    north_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CasePicture:
+    """What the picture of a query shows.
+
+    Parameters
+    ----------
+    title : str
+        Whose answer to what, and how it failed.
+    view : Evidence
+        What was seen.
+    part : MapPart
+        The map around the places.
+    true : Pose, optional
+        Where the view was taken; None where that is not on the map.
+    is_present : bool
+        Whether that place can be found; else it is drawn, and named so.
+    modes : sequence of (Pose, float)
+        The answer, best first; none where it was withheld.
+    at_true, at_answer : Evidence, optional
+        What the map shows at the true and at the first place.
+    disc : (float, float, float), optional
+        Easting, northing and radius of the disc that is searched.
+    said : sequence of str
+        Lines on what the answer and the integrity model say.
+    attribution : str
+        Of the map.
+    """
+
+    title: str
+    view: Evidence
+    part: MapPart
+    true: Pose | None
+    is_present: bool
+    modes: Sequence[tuple[Pose, float]]
+    at_true: Evidence | None
+    at_answer: Evidence | None
+    disc: tuple[float, float, float] | None
+    said: Sequence[str]
+    attribution: str
+
+
+def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
+    """Draw a query and its answer; pixels as of `picture.pixels_of`, the same for the same case."""
+    figure = PlainFigure(figsize=(_WIDTH, _HEIGHT), dpi=_DPI, facecolor="white")
+    _text(figure, 0.12, _HEIGHT - 0.1, case.title, size=10.5, weight="bold")
+    _text(figure, 0.12, 0.17, f"Map: {case.attribution}", size=7)
+    top = _HEIGHT - 0.62
+    where = "map at the true place" if case.is_present else "map where it was taken"
+    panels = (("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer))
+    for number, (name, evidence) in enumerate(panels):
+        box = (0.12 + number * (_SIDE + 0.08), top - _SIDE, _SIDE, _SIDE)
+        _panel(_axes(figure, box), name, evidence)
+    _draw_map(_axes(figure, (_WIDTH - 0.1 - _MAP, top - _MAP, _MAP, _MAP)), case)
+    low = top - _MAP
+    _draw_modes(_axes(figure, (0.62, low + 0.33, 1.62, _MAP - _SIDE - 0.75)), case)
+    lines = "\n".join(case.said)
+    _text(figure, 2.5, top - _SIDE - 0.2, lines, size=6.8, linespacing=1.32)
+    return pixels_of(figure)
+
+
+def _axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
+    left, low, wide, high = box
+    return figure.add_axes((left / _WIDTH, low / _HEIGHT, wide / _WIDTH, high / _HEIGHT))
+
+
+def _text(
+    figure: Figure, left: float, top: float, text: str, *, size: float, weight: str = "normal", linespacing: float = 1.2
+) -> None:
+    figure.text(left / _WIDTH, top / _HEIGHT, text, va="top", fontsize=size, fontweight=weight, linespacing=linespacing)
+
+
+def _panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
+    chart.set_xticks([])
+    chart.set_yticks([])
+    chart.set_title(name, fontsize=7.5, pad=2, loc="left")
+    if evidence is None:
+        chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=8, color=_GREY, transform=chart.transAxes)
+    else:
+        chart.imshow(paint(evidence), interpolation="antialiased")
+
+
+def _draw_map(chart: Axes, case: CasePicture) -> None:
+    """North up, metres from the lower left corner."""
+    part = case.part
+    width_m, height_m = part.east_m - part.west_m, part.north_m - part.south_m
+    side_m = max(width_m, height_m)
+    chart.imshow(part.colours, extent=(0, width_m, 0, height_m), interpolation="antialiased", alpha=0.75)
+    chart.set_xlim(0, side_m)
+    chart.set_ylim(0, side_m)
+    chart.set_facecolor(HIDDEN)
+    chart.add_patch(Rectangle((0, 0), width_m, height_m, color="white", lw=0, zorder=-1))
+    chart.set_xticks([])
+    chart.set_yticks([])
+    chart.set_title(f"map, north up, {side_m:.0f} m across: {_key(case)}", fontsize=7.5, pad=2, loc="left")
+    if case.disc is not None:
+        easting_m, northing_m, radius_m = case.disc
+        middle = (easting_m - part.west_m, northing_m - part.south_m)
+        chart.add_patch(Circle(middle, radius_m, fill=False, ec="#555555", lw=0.8, ls=":"))
+    for number, (pose, _) in reversed(list(enumerate(case.modes[:MOST_MODES], start=1))[1:]):
+        at = _at(pose, part)
+        if 0 <= at[0] <= side_m and 0 <= at[1] <= side_m:
+            chart.text(*at, str(number), fontsize=6.5, color=_OTHER, ha="center", va="center", path_effects=_HALO)
+    size_m = case.view.size_m
+    if case.modes:
+        _outline(chart, case.modes[0][0], size_m, part, colour=ANSWERED, dash="--")
+    if case.true is not None:
+        _outline(chart, case.true, size_m, part, colour=TRUE, dash="-")
+    if case.true is not None and case.modes:
+        _offset(chart, case, part)
+    scale_bar(chart, side_m, side_m)
+
+
+def _key(case: CasePicture) -> str:
+    """What is drawn on the map, in words."""
+    shown = [("true place solid" if case.is_present else "where it was taken solid", case.true is not None)]
+    shown += [("answer dashed", bool(case.modes)), ("search dotted", case.disc is not None)]
+    return ", ".join(name for name, is_there in shown if is_there)
+
+
+def _at(pose: Pose, part: MapPart) -> tuple[float, float]:
+    return (pose.easting_m - part.west_m, pose.northing_m - part.south_m)
+
+
+def _outline(chart: Axes, pose: Pose, size_m: tuple[float, float], part: MapPart, *, colour: str, dash: str) -> None:
+    """Footprint of a view, with a notch that points where its top is."""
+    ring = shapely.get_coordinates(footprint(pose, size_m=size_m)) - (part.west_m, part.south_m)
+    chart.plot(ring[:, 0], ring[:, 1], color=colour, ls=dash, lw=1.6, path_effects=_HALO)
+    up = np.array([(0.0, 0.5), (0.0, 0.36)]) * size_m[1]
+    top = pose.to_map(up) - (part.west_m, part.south_m)
+    chart.plot(top[:, 0], top[:, 1], color=colour, lw=1.6, path_effects=_HALO)
+    chart.plot(*_at(pose, part), color=colour, marker="o", ms=3.5, path_effects=_HALO)
+
+
+def _offset(chart: Axes, case: CasePicture, part: MapPart) -> None:
+    """A line between both places, with its length."""
+    if case.true is None:
+        return
+    ends = np.array([_at(case.true, part), _at(case.modes[0][0], part)])
+    chart.plot(ends[:, 0], ends[:, 1], color="#000000", lw=0.7)
+    middle = ends.mean(axis=0)
+    text = f"{float(np.hypot(*(ends[1] - ends[0]))):.0f} m"
+    chart.text(
+        float(middle[0]),
+        float(middle[1]),
+        text,
+        fontsize=7.5,
+        ha="center",
+        va="bottom",
+        weight="bold",
+        path_effects=_HALO,
+    )
+
+
+def _draw_modes(chart: Axes, case: CasePicture) -> None:
+    """Scores of the modes as bars from the least of them; each named by how far it is from the true place."""
+    chart.set_title("scores of the modes", fontsize=7.5, pad=2, loc="left")
+    modes = list(case.modes[:MOST_MODES])
+    chart.set_yticks([])
+    for side in ("top", "right"):
+        chart.spines[side].set_visible(False)
+    if not modes:
+        chart.set_xticks([])
+        chart.text(0.5, 0.5, "no answer", ha="center", va="center", fontsize=8, color=_GREY, transform=chart.transAxes)
+        return
+    scores = np.array([score for _, score in modes])
+    least = min(0.0, float(scores.min())) if float(scores.min()) < 0 <= float(scores.max()) else float(scores.min())
+    room = (float(scores.max()) - least) or 1.0
+    base = least - 0.12 * room if least == float(scores.min()) else least
+    places = np.arange(len(modes))
+    colours = [ANSWERED if at == 0 else _OTHER for at in places]
+    chart.barh(places, scores - base, left=base, height=0.7, color=colours)
+    chart.set_yticks(places, [_away(case, pose, at + 1) for at, (pose, _) in enumerate(modes)], fontsize=6.3)
+    chart.set_ylim(len(modes) - 0.4, -0.6)
+    chart.set_xlim(base, float(scores.max()) + 0.04 * room)
+    ends = sorted({float(scores.min()), float(scores.max())})
+    chart.set_xticks(ends, [f"{end:.4g}" for end in ends], fontsize=6.3)
+    chart.tick_params(axis="y", length=0, pad=2)
+    rest = len(case.modes) - len(modes)
+    unit = "score (the matcher's own unit)" + (f"; {rest} more" if rest > 0 else "")
+    chart.set_xlabel(unit, fontsize=6.3, labelpad=1)
+
+
+def _away(case: CasePicture, pose: Pose, number: int) -> str:
+    """Number of a mode, and how far from the true place it is."""
+    if case.true is None:
+        return str(number)
+    away_m = np.hypot(pose.easting_m - case.true.easting_m, pose.northing_m - case.true.northing_m)
+    return f"{number}: {away_m:.0f} m"

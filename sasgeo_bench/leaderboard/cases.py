@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Queries that went wrong, each in one class of failure, and a few of each class to look at.
+
+The classes, in the order in which they are tried; every failure is in the first that fits:
+
+absent accepted
+    The place is absent, and the answer is accepted.
+right but withheld
+    The fix is right, and is not accepted.
+aged
+    Under a stress whose view differs more from the map than that of its control does (`changed_share`, by at least
+    0.1), the answer is wrong or none, and that of the control is right: same matcher, site, track, prior group and
+    size of view.
+occluded
+    The same with more of the view unknown (`unknown_share`, by at least 0.05).
+aliased
+    The answer is wrong and accepted, at a place that has a double: alias index at least 0.9, the highest bin of a
+    board, or a suite that copies places.
+also without the stress
+    Under a stress the answer is wrong or none, and so is that of a control at the site: the stress is not to blame.
+other
+    Any other control or stress at a present place without a right answer.
+
+Accepted is what the operating rejector accepts at the threshold that kept the risk at 5 % on calibration places; where
+there is none, every answer. Right is within 25 m whatever the heading, on both tracks, as in all figures of
+rejection. Falsifiers are no cases: of some of them nothing else is asked than no answer.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.scoring.base import Bools
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.rejection import OWN
+
+BOTH: Final = "also without the stress"
+FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but withheld", BOTH, "other")
+OPERATING: Final = "accepted_0.05"  # column of judged rows
+COLUMNS: Final = ("query_id", "matcher", "failure", "suite", "region", "kind")
+MOST_CASES: Final = 60  # of a board
+_ALIAS: Final = 0.9
+_UNKNOWN_MORE: Final = 0.05
+_CHANGED_MORE: Final = 0.1  # the lowest bin of a board ends there: less is hardly a change
+_COPIES: Final = ("alias", "topology-twins", "instance-twins")  # suites where every place has a double
+_SITE: Final = ("pair_id", "track", "prior_group", "view_cells")
+
+
+def operating_rejector(
+    judged: Mapping[tuple[str, str], pd.DataFrame], matcher: str, contrasts: Sequence[Contrast] = ()
+) -> str | None:
+    """The rejector by whose threshold a matcher's answers are taken for accepted.
+
+    Parameters
+    ----------
+    judged : mapping of (matcher, rejector) to pandas.DataFrame
+        What rejectors say, in the order they were asked for.
+    matcher : str
+        Whose answers.
+    contrasts : sequence of Contrast
+        Those that were registered: what stands first in one of them goes first.
+
+    Returns
+    -------
+    str or None
+        Of a contrast, else the first that was asked for, else the matcher's own word; None where none has a threshold.
+
+    Examples
+    --------
+    >>> rows = pd.DataFrame({"accepted_0.05": [True]})
+    >>> operating_rejector({("m", "own"): rows, ("m", "margin"): rows}, "m")
+    'margin'
+    """
+    sides = [item.first.partition(" x ") for item in contrasts]
+    first = [rejector for name, _, rejector in sides if name == matcher and rejector]
+    known = [rejector for name, rejector in judged if name == matcher]
+    for rejector in (*first, *(name for name in known if name != OWN), OWN):
+        frame = judged.get((matcher, rejector))
+        if frame is not None and frame[OPERATING].notna().any():
+            return rejector
+    return None
+
+
+def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Failures of one matcher.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Its scored rows.
+    matcher : str
+        Its name.
+    judged : pandas.DataFrame, optional
+        What the operating rejector says of them; rows that it says nothing of have no threshold.
+
+    Returns
+    -------
+    pandas.DataFrame
+        `COLUMNS`, a row for each failure in the order of the scores.
+    """
+    taken, has_threshold = _accepted(scores, judged)
+    is_present, is_right, is_answered = (
+        scores[name].to_numpy(bool) for name in ("is_present", "is_right", "is_answered")
+    )
+    is_stress, is_asked = ((scores["role"] != role).to_numpy(bool) for role in ("control", "falsifier"))
+    is_wrong = is_present & ~is_right & is_asked
+    control = _controls(scores)
+    is_paired = is_wrong & is_stress & control["is_right"].to_numpy(bool)
+    changed, unknown = (scores[name].to_numpy(float) for name in ("changed_share", "unknown_share"))
+    alias = scores["alias_index"].astype(float).fillna(0.0).to_numpy(float)
+    has_double = (alias >= _ALIAS) | scores["suite"].isin(_COPIES).to_numpy(bool)
+    rules = (
+        ("absent accepted", ~is_present & is_answered & taken & is_asked),
+        ("right but withheld", is_present & is_right & has_threshold & ~taken & is_asked),
+        ("aged", is_paired & (changed >= control["changed_share"].to_numpy(float) + _CHANGED_MORE)),
+        ("occluded", is_paired & (unknown >= control["unknown_share"].to_numpy(float) + _UNKNOWN_MORE)),
+        ("aliased", is_wrong & is_answered & taken & has_double),
+        (BOTH, is_wrong & is_stress & control["is_wrong"].to_numpy(bool)),
+        ("other", is_wrong),
+    )
+    failure = np.select([mask for _, mask in rules], [name for name, _ in rules], default="")
+    found = scores.assign(matcher=matcher, failure=failure)
+    return pd.DataFrame(found[failure != ""], columns=list(COLUMNS)).reset_index(drop=True)
+
+
+def _accepted(scores: pd.DataFrame, judged: pd.DataFrame | None) -> tuple[Bools, Bools]:
+    """Which answers are accepted, and of which a threshold says so."""
+    answered = scores["is_answered"].to_numpy(bool)
+    if judged is None:
+        return answered, np.zeros(len(scores), dtype=bool)
+    said = dict(zip(judged["query_id"], judged[OPERATING], strict=True))
+    known = np.array([float(said.get(name, np.nan)) for name in scores["query_id"]], dtype=np.float64)
+    is_known = ~np.isnan(known)
+    return np.where(is_known, known > 0, answered), is_known
+
+
+def _controls(scores: pd.DataFrame) -> pd.DataFrame:
+    """Of each row the controls at its site: whether all are right, whether some are wrong, and what they saw."""
+    controls = scores[(scores["role"] == "control").to_numpy(bool) & scores["is_present"].to_numpy(bool)]
+    how = {"is_right": "all", "changed_share": "max", "unknown_share": "max"}
+    found = controls.groupby(list(_SITE), as_index=False).agg(how)
+    beside = scores[list(_SITE)].merge(found, on=list(_SITE), how="left")
+    said = {"is_right": beside["is_right"].eq(other=True), "is_wrong": beside["is_right"].eq(other=False)}
+    return beside.assign(**said).fillna({"changed_share": 0.0, "unknown_share": 0.0})
+
+
+def sample_cases(cases: pd.DataFrame, *, each: int, most: int = MOST_CASES) -> pd.DataFrame:
+    """A few failures of each class and matcher; which ones hangs on nothing but their names.
+
+    Parameters
+    ----------
+    cases : pandas.DataFrame
+        From `find_cases`, of all matchers one after the other.
+    each : int
+        At most so many of a class and matcher.
+    most : int
+        At most so many in all: the first of every class and matcher, then the second of each, and so on.
+
+    Returns
+    -------
+    pandas.DataFrame
+        In the order of classes, then of matchers as they were given.
+
+    Examples
+    --------
+    >>> some = pd.DataFrame({"query_id": ["a", "b"], "matcher": "m", "failure": "other", "suite": "clean"})
+    >>> len(sample_cases(some, each=1)), len(sample_cases(some, each=5))
+    (1, 2)
+    """
+    if cases.empty:
+        return cases
+    matchers = list(dict.fromkeys(cases["matcher"]))
+    ranked = cases.assign(
+        _class=cases["failure"].map(FAILURES.index),
+        _who=cases["matcher"].map(matchers.index),
+        _mark=[_mark(*names) for names in zip(cases["matcher"], cases["query_id"], strict=True)],
+    ).sort_values(["_class", "_who", "_mark"])
+    ranked = ranked.assign(_round=ranked.groupby(["_class", "_who"]).cumcount())
+    chosen = ranked[ranked["_round"] < each].sort_values(["_round", "_class", "_who"], kind="stable").head(most)
+    chosen = chosen.sort_values(["_class", "_who", "_round"], kind="stable")
+    return chosen[list(cases.columns)].reset_index(drop=True)
+
+
+def _mark(matcher: str, query_id: str) -> str:
+    return hashlib.sha256(f"{matcher}/{query_id}".encode()).hexdigest()
+
+
+def count_cases(cases: pd.DataFrame) -> dict[str, int]:
+    """How many failures of each class there are.
+
+    Examples
+    --------
+    >>> count_cases(pd.DataFrame({"failure": ["aged", "aged"]}))["aged"]
+    2
+    """
+    counts = cases["failure"].value_counts()
+    return {name: int(counts.get(name, 0)) for name in FAILURES}

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a file in `pipelines/` says: an experiment as data, read before anything is run."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sasgeo_bench.config import (
+    Document,
+    Line,
+    NamedDocument,
+    Prose,
+    Short,
+    find_document,
+    list_documents,
+    read_document,
+)
+from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, Track
+
+PAPER_SUITE: Final = "paper-poc"
+CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
+
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
+
+
+class ContrastSpec(Document):
+    """One registered contrast; `first` and `second` are matchers, or "matcher x rejector" for the metric "aurc"."""
+
+    name: Name
+    first: str
+    second: str
+    suites: Annotated[list[str], Field(min_length=1)]
+    kinds: list[Short] = []
+    metric: Literal["primary", "aurc"] = "primary"
+    track: Literal["localization", "retrieval"] = "localization"
+    min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
+    why: Prose = ""
+
+
+class TaskSpec(Document):
+    """Suites that are drawn alike; several of these make up a pipeline.
+
+    `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
+    `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
+    at more sites say more.
+    """
+
+    suites: Annotated[list[str], Field(min_length=1)]
+    sites: Annotated[int, Field(ge=1, le=10_000)]
+    prior: str | None = None
+    matchers: list[str] = []
+    views_cells: list[Annotated[int, Field(gt=0)]] = []
+    kinds: list[Short] = []
+    tracks: list[Track] = []
+
+
+class PaperSpec(Document):
+    """The paper's own experiment: regions and trials of each of these seeds, drawn with no split and no other setting.
+
+    Examples
+    --------
+    >>> PaperSpec().seeds, PaperSpec().trials
+    ([42], 220)
+    """
+
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = [42]
+    trials: Annotated[int, Field(ge=1, le=10_000)] = 220
+
+
+class LearningSpec(Document):
+    """What matchers that have a `learn` learn from: queries of these suites, at most so many, on the other half.
+
+    `oracles` learn from the half that they are asked on: yardsticks of what rates known in advance would be worth.
+
+    Examples
+    --------
+    >>> LearningSpec(suites=["clean"]).most
+    200
+    """
+
+    suites: Annotated[list[str], Field(min_length=1)]
+    most: Annotated[int, Field(ge=1, le=2000)] = 200
+    oracles: list[str] = []
+
+
+class PipelineFile(NamedDocument):
+    """What a pipeline file says: suites on regions of a split, the paper's experiment, or both.
+
+    Examples
+    --------
+    >>> spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random"]}
+    >>> PipelineFile.model_validate(spec | {"task": [{"suites": ["clean"], "sites": 2}]}).top_k
+    25
+    """
+
+    id: Name
+    title: Line
+    split: str | None = None
+    regions: list[str] = []
+    seed: int = 0
+    task: list[TaskSpec] = []
+    paper: PaperSpec | None = None
+    learning: LearningSpec | None = None
+    matchers: Annotated[list[str], Field(min_length=1)]
+    rejectors: list[str] = []
+    contrast: list[ContrastSpec] = []
+    top_k: Annotated[int, Field(ge=1, le=1000)] = 25
+    match_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    draws: Annotated[int, Field(ge=100, le=100_000)] = 10_000
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all that it says, defaults among it, as `board.json` names it."""
+        # Files that leave a newer key out keep the hash that boards were made under before there was one.
+        said = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
+        for task in said["task"]:
+            for name in CHOICE:
+                if not task[name]:
+                    del task[name]
+        return hashlib.sha256(json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
+
+    @property
+    def said(self) -> dict[str, str]:
+        """Which pipeline it is, as `board.json` says it."""
+        return {"id": self.id, "sha256": self.sha256}
+
+    @model_validator(mode="after")
+    def _has_what_it_needs(self) -> Self:
+        if self.rejectors and (self.split is None or not self.task):
+            message = "rejectors are fitted on the calibration places of a split: name 'split' and a [[task]], or none"
+            raise ValueError(message)
+        if not self.task and self.paper is None:
+            message = "'task' is missing: draw suites by [[task]], or the paper's experiment by [paper]"
+            raise ValueError(message)
+        if self.task and self.split is None:
+            message = "'split' is missing: [[task]] is drawn on the regions of a split"
+            raise ValueError(message)
+        if not self.task and (self.split is not None or self.regions):
+            message = "'split' and 'regions' are for [[task]], and there is none: leave them out"
+            raise ValueError(message)
+        return self
+
+    @model_validator(mode="after")
+    def _names_once(self) -> Self:
+        suites = [name for task in self.task for name in task.suites]
+        suites += [] if self.paper is None else [PAPER_SUITE]
+        for what, listed in (
+            ("suite", suites),
+            ("matcher", self.matchers),
+            ("rejector", self.rejectors),
+            ("contrast", [item.name for item in self.contrast]),
+            ("suite to learn from", [] if self.learning is None else self.learning.suites),
+            ("seed", [] if self.paper is None else [str(seed) for seed in self.paper.seeds]),
+        ):
+            twice = sorted({name for name in listed if listed.count(name) > 1})
+            if twice:
+                message = f"{what} {twice[0]!r} is listed twice"
+                raise ValueError(message)
+        if CONTROLS in suites:
+            message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
+            raise ValueError(message)
+        drawn = [name for task in self.task for name in task.suites]
+        lost = next((name for name in (self.learning.suites if self.learning else ()) if name not in drawn), None)
+        if lost is not None:
+            message = f"learning names the suite {lost!r}, which no [[task]] draws: add it there, or leave it out"
+            raise ValueError(message)
+        _check_apart(self.contrast)
+        for item in self.contrast:
+            lost = next((name for name in item.suites if name not in suites), None)
+            if lost is not None:
+                message = f"contrast {item.name!r} names the suite {lost!r}, which is not drawn"
+                raise ValueError(message)
+            if item.suites == [PAPER_SUITE] and item.track != "retrieval":
+                message = f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"'
+                raise ValueError(message)
+            _check_methods(item, self.matchers, self.rejectors)
+        return self
+
+    @model_validator(mode="after")
+    def _asks_whom_it_names(self) -> Self:
+        for task in self.task:
+            if task.prior is not None:
+                PriorGroup.parse(task.prior)
+            strange = next((name for name in task.matchers if name not in self.matchers), None)
+            if strange is not None:
+                message = f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too"
+                raise ValueError(message)
+        oracles = [] if self.learning is None else self.learning.oracles
+        strange = next((name for name in oracles if name not in self.matchers), None)
+        if strange is not None:
+            message = f"learning names the oracle {strange!r}, which is not among 'matchers': name it there, too"
+            raise ValueError(message)
+        idle = next((name for name in self.matchers if self.task and not self.suites_of(name)), None)
+        if idle is not None and self.paper is None:
+            message = f"matcher {idle!r} is asked on no suite: leave it out, or name it in a [[task]]"
+            raise ValueError(message)
+        for item in self.contrast:
+            _check_asked(item, self.task)
+        return self
+
+    def suites_of(self, matcher: str) -> frozenset[str]:
+        """Suites that a matcher is asked on.
+
+        Examples
+        --------
+        >>> tasks = [{"suites": ["clean"], "sites": 2}, {"suites": ["alias"], "sites": 2, "matchers": ["fft_vote"]}]
+        >>> spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random", "fft_vote"]}
+        >>> sorted(PipelineFile.model_validate(spec | {"task": tasks}).suites_of("random"))
+        ['clean']
+        """
+        asked = (task for task in self.task if not task.matchers or matcher in task.matchers)
+        return frozenset(name for task in asked for name in task.suites)
+
+
+def _check_apart(contrasts: list[ContrastSpec]) -> None:
+    """Refuse a method against itself, and two contrasts of the same: Holm's adjustment would count both."""
+    seen: dict[object, str] = {}
+    for item in contrasts:
+        if item.first == item.second:
+            message = f"contrast {item.name!r} holds {item.first!r} against itself: name two methods"
+            raise ValueError(message)
+        what = (frozenset((item.first, item.second)), frozenset(item.suites), frozenset(item.kinds))
+        before = seen.setdefault((*what, item.metric, item.track), item.name)
+        if before != item.name:
+            message = f"contrasts {before!r} and {item.name!r} compare the same: leave one out"
+            raise ValueError(message)
+
+
+def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
+    """Refuse a contrast of a matcher that is not asked on its suites."""
+    for task in tasks:
+        for method in (item.first, item.second):
+            suite = next((name for name in task.suites if name in item.suites), None)
+            matcher = method.split(" x ")[0]
+            if suite is not None and task.matchers and matcher not in task.matchers:
+                message = f"contrast {item.name!r} names {matcher!r}, which is not asked on {suite!r}"
+                raise ValueError(message)
+
+
+def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:
+    """Refuse a contrast of methods that are not run."""
+    known = set(matchers) if item.metric == "primary" else {f"{one} x {two}" for one in matchers for two in rejectors}
+    lost = next((name for name in (item.first, item.second) if name not in known), None)
+    if lost is not None:
+        kind = "matcher" if item.metric == "primary" else "matcher x rejector"
+        message = f"contrast {item.name!r} names the unknown {kind} {lost!r}"
+        raise ValueError(message)
+
+
+def read_pipeline_file(path: Path) -> PipelineFile:
+    """Read one pipeline file; raises as `read_document` does."""
+    return read_document(path, PipelineFile, "pipelines")
+
+
+def list_pipeline_files() -> dict[str, Path]:
+    """Pipeline id -> file, of those shipped; raises as `list_documents` does.
+
+    Examples
+    --------
+    >>> "demo" in list_pipeline_files()
+    True
+    """
+    return list_documents("pipelines", PipelineFile, ())
+
+
+def find_pipeline_file(id_or_path: str) -> Path:
+    """Find a pipeline file by its id, or take the path of one; raises as `find_document` does."""
+    return find_document(id_or_path, "pipeline", "or name a .toml file", list_pipeline_files)

@@ -1,0 +1,346 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What figures over many queries at once show, as tables: pooled arms, ranks, errors, what it all costs.
+
+Each row is of queries that all matchers of its panel were asked: else one would be drawn by what it was spared.
+"""
+
+import hashlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import chain
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.leaderboard.plot_tables import calibrated_parts
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
+from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
+from sasgeo_bench.scoring.draws import ClusterDraws
+from sasgeo_bench.scoring.integrity import SLOW_DRAWS
+from sasgeo_bench.scoring.intervals import bootstrap_means, effective_count, share_interval
+from sasgeo_bench.scoring.measures import primary_of, ranks_of
+from sasgeo_bench.scoring.pose import rank_pose
+from sasgeo_bench.scoring.ranking import RECALL_AT, Ranks, hits
+from sasgeo_bench.scoring.rejection import answers_of
+from sasgeo_bench.scoring.rows import ALL_SUITES
+from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
+from sasgeo_bench.scoring.strata import ALL, STRESS
+from sasgeo_bench.tasks.query import Truth
+
+Scores = Mapping[str, pd.DataFrame]
+
+RANKS: Final = (1, 2, 3, *RECALL_AT[1:])
+WITHIN_M: Final = "within_25m"  # the figure of the board that a curve of errors passes through
+LEAST_ERROR_M: Final = 0.1
+MOST_ERROR_M: Final = 2000.0
+_RADII_M: Final = np.unique(np.concatenate((np.geomspace(LEAST_ERROR_M, MOST_ERROR_M, 87), [5.0, 10.0, FIX_M])))
+_RATIOS: Final = np.unique(np.concatenate((np.geomspace(1.0, 200.0, 47), COST_RATIOS)))
+_GROUP: Final = ("suite", "track", "prior_group")
+_NO_INTERVAL: Final = (np.nan, np.nan)
+_FIGURE: Final = ("n", "blocks", "value", "lo", "hi")
+
+
+def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any]]:
+    """Means of columns of values in [0, 1] with intervals as of a board; drawn alike for the same queries."""
+    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    blocks, sites = (np.unique(rows[name], return_inverse=True)[1] for name in ("block", "pair_id"))
+    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=seed, draws=SLOW_DRAWS)
+    means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.empty((0, table.shape[1]))
+    trials, values = effective_count(sites), table.mean(axis=0)
+    found = [share_interval(float(value), means[:, at], trials)[0] for at, value in enumerate(values)]
+    said = {"n": len(rows), "blocks": drawn.blocks_count}
+    return [{**said, "value": one.value, "lo": one.lo, "hi": one.hi} for one in found]
+
+
+def _alike(frames: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Those matchers that were asked the most queries of a pool, the same ones, and can answer; rows in one order."""
+    able = {name: frame for name, frame in frames.items() if _is_able(frame)}
+    sorted_ = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in able.items()}
+    most = max(sorted_.values(), key=len, default=pd.DataFrame({"query_id": []}))["query_id"]
+    return {name: frame for name, frame in sorted_.items() if frame["query_id"].equals(most)}
+
+
+def _is_able(frame: pd.DataFrame) -> bool:
+    """Whether there is a query, and the matcher's card does not say that it cannot."""
+    return bool((frame["status"] != NOT_APPLICABLE).any())
+
+
+def _is_whole(first: pd.DataFrame) -> Bools:
+    """Which rows a panel of a suite is of: present places under stress, or all present ones of a suite without."""
+    present = first["is_present"].to_numpy(bool)
+    stress = present & (first["role"] == STRESS).to_numpy(bool)
+    return stress if stress.any() else present
+
+
+def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[dict[str, Any], dict[str, pd.DataFrame]]]:
+    """Rows of the matchers of each suite, track and prior group, and what a panel says of them."""
+    mine = {name: scores[name] for name in shown if name in scores}
+    keys = {key for frame in mine.values() for key in zip(*(frame[name] for name in _GROUP), strict=True)}
+    for key in sorted(keys):
+        some = {}
+        for name, frame in mine.items():
+            is_mine = [frame[column].to_numpy() == value for column, value in zip(_GROUP, key, strict=True)]
+            rows = frame[np.logical_and.reduce(is_mine)]
+            some[name] = rows[_is_whole(rows)]
+        alike = _alike(some)
+        if alike:
+            first = next(iter(alike.values()))
+            part = STRESS if (first["role"] == STRESS).all() else ALL
+            yield {**dict(zip(_GROUP, key, strict=True)), "stratum": part}, alike
+
+
+# --- arms side by side ------------------------------------------------------------------------------------------------
+
+
+def ablation_frame(scores: Scores, contrasts: Sequence[Contrast], shown: Sequence[str]) -> pd.DataFrame:
+    """The figure that matchers are ranked by, pooled over the suites of each registered contrast.
+
+    Parameters
+    ----------
+    scores : mapping of str to pandas.DataFrame
+        Scored rows by matcher.
+    contrasts : sequence of Contrast
+        Those that were registered. Those of means make a pool each, two over the same queries one; without any, all
+        suites are one pool for each track.
+    shown : sequence of str
+        Matchers; a pool has those that were asked all of it.
+
+    Returns
+    -------
+    pandas.DataFrame
+        pool, suites, track, prior_group, matcher, n, blocks, value, lo, hi: present places under stress.
+    """
+    rows: list[dict[str, Any]] = []
+    for pool in _pools(contrasts, scores):
+        some = {name: chosen_rows(pool, scores[name]) for name in shown if name in scores}
+        for group in sorted({group for frame in some.values() for group in frame["prior_group"]}):
+            alike = _alike({name: frame[frame["prior_group"] == group] for name, frame in some.items()})
+            suites = sorted({suite for frame in alike.values() for suite in frame["suite"]})
+            said = {"pool": pool.name, "suites": ", ".join(suites), "track": pool.track, "prior_group": group}
+            for name, frame in alike.items():
+                values = primary_of(pool.track).values(frame)[:, None]
+                text = f"{pool.name}/{pool.track}/{group}"
+                rows += [{**said, "matcher": name, **one} for one in _figures(frame, values, text)]
+    return pd.DataFrame(rows, columns=["pool", "suites", "track", "prior_group", "matcher", *_FIGURE])
+
+
+def _pools(contrasts: Sequence[Contrast], scores: Scores) -> Iterator[Contrast]:
+    """A contrast for each pool, under the names of all that are over the same queries."""
+    means = [item for item in contrasts if item.metric == "primary"]
+    names: dict[tuple[object, ...], list[Contrast]] = {}
+    for item in means:
+        names.setdefault((item.suites, item.kinds, item.track), []).append(item)
+    for listed in names.values():
+        first = listed[0]
+        name = ", ".join(item.name for item in listed)
+        yield Contrast(name=name, first="", second="", suites=first.suites, kinds=first.kinds, track=first.track)
+    if not means:
+        tracks = sorted({track for frame in scores.values() for track in frame["track"]})
+        suites = tuple(sorted({suite for frame in scores.values() for suite in frame["suite"]}))
+        for track in tracks:
+            yield Contrast(name=ALL_SUITES, first="", second="", suites=suites, track=track)
+
+
+# --- the right place within a list, or within metres ------------------------------------------------------------------
+
+
+def recall_frame(
+    scores: Scores,
+    predictions: Mapping[str, Mapping[str, Prediction]],
+    truths: Mapping[str, Truth],
+    shown: Sequence[str],
+) -> pd.DataFrame:
+    """Recall@K: how often the right place is among the first K of an answer.
+
+    Parameters
+    ----------
+    scores : mapping of str to pandas.DataFrame
+        Scored rows by matcher.
+    predictions : mapping of str to mapping
+        Answers by matcher and query.
+    truths : mapping of str to Truth
+        By query.
+    shown : sequence of str
+        Matchers.
+
+    Returns
+    -------
+    pandas.DataFrame
+        suite, track, prior_group, stratum, matcher, k, n, blocks, value, lo, hi. Of retrieval the right candidate, of
+        localization a pose within 25 m, whatever the heading. Nothing where no answer has a second pose.
+    """
+    rows: list[dict[str, Any]] = []
+    for said, frames in _suites(scores, shown):
+        longest = max(
+            len(answer.candidates)
+            for name, frame in frames.items()
+            for answer in chain([Prediction(query_id="")], _answers(predictions[name], frame))
+        )
+        steps = [k for k in RANKS if k <= longest]
+        if len(steps) < 2:  # noqa: PLR2004 - a point is no curve
+            continue
+        text = "/".join((*said.values(), "recall"))
+        for name, frame in frames.items():
+            ranks = ranks_of(frame) if said["track"] == "retrieval" else _near(frame, predictions[name], truths)
+            table = np.column_stack([hits(ranks, k) for k in steps])
+            found = _figures(frame, table, text)
+            rows += [{**said, "matcher": name, "k": k, **one} for k, one in zip(steps, found, strict=True)]
+    return pd.DataFrame(rows, columns=[*_GROUP, "stratum", "matcher", "k", *_FIGURE])
+
+
+def _answers(predictions: Mapping[str, Prediction], frame: pd.DataFrame) -> Iterator[Prediction]:
+    return (predictions[name] for name in frame["query_id"] if name in predictions)
+
+
+def _near(frame: pd.DataFrame, predictions: Mapping[str, Prediction], truths: Mapping[str, Truth]) -> Ranks:
+    """Rank of the best pose near the truth. Headings do not count: stored results may have left them out."""
+    return Ranks.of(
+        [rank_pose(predictions.get(name), truths[name], within_m=FIX_M, within_deg=180.0) for name in frame["query_id"]]
+    )
+
+
+def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
+    """Share of all queries whose fix is within some metres.
+
+    Parameters
+    ----------
+    scores : mapping of str to pandas.DataFrame
+        Scored rows by matcher.
+    table : pandas.DataFrame
+        The leaderboard: it says the intervals at 25 m.
+    shown : sequence of str
+        Matchers.
+
+    Returns
+    -------
+    pandas.DataFrame
+        suite, track, prior_group, stratum, matcher, radius_m, n, blocks, value, lo, hi (NaN but at 25 m). Localization
+        alone; a query without an answer is within no distance, and in the denominator.
+    """
+    rows: list[dict[str, Any]] = []
+    told = table[(table["metric"] == WITHIN_M) & (table["rejector"] == "")]
+    keys = zip(*(told[name] for name in (*_GROUP, "stratum", "matcher")), strict=True)
+    both = zip(told["lo"].to_numpy(float), told["hi"].to_numpy(float), strict=True)
+    ends = dict(zip(keys, both, strict=True))
+    for said, frames in _suites(scores, shown):
+        if said["track"] == "retrieval":
+            continue
+        for name, frame in frames.items():
+            errors_m = np.sort(frame["position_error_m"].fillna(np.inf).to_numpy(float))
+            shares = np.searchsorted(errors_m, _RADII_M, side="right") / len(errors_m)
+            counts = {"n": len(frame), "blocks": int(frame["block"].nunique())}
+            end = ends.get((*said.values(), name), _NO_INTERVAL)
+            for radius_m, value in zip(_RADII_M.tolist(), shares.tolist(), strict=True):
+                lo, hi = end if radius_m == FIX_M else _NO_INTERVAL
+                point = {"radius_m": radius_m, "value": value, "lo": lo, "hi": hi}
+                rows.append({**said, "matcher": name, **counts, **point})
+    return pd.DataFrame(rows, columns=[*_GROUP, "stratum", "matcher", "radius_m", *_FIGURE])
+
+
+# --- what decisions and answers cost ----------------------------------------------------------------------------------
+
+
+def cost_frame(
+    judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
+) -> pd.DataFrame:
+    """Mean cost of a query against the cost of a false fix, when fixes are accepted by Eq. (14).
+
+    Parameters
+    ----------
+    judged : mapping of (matcher, rejector) to pandas.DataFrame
+        From `rejection.judge` and `rejection.own_word`.
+    calibrated : collection of (matcher, rejector)
+        Those that give probabilities.
+    shown : sequence of str
+        Matchers.
+
+    Returns
+    -------
+    pandas.DataFrame
+        track, prior_group, matcher, rejector, n, ratio, cost, accept_all, withhold_all: all suites together. As
+        `cost_20_place` of a board: a present place without an accepted fix costs 1, a false fix `ratio`.
+    """
+    rows: list[dict[str, Any]] = []
+    for said, part in calibrated_parts(judged, calibrated, shown):
+        some = answers_of(part)
+        withhold = float(some.is_present.mean())
+        for ratio in _RATIOS.tolist():
+            cost = decision_cost(some, ratio, charged="place")
+            all_accepted = float(cost_values(some, some.is_answered, ratio, charged="place").mean())
+            costs = {"cost": cost, "accept_all": all_accepted, "withhold_all": withhold}
+            rows.append({**said, "n": len(some), "ratio": ratio, **costs})
+    columns = ["track", "prior_group", "matcher", "rejector", "n", "ratio", "cost", "accept_all", "withhold_all"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+COSTS: Final = {"latency_p50": "latency_s", "latency_p95": "slow_s", "map_per_km2": "map_kb_per_km2"}
+
+
+def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd.DataFrame:
+    """What answers are worth beside what they take: a row for each matcher, on the queries that all of them were asked.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        The leaderboard: it says the costs.
+    scores : mapping of str to pandas.DataFrame
+        Scored rows by matcher.
+    shown : sequence of str
+        Matchers.
+
+    Returns
+    -------
+    pandas.DataFrame
+        suites, track, prior_group, matcher, n, blocks, value, lo, hi, latency_s, slow_s (95th percentile),
+        map_kb_per_km2; NaN where a cost is not known. Present places of the suites of the track that all were asked.
+    """
+    rows: list[dict[str, Any]] = []
+    mine = {name: scores[name][scores[name]["is_present"].to_numpy(bool)] for name in shown if name in scores}
+    groups = {key for one in mine.values() for key in zip(one["track"], one["prior_group"], strict=True)}
+    for track, prior_group in sorted(groups):
+        some = {
+            name: frame[(frame["track"] == track) & (frame["prior_group"] == prior_group)]
+            for name, frame in mine.items()
+        }
+        some = {name: frame for name, frame in some.items() if _is_able(frame)}
+        suites = [set(frame["suite"]) for frame in some.values()]
+        shared = set.intersection(*suites) if suites else set()
+        said = {"suites": ", ".join(sorted(shared)), "track": track, "prior_group": prior_group}
+        for name, frame in _alike({name: one[one["suite"].isin(shared)] for name, one in some.items()}).items():
+            values = primary_of(track).values(frame)[:, None]
+            (found,) = _figures(frame, values, f"{said['suites']}/{track}/{prior_group}")
+            rows.append({**said, "matcher": name, **found, **_costs_of(table, name, track)})
+    columns = ["suites", "track", "prior_group", "matcher", *_FIGURE, *COSTS.values()]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]:
+    """Costs of one matcher as the board says them."""
+    told = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
+    known = dict(zip(told["metric"], told["value"], strict=True))
+    return {column: float(known.get(metric, np.nan)) for metric, column in COSTS.items()}
+
+
+def front_of(cost: Floats, value: Floats) -> Bools:
+    """Which of some methods no other one beats: none is both at least as cheap and at least as good, and better in one.
+
+    Parameters
+    ----------
+    cost, value : ndarray of float, shape (N,)
+        Less and more are better; a cost that is not known (NaN) or infinite is on no front.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+
+    Examples
+    --------
+    >>> front_of(np.array([1.0, 2.0, 3.0, np.nan]), np.array([0.5, 0.4, 0.9, 1.0])).tolist()
+    [True, False, True, False]
+    """
+    known = np.isfinite(cost)
+    cheaper, better = cost[None, :] <= cost[:, None], value[None, :] >= value[:, None]
+    strictly = (cost[None, :] < cost[:, None]) | (value[None, :] > value[:, None])
+    return np.asarray(known & ~(known[None, :] & cheaper & better & strictly).any(axis=1))

@@ -1,0 +1,373 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The door: what a matcher is, what it says of itself, and what it answers."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final, Literal, Protocol, get_args, runtime_checkable
+
+from sasgeo_bench.bounds import BOUNDS, MOST_CANDIDATES, MOST_DIAGNOSTICS, MOST_NAME, bounds_text, is_line
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.tasks.query import Head, Query, Track, Truth
+from sasgeo_bench.texts import NAME, VERSION
+
+Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
+NEEDS: Final[tuple[Need, ...]] = get_args(Need)
+MOST_SAID: Final = 4000  # characters of a field of a card
+MOST_SHOWN: Final = 80  # of a wrong one
+MOST_LEARNED_BYTES: Final = 2**20  # of what a matcher has learnt, as UTF-8
+SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatcherCard:
+    """What a matcher says of itself; printed on the board beside its row.
+
+    Parameters
+    ----------
+    name : str
+        Lower-case letters, digits, hyphens and underscores.
+    version : str
+        Letters, digits, dots, hyphens, underscores and plus signs; raised whenever answers change.
+    title : str
+        One line for people.
+    source : str
+        Paper, page or "original": where the method comes from.
+    ours : str
+        What of it is the implementer's own.
+    licence : str
+        SPDX name of the code's licence.
+    tracks : tuple of {"retrieval", "localization"}
+        What it answers; elsewhere its row says "not applicable".
+    needs : tuple of str
+        Of `NEEDS`: what a query must tell or hold; without it the row says "not applicable".
+    limits : str
+        What it is known not to do.
+    trained_on : tuple of str
+        Places its parameters come from; a row that was trained on a test place is set apart.
+
+    Raises
+    ------
+    MatchError
+        If a field is empty, too long or not printable, or says what is not known.
+
+    Examples
+    --------
+    >>> said = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
+    >>> MatcherCard(**said, tracks=("localization",)).needs
+    ()
+    """
+
+    name: str
+    version: str
+    title: str
+    source: str
+    ours: str
+    licence: str
+    tracks: tuple[Track, ...]
+    needs: tuple[Need, ...] = ()
+    limits: str = ""
+    trained_on: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a card that does not say what a reader of the board needs."""
+        check_said(self)
+        check_identity(self.name, self.version)
+        for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
+            wrong = next((item for item in getattr(self, name) if item not in known), None)
+            if wrong is not None:
+                message = f"card: {name} holds {wrong!r}, known are {', '.join(known)}"
+                raise MatchError(message)
+        if not self.tracks:
+            message = "card: tracks is empty, name retrieval, localization or both"
+            raise MatchError(message)
+        for place in self.trained_on:
+            _check_line("trained_on", place)
+
+
+def check_said(card: object) -> None:
+    """Refuse a card on which one of the fields that every card has says nothing."""
+    for name in ("name", "version", "title", "source", "ours", "licence"):
+        value = getattr(card, name)
+        if not isinstance(value, str) or not value.strip():
+            message = f"card: {name} is empty, say it in one line"
+            raise MatchError(message)
+        _check_line(name, value)
+    _check_line("limits", getattr(card, "limits"))  # noqa: B009 - of either kind of card
+
+
+def _check_line(name: str, value: object) -> None:
+    if not isinstance(value, str) or not value.isprintable() or len(value) > MOST_SAID:
+        message = f"card: {name} must be one line of at most {MOST_SAID} printable characters"
+        raise MatchError(message)
+
+
+def check_identity(name: str, version: str) -> None:
+    """Refuse a name or a version that could not be part of a folder's name, a flag or a cell of any table.
+
+    Raises
+    ------
+    MatchError
+        Saying what it may hold.
+
+    Examples
+    --------
+    >>> check_identity("mine", "1.0.0rc1+cpu")
+    >>> check_identity("mine", "=1+1")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: card: version '=1+1' may hold letters, digits, dots, hyphens, underscores and plus
+    signs only, a letter or digit first, 60 at most
+    """
+    for what, value, pattern, letters in (
+        ("name", name, NAME, "lower-case letters, digits, hyphens and underscores"),
+        ("version", version, VERSION, "letters, digits, dots, hyphens, underscores and plus signs"),
+    ):
+        if not re.fullmatch(pattern, value):
+            message = (
+                f"card: {what} {value[:MOST_SHOWN]!r} may hold {letters} only, a letter or digit first, 60 at most"
+            )
+            raise MatchError(message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Match:
+    """An answer to one query: places with scores, best first; no place at all is an answer withheld.
+
+    Parameters
+    ----------
+    poses : sequence of Pose
+        For retrieval, candidates of the query; for localization, any poses.
+    scores : sequence of float
+        As many as poses, none greater than the one before it; any scale.
+    confidence : float, optional
+        Probability, 0..1, that the first pose is right; None where the matcher does not say.
+    diagnostics : mapping of str to float
+        Whatever a rejector or a reader may want, as in "margin".
+    """
+
+    poses: Sequence[Pose]
+    scores: Sequence[float]
+    confidence: float | None = None
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+
+
+WITHHELD: Final = Match(poses=(), scores=(), confidence=0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Training:
+    """What a matcher may learn from: maps, queries and truths of places that it is not asked about.
+
+    Parameters
+    ----------
+    regions : mapping of str to Region
+        Maps by the name that queries have in `region`. In a run each is read when it is asked for and only a few are
+        kept: take the pairs in their order, which leaves those on one map together.
+    pairs : sequence of (Query, Truth)
+        Both tracks, and queries whose place is absent (`truth.is_present` is False, or there is no pose) among them.
+    """
+
+    regions: Mapping[str, Region]
+    pairs: Sequence[tuple[Query, Truth]]
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """A method under test. It is made without arguments, in a process of its own, and sees no truth."""
+
+    card: MatcherCard
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Index a map; called once for each map, timed apart. `learned` is what `learn` said, None without one."""
+        ...
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Answer a query on the map prepared last, with at most `top_k` poses."""
+        ...
+
+
+@runtime_checkable
+class Learner(Matcher, Protocol):
+    """A matcher that learns, once for each set of training places and in a process of its own.
+
+    All that is learnt is a text, which the runner keeps and hands to every `prepare`; the same training gives the same
+    text. Where nothing could be learnt `prepare` gets None: a matcher that then cannot answer needs "training" on its
+    card.
+    """
+
+    def learn(self, training: Training) -> str:
+        """Say what is to be known from now on, as JSON or any other text of at most `MOST_LEARNED_BYTES`."""
+        ...
+
+
+def check_learned(learned: object) -> str:
+    """Hold what a matcher has learnt to what can be kept.
+
+    Raises
+    ------
+    MatchError
+        With found and expected, if it is no text, too long, or cannot be written as UTF-8.
+
+    Examples
+    --------
+    >>> check_learned('{"bias_m": 3.5}')
+    '{"bias_m": 3.5}'
+    """
+    if not isinstance(learned, str):
+        message = f"learn() returned {type(learned).__name__}, expected a text: write it as JSON, say"
+        raise MatchError(message)
+    try:
+        size = len(learned.encode())
+    except UnicodeEncodeError as error:
+        message = "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
+        raise MatchError(message) from error
+    if size > MOST_LEARNED_BYTES:
+        message = f"learn() returned {size} bytes, expected at most {MOST_LEARNED_BYTES}"
+        raise MatchError(message)
+    return learned
+
+
+def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
+    """Hold an answer to what an answer must be.
+
+    Parameters
+    ----------
+    match : object
+        What a matcher returned.
+    query : Query or Head
+        What it was asked.
+    top_k : int
+        How many poses it may give.
+
+    Returns
+    -------
+    Match
+        The answer, with floats for numbers.
+
+    Raises
+    ------
+    MatchError
+        With found and expected, if it is not a Match, gives more than `top_k` poses, as many scores as it should not,
+        a number out of `bounds.BOUNDS`, scores out of order, a pose twice or one that is no candidate of a retrieval
+        query, or diagnostics with a name that is no line of at most `bounds.MOST_NAME` characters.
+    """
+    if not isinstance(match, Match):
+        message = f"match() returned {type(match).__name__}, expected sasgeo_bench.matching.matcher.Match"
+        raise MatchError(message)
+    count = len(match.poses)
+    if count > min(top_k, MOST_CANDIDATES):
+        message = f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}"
+        raise MatchError(message)
+    # What has a length may still give more or fewer than it says.
+    scores = [_number(score, "score") for score in islice(match.scores, MOST_CANDIDATES + 1)]
+    poses = [_pose(pose) for pose in islice(match.poses, count)]
+    if len(poses) != count or len(scores) != count:
+        message = f"match() returned {len(scores)} scores for {len(poses)} poses, expected one each"
+        raise MatchError(message)
+    fallen = next((at for at in range(1, count) if scores[at] > scores[at - 1]), None)
+    if fallen is not None:
+        message = (
+            f"scores rise from {scores[fallen - 1]:g} to {scores[fallen]:g} at place {fallen}, expected best first"
+        )
+        raise MatchError(message)
+    confidence = None if match.confidence is None else _number(match.confidence, "confidence")
+    if query.track == "retrieval":
+        _check_candidates(poses, query.candidates)
+    diagnostics = _diagnostics(match.diagnostics)
+    return Match(poses=poses, scores=scores, confidence=confidence, diagnostics=diagnostics)
+
+
+def _number(value: object, name: str, *, shown: str = "") -> float:
+    try:
+        if isinstance(value, str | bytes):
+            raise TypeError(value)  # noqa: TRY301 - Python reads "0.5" as a number, the door does not
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError) as error:
+        message = f"{shown or name} is a {type(value).__name__}, expected a number"
+        raise MatchError(message) from error
+    least, most = BOUNDS[name]
+    if not least <= number <= most:
+        message = f"{shown or name} is {number:g}, expected a finite number within {bounds_text(name)}"
+        raise MatchError(message)
+    return number
+
+
+def _pose(pose: object) -> Pose:
+    if not isinstance(pose, Pose):
+        message = f"a pose is a {type(pose).__name__}, expected sasgeo_bench.geometry.pose.Pose"
+        raise MatchError(message)
+    numbers = {name: _number(getattr(pose, name), name) for name in ("easting_m", "northing_m", "yaw_deg", "scale")}
+    return Pose(**numbers)
+
+
+def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None:
+    """Every pose of a retrieval answer is one of the candidates, and none is given twice."""
+    given: set[int] = set()
+    for pose in poses:
+        near = candidates_at(pose, candidates)
+        at = next((index for index in near if index not in given), near[0] if near else None)
+        if at is None:
+            place = f"({pose.easting_m:.2f}, {pose.northing_m:.2f})"
+            message = f"pose {place} is none of the {len(candidates)} candidates, expected one of query.candidates"
+            raise MatchError(message)
+        if at in given:
+            message = f"candidate {at} is given twice, expected each at most once"
+            raise MatchError(message)
+        given.add(at)
+
+
+def candidates_at(pose: Pose, candidates: Sequence[Pose]) -> list[int]:
+    """Candidates that lie where a pose lies, within 5 cm, the nearest first; heading and scale may have been refined.
+
+    Examples
+    --------
+    >>> one, two = (Pose(easting_m=x, northing_m=0.0, yaw_deg=0.0) for x in (1.0, 7.0))
+    >>> candidates_at(two, [one, two])
+    [1]
+    """
+    apart_m = [math.hypot(pose.easting_m - item.easting_m, pose.northing_m - item.northing_m) for item in candidates]
+    near = [index for index, gap_m in enumerate(apart_m) if gap_m <= SAME_PLACE_M]
+    return sorted(near, key=apart_m.__getitem__)
+
+
+def _diagnostics(given: object) -> dict[str, float]:
+    if not isinstance(given, Mapping):
+        message = f"diagnostics is a {type(given).__name__}, expected a mapping of name to number"
+        raise MatchError(message)
+    if len(given) > MOST_DIAGNOSTICS:
+        message = f"diagnostics holds {len(given)} entries, expected at most {MOST_DIAGNOSTICS}"
+        raise MatchError(message)
+    pairs = [(str(name), value) for name, value in islice(given.items(), MOST_DIAGNOSTICS + 1)]
+    wrong = next((name for name, _ in pairs if not name or not is_line(name, MOST_NAME)), None)
+    if wrong is not None:
+        message = f"diagnostics holds the name {wrong[:MOST_NAME]!r}, expected 1..{MOST_NAME} printable characters"
+        raise MatchError(message)
+    found = {name: _number(value, "diagnostics", shown=f"diagnostics[{name!r}]") for name, value in pairs}
+    if len(found) != len(given):
+        message = f"diagnostics holds {len(given)} entries under {len(found)} names, expected each name once"
+        raise MatchError(message)
+    return found
+
+
+def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | None:
+    """Why a query is not applicable to a matcher, or None if it is.
+
+    A disc, a heading or vectors that a card needs and a query lacks are named; so is a track it does not answer, and
+    training where there was nothing to learn from.
+    """
+    if query.track not in card.tracks:
+        return f"track {query.track}"
+    has = {
+        "position": query.prior.center_m is not None or bool(query.candidates),
+        "yaw": query.prior.yaw_deg is not None,
+        "scale": True,
+        "vectors": query.vectors is not None,
+        "image": False,
+        "training": is_taught,
+    }
+    return next((f"no {need}" for need in card.needs if not has[need]), None)

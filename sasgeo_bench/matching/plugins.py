@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding plugins: by name through entry points, or by module:Class; built-in ones win a clash of names."""
+
+import difflib
+import importlib
+import warnings
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from importlib.metadata import Distribution, EntryPoint, entry_points
+from typing import Any, Final
+
+from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.matcher import Matcher, MatcherCard
+from sasgeo_bench.matching.rejector import Rejector, RejectorCard
+
+MATCHERS: Final = "sasgeo_bench.matchers"
+REJECTORS: Final = "sasgeo_bench.rejectors"
+BUILT_IN: Final = "sasgeo-baselines"
+_OURS: Final = ("sasgeo-bench", BUILT_IN)  # the distributions whose names win
+_MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
+ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
+
+
+def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
+    """Every entry point of a group by its name; of two with one name the built-in one, else the first to be listed.
+
+    Warns
+    -----
+    UserWarning
+        Where a name stands twice, or is that of the runner's own control.
+
+    Raises
+    ------
+    MatchError
+        If an installed package has entry points that cannot be read.
+    """
+    found: dict[str, EntryPoint] = {}
+    for point in _installed(group):
+        if group == MATCHERS and point.name == ORACLE:
+            message = f"{_home(point)} ({point.value}) is not used: {ORACLE!r} is the name of a control of the runner"
+            warnings.warn(message, stacklevel=2)
+        elif point.name not in found:
+            found[point.name] = point
+        elif found[point.name].value != point.value:
+            message = _clash(found[point.name], point)
+            warnings.warn(message, stacklevel=2)
+    return dict(sorted(found.items()))
+
+
+def _installed(group: str) -> list[EntryPoint]:
+    """Entry points of a group, those of ours first."""
+    try:
+        installed = entry_points(group=group)
+    except Exception as error:
+        message = f"an installed package has entry points that cannot be read ({told(error)}): reinstall or remove it"
+        raise MatchError(message) from error
+    return sorted(installed, key=lambda point: (_home(point) not in _OURS, _home(point), point.value))
+
+
+def _clash(first: EntryPoint, other: EntryPoint) -> str:
+    """Name both of two plugins of one name, and say which is used: ours, or else none."""
+    lost = f"{_home(other)} ({other.value})"
+    if _home(first) in _OURS:
+        return f"two plugins are named {first.name!r}: {_home(first)} is used, {lost} is not"
+    return (
+        f"two plugins are named {first.name!r}: {_home(first)} ({first.value}) and {lost}, so neither is used: "
+        "uninstall one, or name module:Class"
+    )
+
+
+def shipped_names() -> frozenset[str]:
+    """Names of the matchers that ship, which no other plugin may bear.
+
+    Examples
+    --------
+    >>> "oracle_pose" in shipped_names()
+    True
+    """
+    return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in _OURS)})
+
+
+def check_card_name(spec: str, name: str) -> None:
+    """Refuse a matcher of others whose card bears the name of one that ships: its row would pass for that one's.
+
+    Parameters
+    ----------
+    spec : str
+        How it was named: a name, or module:Class.
+    name : str
+        Of its card.
+
+    Raises
+    ------
+    MatchError
+        Naming both.
+
+    Examples
+    --------
+    >>> check_card_name("mine:Matcher", "oracle_pose")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: mine:Matcher: its card is named 'oracle_pose', as a matcher that ships: rename it
+    """
+    is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped_names()
+    if not is_ours and name in shipped_names():
+        message = f"{one_line(spec)}: its card is named {name!r}, as a matcher that ships: rename it"
+        raise MatchError(message)
+
+
+def _home(point: EntryPoint) -> str:
+    return "" if point.dist is None else _name_of(point.dist)
+
+
+@lru_cache(maxsize=16)  # its entry points share a distribution, which reads its metadata anew at every question
+def _name_of(distribution: Distribution) -> str:
+    return distribution.name
+
+
+def load_matcher(spec: str) -> Matcher:
+    """Import a matcher and make one.
+
+    Parameters
+    ----------
+    spec : str
+        A name, or "module:Class".
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name, it cannot be imported or made, is not a matcher, or has no sound card.
+
+    Examples
+    --------
+    >>> load_matcher("no_such_matcher")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list-matchers shows all; or module:Class)
+    """
+    matcher: Matcher = _made(spec, _find(spec, MATCHERS, "matcher"))
+    _check(spec, matcher, MatcherCard, "matcher", ("prepare", "match"))
+    return matcher
+
+
+def load_rejector(spec: str) -> Rejector:
+    """Import a rejector and make one.
+
+    Parameters
+    ----------
+    spec : str
+        A name, or "module:Class".
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name, it cannot be imported or made, is not a rejector, or has no sound card.
+    """
+    return rejector_maker(spec)()
+
+
+def rejector_maker(spec: str) -> Callable[[], Rejector]:
+    """What makes rejectors of a name, as `load_rejector` does, but looks for them once: a board makes thousands.
+
+    Parameters
+    ----------
+    spec : str
+        A name, or "module:Class".
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name, or it cannot be imported.
+    """
+    return partial(_rejector, spec, _find(spec, REJECTORS, "rejector"))
+
+
+def _rejector(spec: str, target: Callable[[], Any]) -> Rejector:
+    rejector: Rejector = _made(spec, target)
+    _check(spec, rejector, RejectorCard, "rejector", ("fit", "p_false"))
+    return rejector
+
+
+def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequence[str]) -> None:
+    """Refuse what has not the card and the verbs of its kind."""
+    try:
+        card = getattr(plugin, "card", None)
+        missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
+    except (Exception, SystemExit) as error:
+        message = f"{spec}: its card and verbs cannot be read ({told(error)})"
+        raise MatchError(message) from error
+    if not isinstance(card, card_type):
+        expected = f"{card_type.__module__}.{card_type.__name__}"
+        message = f"{spec}: card is a {type(card).__name__}, expected a {expected}"
+        raise MatchError(message)
+    if missing:
+        message = f"{spec}: {type(plugin).__name__} is not a {kind}, it has no {' and no '.join(missing)}"
+        raise MatchError(message)
+
+
+def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
+    """The class behind a name or module:Class."""
+    return _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
+
+
+def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever the plugin is
+    """One of it; what goes wrong is told in one line."""
+    try:
+        return target()
+    except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+        message = f"{spec}: cannot be made ({told(error)})"
+        raise MatchError(message) from error
+
+
+def _from_module(spec: str) -> Callable[[], Any]:
+    module, _, name = spec.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
+    except (Exception, SystemExit) as error:
+        message = f"{one_line(spec)}: cannot be imported ({told(error)})"
+        raise MatchError(message) from error
+
+
+def _known(name: str, group: str, kind: str) -> EntryPoint:
+    points = list_entry_points(group)
+    if name not in points:
+        near = difflib.get_close_matches(name, points, n=1, cutoff=0.6)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        message = f"there is no {kind} {name!r}{hint} (list-{kind}s shows all; or module:Class)"
+        raise MatchError(message)
+    others = {point.value: point for point in _installed(group) if point.name == name and point != points[name]}
+    rival = next((point for value, point in others.items() if value != points[name].value), None)
+    if rival is not None and _home(points[name]) not in _OURS:
+        raise MatchError(_clash(points[name], rival))
+    return points[name]
+
+
+def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) -> None:
+    """Refuse names that no installed package has; nothing is imported, and module:Class is taken at its word.
+
+    Raises
+    ------
+    MatchError
+        If there is none of that name.
+
+    Examples
+    --------
+    >>> check_names(matchers=["mine:Matcher", "oracle_pose"])
+    """
+    for listed, group, kind in ((matchers, MATCHERS, "matcher"), (rejectors, REJECTORS, "rejector")):
+        for name in listed:
+            if ":" not in name and not (group == MATCHERS and name == ORACLE):
+                _known(name, group, kind)
+
+
+def check_registered(rejectors: Sequence[str], *, source: str) -> None:
+    """Refuse rejectors that data name by module:Class: whoever imports what a file names runs whatever it names.
+
+    Parameters
+    ----------
+    rejectors : sequence of str
+        As the data name them.
+    source : str
+        What the data are called.
+
+    Raises
+    ------
+    MatchError
+        If one is not registered by an installed package; nothing is imported.
+
+    Examples
+    --------
+    >>> check_registered(["margin"], source="stored")
+    """
+    known = list_entry_points(REJECTORS) if rejectors else {}
+    stray = next((name for name in rejectors if name not in known), None)
+    if stray is not None:
+        message = (
+            f"{source} names the rejector {one_line(stray)!r}, and data may name registered ones only (list-rejectors "
+            "shows all): name each that is to judge with --rejector, and code only if you trust it"
+        )
+        raise MatchError(message)
+
+
+def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
+    point = _known(name, group, kind)
+    try:
+        return point.load()  # type: ignore[no-any-return]
+    except (Exception, SystemExit) as error:
+        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({told(error)})"
+        raise MatchError(message) from error

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prediction: one row of an answer, whether a program gave it or a file; its place and hash in a run."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal, get_args
+
+from sasgeo_bench.geometry.pose import Pose
+
+Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
+STATUSES: Final[tuple[Status, ...]] = get_args(Status)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """One row of the predictions of a task; the contract of a submission.
+
+    Parameters
+    ----------
+    query_id : str
+        Of the query.
+    candidates : tuple of (Pose, float)
+        Poses with scores, best first; empty where the answer was withheld or there is none.
+    confidence : float, optional
+        Probability that the first pose is right.
+    diagnostics : mapping of str to float
+        What the matcher tells besides.
+    status : str
+        "ok"; "timeout", "crash", "invalid" or "refused" where there is no answer, and why; "not applicable" where
+        the matcher's card says it cannot.
+    message : str
+        In one line, why there is no answer.
+    latency_s : float, optional
+        By the runner's clock, from when the query was sent until the answer was read; None where there is no answer,
+        and in files whose author says nothing of it. Rows of older programs have the matcher's own clock here.
+    matcher_s : float, optional
+        Of `match` alone by the clock of the matcher's own process; no figure is made of it.
+    """
+
+    query_id: str
+    candidates: tuple[tuple[Pose, float], ...] = ()
+    confidence: float | None = None
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+    status: Status = "ok"
+    message: str = ""
+    latency_s: float | None = None
+    matcher_s: float | None = None
+
+
+def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
+    """First 12 hex digits of what makes two runs of a matcher the same: its name, version, code and the run's settings.
+
+    Examples
+    --------
+    >>> len(matcher_hash("mine", "1", b"", ""))
+    12
+    """
+    digest = hashlib.sha256()
+    for part in (spec.encode(), version.encode(), code, settings.encode()):
+        digest.update(len(part).to_bytes(8, "big") + part)
+    return digest.hexdigest()[:12]

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plugin package to begin with: complete, small, and good enough to pass the conformance kit at once."""
+
+import keyword
+import re
+import sys
+from typing import Final
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.matching.plugins import BUILT_IN, ORACLE, list_entry_points
+from sasgeo_bench.matching.submission import example_card
+
+_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
+_LONGEST: Final = 60
+# Modules that a package of this name would hide: of Python, of this package and what it imports, and around them.
+_TAKEN: Final = frozenset(
+    {
+        *sys.stdlib_module_names,
+        *(
+            "affine",
+            "cv2",
+            "filelock",
+            "geopandas",
+            "lazy_loader",
+            "matplotlib",
+            "numpy",
+            "osmium",
+            "pandas",
+            "pooch",
+            "psutil",
+        ),
+        *("pyarrow", "pydantic", "pyproj", "rasterio", "rich", "scipy", "shapely", "tqdm", "typer", "click"),
+        *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
+        *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
+        *("src", "test", "tests", "con", "nul", "aux", "prn"),
+    }
+)
+
+_PYPROJECT: Final = """\
+[build-system]
+requires = ["hatchling>=1.27"]
+build-backend = "hatchling.build"
+
+[project]
+name = "{distribution}"
+version = "0.1.0"
+description = "A matcher for sasgeo-bench"
+requires-python = ">=3.11"
+dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
+
+[project.entry-points."sasgeo_bench.matchers"]
+{name} = "{module}.matcher:{cls}"
+
+[tool.hatch.build.targets.wheel]
+packages = ["src/{module}"]
+"""
+
+_MATCHER: Final = '''\
+"""The matcher {name}: here is where your method goes."""
+
+import numpy as np
+from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, LayerBits, Match, MatcherCard, Pose, Query, Region, observe
+
+STEPS = 9  # places a side of the lattice that is searched when no candidates are given
+
+
+class {cls}:
+    """Ranks places by how many seen cells the map has there too. A place to start from, no method to win with."""
+
+    card = MatcherCard(
+        name="{name}",
+        version="0.1.0",
+        title="{title}",
+        source="original",
+        ours="all of it",
+        licence="MIT",
+        tracks=("retrieval", "localization"),
+        needs=("position",),
+        limits="looks at a coarse lattice of places, with the heading of the prior alone",
+    )
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Keep the map; called once for each one. `learned` is what a `learn` of its own would have said."""
+        self.region = region
+        self.layers = LayerBits.of(region.layers)
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Score the candidates, or the places of a lattice over the prior's disc; best first."""
+        if (query.evidence.cells == UNKNOWN).all():
+            return WITHHELD
+        places = query.candidates or self.lattice(query)
+        scored = sorted(((self.score(query, pose), -at, pose) for at, pose in enumerate(places)), reverse=True)[:top_k]
+        return Match(poses=[pose for _, _, pose in scored], scores=[score for score, _, _ in scored])
+
+    def lattice(self, query: Query) -> list[Pose]:
+        """Places spread over the prior's disc."""
+        x, y = query.prior.center_m
+        yaw_deg = query.prior.yaw_deg or 0.0
+        steps = np.linspace(-1, 1, STEPS) * query.prior.radius_m
+        return [
+            Pose(easting_m=x + right, northing_m=y + up, yaw_deg=yaw_deg)
+            for right in steps
+            for up in steps
+            if np.hypot(right, up) <= query.prior.radius_m
+        ]
+
+    def score(self, query: Query, pose: Pose) -> float:
+        """Share of what is seen, class by class, that the map shows at a pose; unknown cells are left out."""
+        seen = query.evidence
+        there = observe(
+            self.layers, self.region.grid, pose, size_cells=seen.shape[0], cell_size_m=seen.cell_size_m
+        )
+        order = [self.region.classes.index(name) for name in seen.classes]
+        both_known = (seen.cells != UNKNOWN) & (there[order] != UNKNOWN)
+        agree = both_known & (seen.cells == PRESENT) & (there[order] == PRESENT)
+        either = both_known & ((seen.cells == PRESENT) | (there[order] == PRESENT))
+        return float(agree.sum() / max(1, either.sum()))
+'''
+
+_IMPORTED: Final = frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", _MATCHER, re.MULTILINE))))
+
+_TEST: Final = '''\
+"""The matcher keeps to what every matcher keeps to."""
+
+from sasgeo_bench import check_matcher
+
+
+def test_it_conforms():
+    faults = [check for check in check_matcher("{module}.matcher:{cls}") if check.outcome == "fail"]
+    assert not faults, faults
+'''
+
+_README: Final = """\
+# {title}
+
+A matcher for sasgeo-bench.
+
+```bash
+pip install -e .
+sasgeo-bench check-matcher {name}
+sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside
+```
+
+Say in the card (`src/{module}/matcher.py`) where the method comes from, what of it is yours, and what a query must
+tell for it to work; raise its version whenever answers change. `card.toml` says the same of a submission:
+
+```bash
+sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/results/leaderboard
+```
+"""
+
+
+def plugin_files(name: str) -> dict[str, str]:
+    """Text of every file of a new plugin package, by its path.
+
+    Parameters
+    ----------
+    name : str
+        Of the matcher: lower-case letters, digits, hyphens, underscores.
+
+    Raises
+    ------
+    ConfigError
+        If it is no such name, or taken.
+
+    Examples
+    --------
+    >>> sorted(plugin_files("my-matcher"))[:3]
+    ['README.md', 'card.toml', 'pyproject.toml']
+    """
+    module = name.replace("-", "_")
+    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
+        message = f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name"
+        raise ConfigError(message)
+    if not _NAME.fullmatch(name):
+        message = (
+            f"a matcher's name has lower-case letters, digits, hyphens and underscores, as in my-matcher; got {name!r}"
+        )
+        raise ConfigError(message)
+    known = list_entry_points().get(name)
+    home = known.dist.name if known is not None and known.dist is not None else ""
+    if name == ORACLE or home == BUILT_IN:
+        message = f"{name!r} is a matcher of sasgeo-bench itself, which would be used instead of yours; choose another"
+        raise ConfigError(message)
+    words = re.split(r"[-_]", name)
+    own = "".join(word.capitalize() for word in words)
+    said = {
+        "name": name,
+        "distribution": name.replace("_", "-"),
+        "module": name.replace("-", "_"),
+        "cls": f"{own}Matcher" if own in _IMPORTED or keyword.iskeyword(own) else own,
+        "title": " ".join(words).capitalize(),
+    }
+    files = {
+        "pyproject.toml": _PYPROJECT,
+        "README.md": _README,
+        "src/{module}/__init__.py": '"""The package of the matcher {name}."""\n',
+        "src/{module}/matcher.py": _MATCHER,
+        "tests/test_conforms.py": _TEST,
+    }
+    made = {path.format(**said): text.format(**said) for path, text in files.items()}
+    return made | {"card.toml": example_card(name)}

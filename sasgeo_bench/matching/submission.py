@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a submission says: the card that its author writes, and what stands beside the answers in `submission.json`."""
+
+from collections.abc import Mapping
+from typing import Annotated, Final
+
+from pydantic import BeforeValidator, Field
+
+from sasgeo_bench.config import Document, Line, Short
+from sasgeo_bench.matching.matcher import Need
+from sasgeo_bench.tasks.split import HALVES, Half
+from sasgeo_bench.texts import FOLDER, NAME, VERSION
+
+SCHEMA_VERSION: Final = 1
+NONE: Final = "none"  # what `trained_on` says of a method that has learnt nothing from any place of the split
+MOST_PLACES: Final = 1000
+_SHORT: Final = 60  # characters
+
+_HALVES_SAID: Final = '{ a = ["munich"], b = ["porto"] }'
+
+
+def _trained(said: object) -> object:
+    """Refuse whatever is neither "none" nor places, nor places for each half."""
+    lists = list(said.values()) if isinstance(said, Mapping) and set(said) == set(HALVES) else [said]
+    is_sound = all(
+        isinstance(item, list) and len(item) <= MOST_PLACES and all(isinstance(name, str) for name in item)
+        for item in lists
+    )
+    if said != NONE and (not is_sound or said == []):
+        message = (
+            f'trained_on must be "{NONE}", places of the split as in ["porto"], or for each half of a cross-fit the '
+            f"places that taught the answers about it, as in {_HALVES_SAID}; got {repr(said)[:_SHORT]}"
+        )
+        raise ValueError(message)
+    return said
+
+
+Name = Annotated[str, Field(pattern=NAME)]
+Version = Annotated[str, Field(pattern=VERSION)]
+Identifier = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a board or a split
+Folder = Annotated[str, Field(pattern=FOLDER)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Count = Annotated[int, Field(ge=0)]
+Address = Annotated[str, Field(pattern=r"^https://[A-Za-z0-9][A-Za-z0-9.:/_~%?=&#@+-]{0,250}$")]
+TrainedOn = Annotated[str | list[str] | dict[str, list[str]], BeforeValidator(_trained)]
+
+
+class Card(Document):
+    """What an author says of a method; on the board beside its row, always as text.
+
+    Parameters
+    ----------
+    name, version : str
+        Of the row: lower-case letters, digits, hyphens and underscores; of the version, raised whenever answers change,
+        capitals, dots and plus signs too.
+    title, source, ours, licence : str
+        One line for people; paper, page or "original"; what of it is the author's own; SPDX name of the code's licence.
+    trained_on : "none", list of str, or a list for each half
+        Places of the split that taught the method. By halves, "a" are the places that taught the answers about half a.
+    trained_elsewhere : str
+        Whatever else taught it, in a line.
+    needs : list of str
+        Of `matcher.NEEDS`: what a query must tell.
+    uses : list of str
+        What it looks at besides the query and the map, as in "imagery".
+    limits, authors, contact, code
+        What it is known not to do; who made it, and how to reach them; address of its code.
+
+    Examples
+    --------
+    >>> said = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
+    >>> Card.model_validate(said | {"trained_on": {"a": ["munich"], "b": ["porto"]}}).taught("a")
+    ('munich',)
+    """
+
+    name: Name
+    version: Version
+    title: Line
+    source: Line
+    ours: Line
+    licence: Short
+    trained_on: TrainedOn
+    trained_elsewhere: Line | None = None
+    needs: list[Need] = []
+    uses: Annotated[list[Short], Field(max_length=20)] = []
+    limits: Line | None = None
+    authors: Annotated[list[Short], Field(max_length=100)] = []
+    contact: Line | None = None
+    code: Address | None = None
+
+    @property
+    def is_by_half(self) -> bool:
+        """Whether the two halves of a cross-fit were answered after other training."""
+        return isinstance(self.trained_on, dict)
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """All places that taught it, by name."""
+        return tuple(sorted({place for half in HALVES for place in self.taught(half)}))
+
+    def taught(self, half: Half | None) -> tuple[str, ...]:
+        """Places that taught the answers about places of a half; of None, where a split has none, all of them."""
+        said = self.trained_on
+        if isinstance(said, dict):
+            return self.places if half is None else tuple(said[half])
+        return tuple(said) if isinstance(said, list) else ()
+
+
+class FileSaid(Document):
+    """Hash and size of a file."""
+
+    sha256: Sha256
+    bytes: Count
+
+
+class TaskSaid(Document):
+    """A task that was answered: its queries, by the hash of their file, and how many of them have a row."""
+
+    suite: Folder
+    region: Folder
+    queries_sha256: Sha256
+    queries: Count
+    answered: Count
+
+
+class Submission(Document):
+    """`submission.json`: the card, the board it is for, versions, the tasks it answers and the hashes of its files."""
+
+    schema_version: int
+    card: Card
+    board: Identifier
+    split: Identifier | None
+    task_version: int
+    data_version: int
+    scorer_version: int
+    made_by: Short
+    tasks: Annotated[list[TaskSaid], Field(min_length=1, max_length=100_000)]
+    files: Annotated[dict[str, FileSaid], Field(max_length=100)]
+    licence: Short
+    attribution: Line
+
+
+def example_card(name: str = "my-matcher") -> str:
+    """A card to begin with, as TOML.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.config import parse_toml
+    >>> parse_toml(example_card(), Card, source="card.toml").name
+    'my-matcher'
+    """
+    return _EXAMPLE.format(name=name, halves=_HALVES_SAID)
+
+
+_EXAMPLE: Final = """\
+# What the board says of your method. One line each; see docs/adding-a-matcher.md.
+name = "{name}"
+version = "0.1.0"        # raise it whenever answers change
+title = "A matcher of mine"
+source = "original"      # or the paper it comes from
+ours = "all of it"       # what of it is your own
+licence = "MIT"          # SPDX name, of the code
+
+# Places of the split that taught it: "none", a list, or one for the answers about each half of a cross-fit:
+# trained_on = {halves}
+trained_on = "none"
+# trained_elsewhere = "10,000 views of Zurich"    # what else taught it
+
+needs = ["position"]     # what a query must tell: position, yaw, scale, vectors, image, training
+uses = []                # what it looks at besides query and map, as in "imagery"
+# limits = "knows no heading"
+# authors = ["A. Author"]
+# contact = "a.author@example.org"
+# code = "https://example.org/my-matcher"
+"""

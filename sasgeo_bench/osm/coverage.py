@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where an extract holds the map: extracts end at borders, polygons and boxes, and beyond that nothing is absent."""
+
+from typing import Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from rasterio.features import shapes
+from scipy import ndimage
+
+from sasgeo_bench.osm.locate import CoverageSource
+
+CELL_M: Final = 100.0
+CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie closer together than this
+OPEN_M: Final = 150.0  # thinner than two of these is a road or stream that was kept whole beyond the edge
+MIN_SHARE: Final = 0.02  # of the largest piece: smaller ones are leftovers of relations that cross the edge
+FULL_SHARE: Final = 0.85  # data that fills this much of the header's box was cut by that box
+_M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the sphere is near enough
+
+
+def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
+    """Outline of where mapped coordinates lie, in longitude and latitude.
+
+    Parameters
+    ----------
+    lonlat : ndarray of float, shape (N, 2)
+        Longitude and latitude of vertices, degrees.
+
+    Returns
+    -------
+    shapely.Geometry
+        Polygon or multipolygon, degrees; empty for no vertices.
+
+    Notes
+    -----
+    Cells of 100 m that hold a vertex are closed over 600 m, holes filled, thin tails (ways kept whole across the edge)
+    and small leftovers cut off. It is an estimate: a region file's `coverage_lonlat` overrules it.
+
+    Examples
+    --------
+    >>> field = np.array([[9 + i / 800, 47 + j / 1200] for i in range(40) for j in range(40)])
+    >>> estimate_coverage(field).contains(shapely.Point(9.02, 47.02))
+    True
+    """
+    if len(lonlat) == 0:
+        return shapely.Polygon()
+    west, south = np.percentile(lonlat, 0.1, axis=0)
+    east, north = np.percentile(lonlat, 99.9, axis=0)
+    step = np.array([CELL_M / (_M_PER_DEG * np.cos(np.radians((south + north) / 2))), CELL_M / _M_PER_DEG])
+    pad = int(CLOSE_M / CELL_M) + 2
+    origin = np.array([west, south]) - pad * step
+    size = np.ceil((np.array([east, north]) - origin) / step).astype(int) + pad
+    cells = np.floor((lonlat - origin) / step).astype(int)
+    cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
+    filled = np.zeros((size[1], size[0]), dtype=bool)
+    filled[cells[:, 1], cells[:, 0]] = True
+    outline = _largest(_opened(_closed(filled)))
+    found = [shapely.geometry.shape(shape) for shape, _ in shapes(outline.astype(np.uint8), mask=outline)]
+    scaled = shapely.transform(shapely.union_all(found), lambda points: points * step + origin)
+    return shapely.simplify(scaled, float(step.mean()))
+
+
+def _disc(radius_m: float) -> NDArray[np.bool_]:
+    reach = int(radius_m / CELL_M)
+    rows, cols = np.ogrid[-reach : reach + 1, -reach : reach + 1]
+    return np.asarray(rows**2 + cols**2 <= reach**2 + 1)
+
+
+def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Close by distance transforms, whose cost does not grow with the radius, then fill holes."""
+    reach = CLOSE_M / CELL_M / 2
+    near = ndimage.distance_transform_edt(~cells) <= reach
+    return np.asarray(ndimage.binary_fill_holes(ndimage.distance_transform_edt(near) > reach))
+
+
+def _opened(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    opened = np.asarray(ndimage.binary_opening(cells, _disc(OPEN_M)))
+    return opened if opened.any() else cells
+
+
+def _largest(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    labels, count = ndimage.label(cells)
+    if count == 0:
+        return cells
+    sizes = np.bincount(labels.ravel())[1:]
+    return np.asarray(np.isin(labels, np.flatnonzero(sizes >= MIN_SHARE * sizes.max()) + 1))
+
+
+def choose_coverage(
+    lonlat: NDArray[np.float64],
+    *,
+    stated: shapely.Geometry | None,
+    header_box: tuple[float, float, float, float] | None,
+) -> tuple[shapely.Geometry, CoverageSource]:
+    """Choose the mapped area of an extract and say where it comes from.
+
+    Parameters
+    ----------
+    lonlat : ndarray of float, shape (N, 2)
+        Longitude and latitude of the extract's vertices, degrees.
+    stated : shapely.Geometry or None
+        The region file's polygon, degrees; it overrules all else.
+    header_box : tuple of float or None
+        West, south, east, north of the file's header, degrees.
+
+    Returns
+    -------
+    shapely.Geometry, {"region file", "header box", "estimated"}
+        The area in degrees, and its source. The header's box is taken where the data fill it (an extract cut by a box);
+        of an extract cut along a border it is only the frame, and the estimate within it is taken.
+
+    Examples
+    --------
+    >>> choose_coverage(np.zeros((0, 2)), stated=shapely.box(9, 47, 10, 48), header_box=None)[1]
+    'region file'
+    """
+    if stated is not None:
+        return stated, "region file"
+    found = estimate_coverage(lonlat)
+    if header_box is None:
+        return found, "estimated"
+    box = shapely.box(*header_box)
+    within = shapely.intersection(found, box)
+    if shapely.area(within) >= FULL_SHARE * shapely.area(box):
+        return box, "header box"
+    return within, "estimated"

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding a dated extract: by file name and SHA-256 in the folders named, then by download."""
+
+import datetime as dt
+import hashlib
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event, Thread
+from typing import Annotated, Final, Literal, Self
+from urllib.parse import urlsplit
+
+import pooch
+from pydantic import Field, StringConstraints, field_validator, model_validator
+
+from sasgeo_bench.config import Document, Line
+from sasgeo_bench.errors import ExtractError
+
+FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
+_SILENT_S: Final = 30.0  # between two parts of a download
+ANSWER_S: Final = 3.0  # a server that is silent for longer is taken for unreachable
+
+Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+# Where it is known from which ground an extract maps.
+CoverageSource = Literal["region file", "header box", "estimated", "estimated and islands"]
+Morphology = Literal["grid", "old_town", "suburb", "industrial", "riverside", "agricultural"]
+
+
+class TownEntry(Document):
+    """An embedded town instead of a file: made by `write_town`, never downloaded."""
+
+    morphology: Morphology
+    seed: Annotated[int, Field(ge=0)]
+    size_m: Annotated[float, Field(gt=0, le=10_000)] = 1024.0
+
+
+class Extract(Document):
+    """One `[[extract]]` of a region file.
+
+    `date` is the day the extract speaks of; of a full history, the day it is cut at. Several hashes are several
+    accepted forms of one file, such as with and without user names.
+
+    Examples
+    --------
+    >>> Extract(file="town.osm.pbf", date=dt.date(2020, 1, 1), town=TownEntry(morphology="grid", seed=1)).urls
+    ()
+    """
+
+    file: Line
+    date: dt.date
+    sha256: Annotated[tuple[Sha256, ...], Field(strict=False)] = ()
+    urls: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    town: TownEntry | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _is_plain(cls, file: str) -> str:
+        if Path(file).name != file:
+            message = f"file must be a plain file name without folders, got {file!r}"
+            raise ValueError(message)
+        return file
+
+    @model_validator(mode="after")
+    def _has_source(self) -> Self:
+        if bool(self.sha256) == (self.town is not None):
+            message = f"extract {self.file!r} needs either sha256 = [...] or town = {{...}}"
+            raise ValueError(message)
+        return self
+
+
+def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
+    """Folders searched for extracts, in order: those given, SASGEO_EXTRACTS, the user's cache.
+
+    Examples
+    --------
+    >>> extract_folders([Path("mine")])[0].name
+    'mine'
+    """
+    named = [Path(folder) for folder in os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep) if folder]
+    return (*given, *named, cache_folder())
+
+
+def cache_folder() -> Path:
+    """Where downloaded extracts are kept.
+
+    Examples
+    --------
+    >>> cache_folder().name
+    'sasgeo-bench'
+    """
+    return Path(pooch.os_cache("sasgeo-bench"))
+
+
+def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
+    """Find the file of an extract, or download it into the user's cache.
+
+    Parameters
+    ----------
+    extract : Extract
+        Name, accepted hashes and addresses.
+    folders : sequence of Path
+        Searched first.
+
+    Returns
+    -------
+    Path
+        A file whose SHA-256 is one of those accepted.
+
+    Raises
+    ------
+    ExtractError
+        If no folder holds the file and it cannot be downloaded; the line names the file, its SHA-256 and its place.
+
+    Examples
+    --------
+    >>> wanted = Extract(file="nowhere.osm.pbf", date=dt.date(2020, 1, 1), sha256=("0" * 64,))
+    >>> find_extract(wanted)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ExtractError: nowhere.osm.pbf (SHA-256 0000...) was not found: put it into ...
+    """
+    if not extract.sha256:
+        message = f"{extract.file} is an embedded town: it is made by the build, there is no file to find"
+        raise ExtractError(message)
+    wrong: list[str] = []
+    for folder in extract_folders(folders):
+        path = folder / extract.file
+        if path.is_file():
+            found = _sha256(path)
+            if found in extract.sha256:
+                return path
+            wrong.append(f"{path} has SHA-256 {found}, which is none of those accepted")
+    failures: list[str] = []
+    for url in extract.urls:
+        try:
+            return _download(extract, url)
+        except ExtractError as error:
+            failures.append(str(error))
+    raise ExtractError(_not_found(extract, folders, wrong + failures))
+
+
+def _not_found(extract: Extract, folders: Sequence[Path], reasons: Sequence[str]) -> str:
+    hashes = " or ".join(extract.sha256)
+    places = ", ".join(str(folder) for folder in extract_folders(folders))
+    because = f" ({'; '.join(reasons)})" if reasons else ""
+    return (
+        f"{extract.file} (SHA-256 {hashes}) was not found{because}: "
+        f"put it into {places}, or name its folder with --extracts or {FOLDERS_VARIABLE}"
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as source:
+        return hashlib.file_digest(source, "sha256").hexdigest()
+
+
+def _check_hash(path: Path, extract: Extract, source: str) -> None:
+    found = _sha256(path)
+    if found not in extract.sha256:
+        message = f"{source} has SHA-256 {found}, which is none of those accepted"
+        raise ExtractError(message)
+
+
+def _download(extract: Extract, url: str) -> Path:
+    """Download into the cache; the file gets its name only when its hash is one of those accepted."""
+    if not answers(url):
+        message = f"{url} cannot be reached"
+        raise ExtractError(message)
+    folder = cache_folder()
+    load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty())
+    pooch.get_logger().setLevel("WARNING")  # else it prints where its temporary file lies
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder, prefix=".download-") as scratch:
+            # pooch checks one hash, and several may be accepted here: so it is told none, and we check.
+            got = Path(pooch.retrieve(url, known_hash=None, fname=extract.file, path=scratch, downloader=load))
+            _check_hash(got, extract, url)
+            return got.replace(folder / extract.file)
+    except ExtractError:
+        raise
+    except OSError as error:  # requests' errors are OSErrors, too
+        message = f"{url} could not be downloaded: {_why(error)}"
+        raise ExtractError(message) from error
+
+
+def _why(error: OSError) -> str:
+    """Reason of a failed download, in our words: those of the libraries name their own insides."""
+    response = getattr(error, "response", None)
+    if response is not None:
+        return f"the server answered with status {response.status_code}"
+    return error.strerror or "the connection broke off"
+
+
+def answers(url: str) -> bool:
+    """Whether the server of an address answers at all, within `ANSWER_S`; asked once for each server.
+
+    Examples
+    --------
+    >>> answers("http://127.0.0.1:1/town.osm.pbf")
+    False
+    """
+    parts = urlsplit(url)
+    return parts.scheme in {"http", "https"} and _server_answers(f"{parts.scheme}://{parts.netloc}")
+
+
+@cache
+def _server_answers(server: str) -> bool:
+    found = Event()
+
+    def ask() -> None:
+        with suppress(OSError, ValueError):
+            pooch.HTTPDownloader(timeout=ANSWER_S)(server, None, None, check_only=True)
+            found.set()
+
+    # In a thread: the look-up of a name takes as long as the system likes, whatever limit is set on the connection.
+    thread = Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(ANSWER_S)
+    return found.is_set()

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where an extract holds the map of a grid, which part of it is sea, and what of it is unknown and why."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.cuts import ground_within_reach
+from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.osm.sea import find_shore
+
+CUT: Final = "within reach of ways cut at the edge of the extract"
+OFFSHORE_M: Final = 1000.0  # of whole islands the sea is mapped this far out: no view is wider, no strait much narrower
+_WGS84: Final = 4326
+_EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projected
+_DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
+_AROUND_DEG: Final = 0.5  # coast further off decides nothing here, and a projection holds this far
+_COARSE_M: Final = 20.0  # of outlines of islands, where only what is about a kilometre away counts
+_AREA: Final = 2  # dimensions of a polygon
+
+Box = tuple[float, float, float, float]
+Geometries = NDArray[np.object_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mapped:
+    """What is known of the ground of a grid, in its CRS.
+
+    `coverage` is the mapped area less what is unknown within it, `unknown_m2` the size of that by reason, and `sea` the
+    polygons of the mapped area that are water for their side of the coast.
+    """
+
+    coverage: shapely.Geometry
+    source: CoverageSource
+    sea: Geometries
+    unknown_m2: dict[str, float]
+
+
+def map_ground(
+    grid: Grid,
+    area: shapely.Geometry,
+    source: CoverageSource,
+    *,
+    coast: Geometries,
+    gaps: Geometries,
+    frame: shapely.Geometry,
+) -> Mapped:
+    """Find what of a grid an extract maps, what of that is sea, and what is unknown.
+
+    Parameters
+    ----------
+    grid : Grid
+        The area wanted.
+    area, source : shapely.Geometry, str
+        From `choose_coverage`: the mapped area in longitude and latitude.
+    coast, gaps : ndarray of shapely.Geometry
+        All coastlines of the extract, and where its ways lack nodes (`find_gaps`), in longitude and latitude.
+    frame : shapely.Geometry
+        The box that the whole extract lies in, in longitude and latitude.
+
+    Returns
+    -------
+    Mapped
+        In the CRS of the grid. An estimated outline grows to whole islands and `OFFSHORE_M` of the sea around them.
+
+    Examples
+    --------
+    >>> grid = Grid(epsg=32632, west_m=5e5, north_m=100.0, cell_size_m=1.0, rows=100, cols=100)
+    >>> quay = shapely.LineString([(8.9, 0.0003), (9.1, 0.0003)])  # 33 m north of the southern edge, eastwards
+    >>> none = np.array([], dtype=object)
+    >>> box = shapely.box(8.9, -0.1, 9.1, 0.1)
+    >>> found = map_ground(grid, box, "header box", coast=np.array([quay]), gaps=none, frame=box)
+    >>> round(shapely.area(found.sea).sum()), round(found.coverage.area)
+    (3316, 10000)
+    """
+    west, south, east, north = lonlat_box(grid)
+    near = shapely.box(west - _AROUND_DEG, south - _AROUND_DEG, east + _AROUND_DEG, north + _AROUND_DEG)
+    bounds = shapely.box(*grid.bounds_m)
+    ground = project(shapely.intersection(area, near), grid.epsg)
+    lines = project(coast[shapely.intersects(coast, near)], grid.epsg)
+    within = project(shapely.intersection(frame, near), grid.epsg)
+    if source == "estimated" and len(lines):
+        whole = _islands(lines, within)
+        ground, source = shapely.union(ground, whole), "estimated" if whole.is_empty else "estimated and islands"
+    shore = find_shore(lines, ground)
+    tips = project(gaps[shapely.intersects(gaps, near)], grid.epsg)
+    lost = {CUT: ground_within_reach(tips, shapely.intersection(ground, within))} if len(tips) else {}
+    unknown = {reason: shapely.intersection(part, bounds) for reason, part in (lost | shore.unknown).items()}
+    coverage = _less(shapely.intersection(ground, bounds), unknown)
+    sea = shapely.get_parts(shapely.get_parts(shapely.intersection(shore.sea, bounds)))
+    return Mapped(
+        coverage=coverage,
+        source=source,
+        sea=sea[shapely.area(sea) > 0],
+        unknown_m2={reason: float(part.area) for reason, part in unknown.items() if part.area > 0},
+    )
+
+
+def _less(ground: shapely.Geometry, unknown: dict[str, shapely.Geometry]) -> shapely.Geometry:
+    """The ground without what is unknown of it, polygons alone."""
+    if all(part.is_empty for part in unknown.values()):
+        return ground
+    parts = shapely.get_parts(shapely.difference(ground, shapely.union_all(list(unknown.values()))))
+    return shapely.multipolygons(parts[shapely.get_dimensions(parts) == _AREA])
+
+
+def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
+    """Islands that lie in a frame whole, with the sea around them; nothing where any coastline in it is not whole."""
+    shore = find_shore(coast, frame)
+    is_whole = shapely.length(shapely.intersection(shore.land, shapely.boundary(frame))) == 0
+    if shore.unknown or not is_whole.any():
+        return shapely.Polygon()
+    islands = shapely.union_all(shore.land[is_whole])
+    around = shapely.union_all([islands, *shore.sea])
+    return shapely.intersection(around, shapely.buffer(shapely.simplify(islands, _COARSE_M), OFFSHORE_M))
+
+
+def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
+    """Longitude and latitude -> easting and northing of a CRS, rounded to a millimetre; one geometry or an array.
+
+    Examples
+    --------
+    >>> project(shapely.Point(9.0, 0.0), 32632)
+    <POINT (500000 0)>
+    """
+    to_grid = pyproj.Transformer.from_crs(_WGS84, epsg, always_xy=True)
+
+    def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates of shape (N, 2), degrees -> metres."""
+        return np.column_stack(to_grid.transform(points[:, 0], points[:, 1])).round(_DECIMALS) + 0.0
+
+    return shapely.transform(geometry, projected)
+
+
+def lonlat_box(grid: Grid) -> Box:
+    """West, south, east, north of a grid, degrees: the box around its bent edges.
+
+    Examples
+    --------
+    >>> west, *_ = lonlat_box(Grid(epsg=32632, west_m=5e5, north_m=5.2e6, cell_size_m=1.0, rows=9, cols=9))
+    >>> round(west, 6)
+    9.0
+    """
+    to_lonlat = pyproj.Transformer.from_crs(grid.epsg, _WGS84, always_xy=True)
+    west, south, east, north = grid.bounds_m
+    bounds = to_lonlat.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS)
+    return (float(bounds[0]), float(bounds[1]), float(bounds[2]), float(bounds[3]))

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an OSM file to a feature table: read, classify, project, cut to the grid."""
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import CoverageError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.coverage import choose_coverage
+from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
+from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.osm.mapped import Mapped, lonlat_box, map_ground, project
+from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
+from sasgeo_bench.osm.snapshot import open_snapshot
+from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
+
+_EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium says 1970-01-01 where a file carries no timestamps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """What one extract says about one grid.
+
+    `coverage` lies in the grid's CRS and is cut to the grid; `unknown_m2` is what was taken out of it, by reason (one
+    place may have two), and `cuts` counts what an extract cut out of a larger one lacks. `drops`, `hidden` and `notes`
+    count objects around the grid by reason; `osm_timestamp` is the newest moment the extract speaks of, None where it
+    carries no times.
+    """
+
+    features: gpd.GeoDataFrame
+    coverage: shapely.Geometry
+    coverage_source: CoverageSource
+    osm_timestamp: dt.datetime | None
+    drops: dict[str, int]
+    hidden: dict[str, int]
+    notes: dict[str, int]
+    warnings: tuple[str, ...]
+    unknown_m2: dict[str, float] = field(default_factory=dict)
+    cuts: dict[str, int] = field(default_factory=dict)
+
+
+def read_extract(
+    path: Path,
+    grid: Grid,
+    *,
+    at: dt.date | None = None,
+    stated_coverage: shapely.Geometry | None = None,
+    taxonomy: Taxonomy | None = None,
+) -> Reading:
+    """Read the features of one extract that touch a grid.
+
+    Parameters
+    ----------
+    path : Path
+        An OSM file: .osm.pbf, .osm, .osm.gz, .osm.bz2, or a full history (.osh.pbf) with `at`.
+    grid : Grid
+        The area wanted; its CRS is that of the features, metres.
+    at : date, optional
+        For a full history: the state at the end of this day.
+    stated_coverage : shapely.Geometry, optional
+        Mapped area in longitude and latitude, where the user knows it.
+    taxonomy : Taxonomy, optional
+        The classes; those of the package unless given.
+
+    Returns
+    -------
+    Reading
+        Features with whole geometries, ordered by class and id, whatever the order in the file.
+
+    Raises
+    ------
+    ExtractError
+        If the file is missing, damaged or of an unknown format, or an id, date or coordinate in it is no number: what
+        comes after that cannot be read. A node beyond the globe is only taken out of its ways, and counted in `drops`.
+    CoverageError
+        If the grid lies outside the extract, or no element of any class lies in it.
+
+    Examples
+    --------
+    >>> grid = Grid(epsg=32632, west_m=5e5, north_m=5.2e6, cell_size_m=1.0, rows=9, cols=9)
+    >>> read_extract(Path("nowhere.osm.pbf"), grid)
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
+    """
+    taxonomy = taxonomy or load_taxonomy()
+    grid_lonlat = lonlat_box(grid)
+    with open_snapshot(path, at=at) as snapshot:
+        scan = scan_file(snapshot.path, taxonomy, box=grid_lonlat)
+    geometry = shapely.from_wkb(np.array([row.wkb for row in scan.rows], dtype=object))
+    beyond = shapely.from_wkb(np.array(scan.far, dtype=object))
+    lonlat = shapely.get_coordinates(np.concatenate((geometry, beyond)))
+    coverage, source = choose_coverage(lonlat, stated=stated_coverage, header_box=snapshot.box_lonlat)
+    mapped = map_ground(
+        grid,
+        coverage,
+        source,
+        coast=shapely.from_wkb(np.array(scan.coast, dtype=object)),
+        gaps=np.array([mark for marks in scan.gaps.values() for mark in marks], dtype=object),
+        frame=shapely.box(*(snapshot.box_lonlat or shapely.total_bounds(shapely.multipoints(lonlat)))),
+    )
+    _check_covered(path, grid_lonlat, coverage, mapped)
+    near = _meets(shapely.bounds(geometry), grid_lonlat)
+    features = _table(scan, np.flatnonzero(near), geometry[near], grid, taxonomy)
+    features = _with_sea(features, mapped.sea, taxonomy)
+    if len(features) == 0:
+        message = (
+            f"{path.name} holds no element of any class within {_written(grid_lonlat)}: move or enlarge the bounds"
+        )
+        raise CoverageError(message)
+    newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
+    return Reading(
+        features=features,
+        coverage=mapped.coverage,
+        coverage_source=mapped.source,
+        osm_timestamp=snapshot.replicated_at or (newest if newest > _EPOCH else None),
+        drops=dict(scan.tally.drops.most_common()),
+        hidden=dict(scan.tally.hidden.most_common()),
+        notes=dict(scan.tally.notes.most_common()),
+        warnings=snapshot.warnings,
+        unknown_m2=mapped.unknown_m2,
+        cuts=_cuts(scan),
+    )
+
+
+def _cuts(scan: Scan) -> dict[str, int]:
+    """Ways of a class in the whole extract that lack nodes; nothing where none does."""
+    partial = sum(bool(marks) for marks in scan.gaps.values())
+    found = {"ways that lack some nodes": partial, "ways that lack all nodes": len(scan.gaps) - partial}
+    return {what: count for what, count in found.items() if count}
+
+
+def _check_covered(path: Path, wanted: Box, coverage: shapely.Geometry, mapped: Mapped) -> None:
+    if coverage.is_empty:
+        message = f"{path.name} holds no element of any class: is it an extract of map data?"
+        raise CoverageError(message)
+    if mapped.coverage.is_empty and not mapped.unknown_m2:
+        covered = _written(shapely.bounds(coverage))
+        message = (
+            f"bounds {_written(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
+        )
+        raise CoverageError(message)
+
+
+def _written(box: Box | NDArray[np.float64]) -> str:
+    return "[" + ", ".join(f"{value:.4f}" for value in box) + "]"
+
+
+def _meets(bounds: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
+    west, south, east, north = box
+    return np.asarray(
+        (bounds[:, 0] <= east) & (bounds[:, 2] >= west) & (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
+    )
+
+
+def _table(
+    scan: Scan, picked: NDArray[np.int64], geometry: NDArray[np.object_], grid: Grid, taxonomy: Taxonomy
+) -> gpd.GeoDataFrame:
+    """One row for each picked object and class that touches the grid, in the order of class, type and id."""
+    geometry = project(geometry, grid.epsg)
+    touches = shapely.intersects(geometry, shapely.box(*grid.bounds_m))
+    rows, geometry = [scan.rows[index] for index in picked[touches]], geometry[touches]
+    pairs = [(index, label) for index, row in enumerate(rows) for label in scan.traits[row.kind].labels]
+    source = np.array([index for index, _ in pairs], dtype=np.int64)
+    labels = [label for _, label in pairs]
+    traits = [scan.traits[rows[index].kind] for index, _ in pairs]
+    ids = np.array([row.osm_id for row in rows], dtype=np.int64)[source]
+    is_relation = np.array([row.is_relation for row in rows], dtype=bool)[source]
+    class_ids = np.array([taxonomy.names.index(label.class_name) for label in labels], dtype=np.int64)
+    order = np.lexsort((ids, is_relation, class_ids))
+    columns: dict[str, object] = {
+        "osm_type": np.where(is_relation, "relation", "way")[order],
+        "osm_id": ids[order],
+        "version": np.array([row.version for row in rows], dtype=np.int32)[source][order],
+        "timestamp": _times(rows)[source][order],
+        "class": np.array(taxonomy.names, dtype=object)[class_ids][order],
+        "level": np.array([item.level for item in traits], dtype=np.int16)[order],
+        "is_bridge": np.array([item.is_bridge for item in traits], dtype=bool)[order],
+        "is_tunnel": np.array([item.is_tunnel for item in traits], dtype=bool)[order],
+        "is_visible": np.array([item.hidden_by is None for item in traits], dtype=bool)[order],
+        "width_m": np.array([_width_m(*pair) for pair in zip(labels, traits, strict=True)], dtype=np.float32)[order],
+        "geometry": _shapes(geometry[source], labels)[order],
+    }
+    return make_features(columns, epsg=grid.epsg)
+
+
+def _with_sea(features: gpd.GeoDataFrame, sea: NDArray[np.object_], taxonomy: Taxonomy) -> gpd.GeoDataFrame:
+    """The table with a row of class water for each polygon of sea, numbered from the largest; they have no date."""
+    if len(sea) == 0:
+        return features
+    columns: dict[str, object] = {name: np.zeros(len(sea)) for name in DTYPES} | {
+        "osm_type": [SEA] * len(sea),
+        "osm_id": np.arange(len(sea)) + 1,
+        "timestamp": np.full(len(sea), "NaT", dtype="datetime64[ms]"),
+        "class": ["water"] * len(sea),
+        "is_visible": True,
+        "width_m": np.nan,
+        "geometry": sea[np.argsort(-shapely.area(sea), kind="stable")],
+    }
+    table = pd.concat([features, make_features(columns, epsg=features.crs.to_epsg())])
+    order = np.argsort([taxonomy.names.index(name) for name in table["class"]], kind="stable")
+    return check_features(table.iloc[order].reset_index(drop=True))
+
+
+def _times(rows: Sequence[ScanRow]) -> NDArray[np.datetime64]:
+    """Timestamps as UTC milliseconds; NaT where the file carries none."""
+    known = [row.timestamp.replace(tzinfo=None) if row.timestamp > _EPOCH else None for row in rows]
+    return np.array(known, dtype="datetime64[ms]")
+
+
+def _width_m(label: Label, traits: Traits) -> float:
+    """Drawn width of a line: a tagged width, else that of the class, else that of the road or railway it lies on."""
+    if traits.is_area and not label.is_outline:
+        return float("nan")
+    if traits.width_m is not None and label.keeps_width:
+        return traits.width_m
+    if label.width_m is not None:
+        return label.width_m
+    return max((other.width_m for other in traits.labels if other.width_m is not None), default=DEFAULT_BRIDGE_WIDTH_M)
+
+
+def _shapes(geometry: NDArray[np.object_], labels: list[Label]) -> NDArray[np.object_]:
+    """Outlines become lines; a multipolygon or multiline of one part becomes that part."""
+    is_outline = np.array([label.is_outline for label in labels], dtype=bool)
+    shaped = geometry.copy()
+    shaped[is_outline] = shapely.boundary(geometry[is_outline])
+    single = shapely.get_num_geometries(shaped) == 1
+    shaped[single] = shapely.get_geometry(shaped[single], 0)
+    return np.asarray(shaped)

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The semantic classes and the OSM tag rules that make them; the data is in `taxonomy.toml`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib import resources
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, StringConstraints, model_validator
+
+from sasgeo_bench.config import Document, parse_toml
+
+Kind = Literal["line", "area"]
+Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z_]*$")]
+Colour = Annotated[str, StringConstraints(pattern=r"^#[0-9a-f]{6}$")]
+WidthM = Annotated[float, Field(gt=0, le=100)]
+Share = Annotated[float, Field(ge=0, le=1)]
+ANY = "*"
+
+
+class Persistence(Document):
+    """Hand-set prior and yearly rates of one class (SASGeo paper, Eq. 5); dimensionless and 1/year."""
+
+    prior: Share
+    vanish_per_year: Annotated[float, Field(ge=0)]
+    appear_per_year: Annotated[float, Field(ge=0)]
+
+
+class Rule(Document):
+    """One OSM key and the exact values of it that make a class.
+
+    Examples
+    --------
+    >>> Rule(key="highway", geometry="line", widths={"track": 2.5}).takes("track")
+    True
+    >>> Rule(key="building", geometry="area", values=["*"], besides=["no"]).takes("no")
+    False
+    """
+
+    key: str
+    geometry: Kind
+    values: list[str] = []
+    besides: list[str] = []
+    widths: dict[str, WidthM] = {}
+    multipolygon: Literal["outline", "filled"] = "outline"
+    keeps_width: list[str] = [ANY]
+
+    @model_validator(mode="after")
+    def _has_values(self) -> Self:
+        if bool(self.values) == bool(self.widths):
+            message = f"a rule needs either values or widths, got values={self.values!r} and widths={self.widths!r}"
+            raise ValueError(message)
+        return self
+
+    def takes(self, value: str) -> bool:
+        """Whether a tag value makes the class."""
+        return value in self.widths or value in self.values or (ANY in self.values and value not in self.besides)
+
+
+class Outline(Document):
+    """Areas whose outline is drawn as a line of the class: parcel edges as field boundaries."""
+
+    key: str
+    values: list[str]
+    width_m: WidthM
+
+
+class SemanticClass(Document):
+    """One semantic class: identity, tag rules, look and persistence."""
+
+    id: Annotated[int, Field(ge=0)]
+    name: Name
+    title: str
+    kind: Kind
+    colour: Colour
+    persistence: Persistence
+    rules: list[Rule]
+    outline_of: Outline | None = None
+
+
+class Taxonomy(Document):
+    """All classes in the order of their ids; the band order of every layer stack.
+
+    Examples
+    --------
+    >>> taxonomy = load_taxonomy()
+    >>> taxonomy.names[:2], taxonomy["building"].id
+    (('road_major', 'road_minor'), 4)
+    """
+
+    classes: list[SemanticClass] = Field(alias="class")
+
+    @model_validator(mode="after")
+    def _ids_count_up(self) -> Self:
+        ids = [item.id for item in self.classes]
+        if ids != list(range(len(ids))):
+            message = f"class ids must count up from 0 without a gap, got {ids!r}"
+            raise ValueError(message)
+        if len(set(self.names)) != len(ids):
+            message = f"class names must be unique, got {self.names!r}"
+            raise ValueError(message)
+        return self
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Class names in id order."""
+        return tuple(item.name for item in self.classes)
+
+    def __getitem__(self, name: str) -> SemanticClass:
+        """Return the class of that name; `KeyError` if there is none."""
+        return {item.name: item for item in self.classes}[name]
+
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """OSM keys that any rule reads, in order of first use."""
+        return tuple(dict.fromkeys(rule.key for item in self.classes for rule in item.rules))
+
+    def keys_of(self, geometry: Kind) -> tuple[str, ...]:
+        """OSM keys that line rules (or area rules) read, in order of first use.
+
+        Examples
+        --------
+        >>> load_taxonomy().keys_of("area")[0]
+        'building'
+        """
+        rules = (rule for item in self.classes for rule in item.rules)
+        return tuple(dict.fromkeys(rule.key for rule in rules if rule.geometry == geometry))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Label:
+    """One class that an object belongs to; `width_m` is None for areas and where the host's width counts.
+
+    `is_outline`: the edge of an area is drawn, not the area; `is_filled`: a multipolygon of a line rule is an area;
+    `keeps_width`: a tagged width goes before `width_m`.
+    """
+
+    class_name: str
+    width_m: float | None
+    is_outline: bool = False
+    is_filled: bool = False
+    keeps_width: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Classification:
+    """What the rules make of one object: labels as a line and as an area, and the tags no rule knows."""
+
+    line: tuple[Label, ...]
+    area: tuple[Label, ...]
+    unknown: tuple[str, ...]
+
+
+def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
+    """Apply every rule to the tags of one object.
+
+    Parameters
+    ----------
+    tags : mapping of str to str
+        The object's tags; only keys of the taxonomy matter.
+    taxonomy : Taxonomy
+        The classes.
+
+    Returns
+    -------
+    Classification
+        Labels in class order. A line rule labels areas too (filled or by their outline); whether the object is a line
+        or an area is for the reader to say. `unknown` names "key=value" of taxonomy keys without rule.
+
+    Examples
+    --------
+    >>> found = classify({"highway": "primary", "bridge": "yes"}, load_taxonomy())
+    >>> [(label.class_name, label.width_m) for label in found.line]
+    [('road_major', 8.0), ('bridge', None)]
+    >>> classify({"highway": "proposed"}, load_taxonomy()).unknown
+    ('highway=proposed',)
+    """
+    line: list[Label] = []
+    area: list[Label] = []
+    known: set[str] = set()
+    for item in taxonomy.classes:
+        for rule in item.rules:
+            value = tags.get(rule.key)
+            if value is None or not rule.takes(value):
+                continue
+            known.add(rule.key)
+            target = line if rule.geometry == "line" else area
+            target.append(
+                Label(
+                    class_name=item.name,
+                    width_m=rule.widths.get(value),
+                    is_filled=rule.multipolygon == "filled",
+                    keeps_width=not {ANY, value}.isdisjoint(rule.keeps_width),
+                )
+            )
+        outline = item.outline_of
+        if outline is not None and tags.get(outline.key) in outline.values:
+            area.append(Label(class_name=item.name, width_m=outline.width_m, is_outline=True))
+    unknown = tuple(f"{key}={tags[key]}" for key in taxonomy.keys if key in tags and key not in known)
+    return Classification(line=_unique(line), area=_unique(area), unknown=unknown)
+
+
+def _unique(labels: list[Label]) -> tuple[Label, ...]:
+    """One label a class; the first rule wins."""
+    return tuple({label.class_name: label for label in reversed(labels)}.values())[::-1]
+
+
+@cache
+def load_taxonomy() -> Taxonomy:
+    """Return the taxonomy that ships with the package.
+
+    Examples
+    --------
+    >>> len(load_taxonomy().names)
+    13
+    """
+    text = resources.files("sasgeo_bench.osm").joinpath("taxonomy.toml").read_text(encoding="utf-8")
+    return parse_toml(text, Taxonomy, source="taxonomy.toml")

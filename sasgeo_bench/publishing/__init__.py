@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards and regions for others: sites, archives, releases, submissions."""

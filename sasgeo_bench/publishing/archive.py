@@ -1,0 +1,404 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board with all it was made of -> stored results, and stored results -> what a board is made of."""
+
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.leaderboard.board_figures import figures_extra
+from sasgeo_bench.leaderboard.board_files import BOARD, read_board
+from sasgeo_bench.leaderboard.board_pictures import pictures_extra
+from sasgeo_bench.leaderboard.build import Board, ScoreRequest, make_board
+from sasgeo_bench.leaderboard.private_board import check_public, seed_of
+from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.plugins import check_registered
+from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.publishing.archive_file import (
+    MOST_BYTES,
+    Packed,
+    StoredRun,
+    TaskFolders,
+    unpack,
+    unpack_tasks,
+    write_pack,
+)
+from sasgeo_bench.publishing.archive_folder import check_results, is_pack, read_settings
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.entries import Entry
+from sasgeo_bench.tasks.split import find_split
+from sasgeo_bench.tasks.task_files import read_ids
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stored:
+    """What came of storing a board."""
+
+    folder: Path
+    packed: Packed
+
+    def to_text(self) -> str:
+        """In a line: how large it is, what a prediction takes, and what was left out."""
+        mine = self.packed
+        each = mine.prediction_bytes / max(mine.predictions, 1)
+        left_out = f"; left out: {mine.dropped}" if mine.dropped else ""
+        return (
+            f"{self.folder}: {mine.total_bytes / 1e6:.2f} MB, of these {mine.prediction_bytes / 1e6:.2f} MB for "
+            f"{counted(mine.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
+        )
+
+
+def pack_board(
+    board: Board, request: ScoreRequest, folder: Path, *, lacks: str = "", most_bytes: int = MOST_BYTES
+) -> Stored:
+    """Store a board that was just written.
+
+    Parameters
+    ----------
+    board, request : Board, ScoreRequest
+        What came of what was asked for.
+    folder : Path
+        To write; older results there are replaced.
+    lacks : str
+        What the stored results that were scored had left out already.
+    most_bytes : int
+        Of all files together.
+
+    Raises
+    ------
+    ConfigError
+        If a contestant is a file of predictions: nobody can say who answered; or the board is of a private seed.
+    StoreError
+        If it would be too large, or cannot be written; what was there is as it was.
+    """
+    submitted = next((entry.name for entry in board.everyone if not entry.runs), None)
+    if submitted is not None:
+        message = f"{submitted} is a file of predictions: only boards of runs are stored"
+        raise ConfigError(message)
+    check_public(seed_of(board.tasks), str(request.board))
+    truth = request.truth or request.root / "truth"
+    names = [(str(about["suite"]), str(about["region"])) for about in board.tasks]
+    tasks = [
+        TaskFolders(
+            task=request.root / "tasks" / suite / region,
+            truth=truth / suite / region,
+            region=request.root / "regions" / region,
+        )
+        for suite, region in names
+    ]
+    ids = {name: read_ids(item.task) for name, item in zip(names, tasks, strict=True)}
+    runs = {entry.name: list(_runs_of(entry, board, ids)) for entry in board.everyone}
+    packed = write_pack(
+        folder,
+        board=request.board,
+        tasks=tasks,
+        runs=runs,
+        settings=_settings_of(request),
+        lacks=lacks,
+        most_bytes=most_bytes,
+    )
+    return Stored(folder=folder, packed=packed)
+
+
+def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
+    mine = board.predictions[entry.name]
+    for source, about in zip(entry.sources, entry.runs, strict=True):
+        said = LearnedSaid.of(about)
+        named = ids[about["suite"], about["region"]]
+        yield StoredRun(
+            about=about,
+            predictions=[mine[name] for name in named if name in mine],
+            learned=None if said is None or said.file is None else source.parents[1] / said.file,
+        )
+
+
+def _settings_of(request: ScoreRequest) -> dict[str, Any]:
+    return {
+        "split": None if request.split is None else request.split.spec.id,
+        "rejectors": list(request.rejectors),
+        "contrasts": [asdict(item) for item in request.contrasts],
+        "draws": request.draws,
+        "by_region": sorted(request.by_region),
+        "pipeline": dict(request.pipeline),
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How results were scored that are stored; without any, how anything is."""
+
+    split: str | None = None
+    rejectors: Sequence[str] = ()
+    contrasts: Sequence[Contrast] = ()
+    draws: int = DRAWS
+    by_region: Collection[str] = ()
+    pipeline: Mapping[str, str] = field(default_factory=dict)
+
+
+def stored_settings(predictions: Sequence[Path]) -> Settings:
+    """How the stored results among some predictions were scored.
+
+    Raises
+    ------
+    ConfigError
+        If there are two: their tasks may differ.
+    StoreError
+        If they are damaged.
+
+    Examples
+    --------
+    >>> stored_settings([Path("nowhere")]).draws
+    10000
+    """
+    stored = [path for path in predictions if is_pack(path)]
+    if len(stored) > 1:
+        message = f"{stored[0]} and {stored[1]} are both stored results: name one, beside runs and files of your own"
+        raise ConfigError(message)
+    if not stored:
+        return Settings()
+    said = read_settings(stored[0])
+    return Settings(
+        split=said["split"],
+        rejectors=said["rejectors"],
+        contrasts=tuple(
+            Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])})
+            for item in said["contrasts"]
+        ),
+        draws=said["draws"],
+        by_region=said["by_region"],
+        pipeline=said["pipeline"],
+    )
+
+
+def request_of(
+    predictions: Sequence[Path],
+    *,
+    board: Path,
+    root: Path,
+    split: str | None = None,
+    folders: Sequence[Path] = (),
+    rejectors: Sequence[str] = (),
+) -> ScoreRequest:
+    """What is asked of a board, set as the stored results among its predictions were; as ever where there are none.
+
+    Parameters
+    ----------
+    predictions : sequence of Path
+        Runs, files of predictions, and at most one folder of stored results.
+    board : Path
+        Folder to write.
+    root : Path
+        Where tasks/ and truth/ are.
+    split : str, optional
+        Instead of that of the stored results, or of "crossfit" where none are.
+    folders : sequence of Path
+        With region files of one's own.
+    rejectors : sequence of str
+        Instead of those of the stored results, which may name registered ones only.
+
+    Raises
+    ------
+    ConfigError, StoreError
+        As `stored_settings` does, or if there is no such split.
+    MatchError
+        If the stored results name a rejector that no installed package registers.
+
+    Examples
+    --------
+    >>> request_of([Path("nowhere")], board=Path("board"), root=Path("out")).split.spec.id
+    'crossfit'
+    """
+    settings = stored_settings(predictions)
+    if not rejectors:
+        check_registered(settings.rejectors, source=str(stored_among(predictions)))
+    name = split or settings.split or (None if stored_among(predictions) else "crossfit")
+    return ScoreRequest(
+        predictions=predictions,
+        root=root,
+        split=None if name is None else find_split(name, folders=folders),
+        contrasts=settings.contrasts,
+        rejectors=rejectors or settings.rejectors,
+        board=board,
+        draws=settings.draws,
+        by_region=settings.by_region,
+        pipeline=settings.pipeline,
+        failed=_failed_before(stored_among(predictions)),
+    )
+
+
+def _failed_before(stored: Path | None) -> dict[str, str]:
+    """Who failed when stored results were made: contrasts may name them, and they hold no answer of theirs."""
+    return dict(read_board(stored)[0].get("failed", {})) if stored is not None and (stored / BOARD).is_file() else {}
+
+
+def score_all(
+    request: ScoreRequest,
+    *,
+    tell: Tell,
+    progress: Progress | None = None,
+    has_cases: bool = True,
+    results: Path | None = None,
+) -> Board:
+    """Score what is asked for, stored results laid out, and write the board with its figures and pictures.
+
+    Parameters
+    ----------
+    request : ScoreRequest
+        Without extras.
+    tell : callable
+        Gets a line now and then.
+    progress : Progress, optional
+        As of `make_board`.
+    has_cases : bool
+        Whether queries that went wrong are shown, with their truths.
+    results : Path, optional
+        Folder to store the board in, with all it was made of: under its name.
+
+    Raises
+    ------
+    ConfigError, StoreError
+        As `laid_out`, `make_board` and `pack_board` do, or if the board to be stored is of a part of the queries.
+    """
+    if results is not None:
+        _check_whole(request)
+        check_results(results / request.board.name, request.board)
+    kept = stored_among(request.predictions)
+    with laid_out(request) as laid:
+        figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
+        pictures = partial(
+            pictures_extra,
+            tell=tell,
+            root=laid.root,
+            contrasts=request.contrasts,
+            kept=kept,
+            has_cases=has_cases,
+        )
+        said = {} if kept is None else read_board(kept)[0]
+        board = make_board(replace(laid, extras=(figures, pictures), kept=said), tell=tell, progress=progress)
+        if results is not None:
+            lacks = "" if kept is None else str(read_settings(kept)["dropped"])
+            tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())
+        return board
+
+
+def _check_whole(request: ScoreRequest) -> None:
+    """Stored results hold every query that was asked, and answers of runs alone: said before an hour is lost."""
+    if request.without:
+        message = "a board without some regions is not stored: leave --without or --results away"
+        raise ConfigError(message)
+    if request.submissions:
+        message = "submissions stay apart from the results of their board: leave --submissions or --results away"
+        raise ConfigError(message)
+    submitted = next((path for path in request.predictions if path.is_file()), None)
+    if submitted is not None:
+        message = f"{submitted} is a file of predictions: only boards of runs are stored"
+        raise ConfigError(message)
+
+
+def stored_among(predictions: Sequence[Path]) -> Path | None:
+    """The stored results among some predictions.
+
+    Examples
+    --------
+    >>> stored_among([Path("nowhere")]) is None
+    True
+    """
+    return next((path for path in predictions if is_pack(path)), None)
+
+
+@contextmanager
+def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
+    """Yield the request with stored results among its predictions laid out as runs, tasks and truths.
+
+    They lie in a folder of the system's that goes when the block ends.
+
+    Raises
+    ------
+    ConfigError
+        If tasks are named beside stored results, which hold their own.
+    StoreError
+        If the results are damaged.
+    """
+    stored = stored_among(request.predictions)
+    if stored is None:
+        yield request
+        return
+    if request.tasks:
+        message = f"{stored} are stored results, which hold their own tasks: leave --tasks away"
+        raise ConfigError(message)
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+        found = unpack(stored, Path(folder))
+        others = [path for path in request.predictions if path != stored]
+        with _told_of(stored, found.root):
+            yield replace(
+                request,
+                predictions=[*found.runs, *others],
+                tasks=found.tasks,
+                root=found.root,
+                truth=found.root / "truth",
+            )
+
+
+@contextmanager
+def _told_of(stored: Path, root: Path) -> Iterator[None]:
+    """Tell what is wrong with a folder that will be gone of the stored results that were laid out there."""
+    try:
+        yield
+    except SasgeoError as error:
+        if str(root) not in str(error):
+            raise
+        fault = one_line(str(error).replace(f"{root}/", ""))
+        message = f"{stored} holds no sound stored results ({fault}): fetch them again"
+        raise StoreError(message) from error
+
+
+@contextmanager
+def laid_tasks(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
+    """Yield task folders: those that are named, and the tasks of stored results, laid out until the block ends.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Task folders and stored results.
+
+    Raises
+    ------
+    StoreError
+        If results are damaged.
+
+    Examples
+    --------
+    >>> with laid_tasks([Path("out/tasks/clean/town-grid")]) as tasks:
+    ...     tasks[0].name
+    'town-grid'
+    """
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+        tasks: list[Path] = []
+        for number, path in enumerate(paths):
+            tasks += unpack_tasks(path, Path(folder) / str(number)) if is_pack(path) else [path]
+        with _told_of(next(filter(is_pack, paths), Path()), Path(folder)):
+            yield tuple(tasks)
+
+
+def board_of(paths: Sequence[Path]) -> str:
+    """Id of the board whose stored results are among some paths; empty where none are, or they are of no pipeline.
+
+    Raises
+    ------
+    ConfigError
+        If there are two.
+    StoreError
+        If they are damaged.
+
+    Examples
+    --------
+    >>> board_of([Path("nowhere")])
+    ''
+    """
+    return str(stored_settings(paths).pipeline.get("id", ""))

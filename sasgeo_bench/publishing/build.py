@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board's folder -> its site: the order of the steps."""
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.ageing.ratebook_file import load_ratebook
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.file_manifest import SITE, led_to
+from sasgeo_bench.leaderboard.board_files import LEADERBOARD
+from sasgeo_bench.leaderboard.board_schema import check_shape
+from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
+from sasgeo_bench.leaderboard.private_board import check_public
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.publishing.site import site_pages
+from sasgeo_bench.publishing.site_files import (
+    MOST_BYTES,
+    BoardFiles,
+    Drawn,
+    Written,
+    draw_text,
+    held,
+    read_board_files,
+    write_site,
+)
+from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
+from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
+from sasgeo_bench.publishing.site_source import Case, Download, Picture, Pictures, SiteFigure, SiteSource, Spot
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.tasks.split import find_split_file, read_split_file
+from sasgeo_bench.tasks.task_files import PRIVATE
+
+_MAP: Final = "places.svg"
+_RATES: Final = "ageing-rates.svg"
+
+
+def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
+    """Make the site of a board from its folder alone.
+
+    Parameters
+    ----------
+    board : Path
+        Folder of a board, or of stored results.
+    into : Path, optional
+        Folder to write; `site` in the board's own without.
+    tell : callable
+        Gets a line now and then.
+
+    Returns
+    -------
+    Written
+        Where it is, and how large.
+
+    Raises
+    ------
+    StoreError
+        If there is no sound board, or the site cannot be written; an older site is then as it was.
+    ConfigError
+        If the board is of a private seed.
+    """
+    if into is None and (board / SITE).is_symlink():
+        message = f"{board / SITE} is a link: name where it leads with --into"
+        raise StoreError(message)
+    target = board / SITE if into is None else led_to(into)
+    place, whole = target.parent.resolve() / target.name, board.resolve()
+    if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
+        message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
+        raise StoreError(message)
+    with held(board, target, tell=tell):
+        files = read_board_files(board)
+        check_public(files.about.get(PRIVATE), str(board))
+        with _sound(board):
+            for name, table in {LEADERBOARD: files.board, **files.tables}.items():
+                check_shape(name, table)
+            source, drawn = _source(files, tell)
+            pages = site_pages(source)
+        written = write_site(
+            target,
+            files,
+            pages=pages,
+            drawn=drawn,
+            about={"board": source.name, "made_by": files.about.get("made_by")},
+        )
+    if written.site_bytes > MOST_BYTES:
+        tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB, pictures apart: slow to open from afar")
+    return written
+
+
+@contextmanager
+def _sound(board: Path) -> Iterator[None]:
+    """Tell what is wrong with a board that anybody may have made: its tables, or values that no page can show."""
+    try:
+        yield
+    except StoreError as error:
+        message = str(error) if str(board) in str(error) else f"{board} holds a damaged board: {error}"
+        raise StoreError(message) from error
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        text = one_line(repr(error))
+        message = f"{board} holds a board that no page can be made of ({text}): score it again"
+        raise StoreError(message) from error
+
+
+def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:
+    """All that pages are made of, and the figures that are drawn for them."""
+    about, name = files.about, _name_of(files)
+    spec = _pipeline_of(about)
+    spots, parts = _spots(), _parts(about)
+    lost = [region for region in regions_of(about) if region not in spots]
+    if lost:
+        tell(f"not on the map of places, for no region of that name ships: {', '.join(lost)}")
+    places = places_on_map(about, spots, parts)
+    book = load_ratebook()
+    drawing: dict[str, Callable[[Path], None]] = {_RATES: partial(draw_rates, book=book)}
+    if places:
+        drawing[_MAP] = partial(draw_places, places=places)
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+        drawn = {file: draw_text(draw, Path(folder)) for file, draw in drawing.items()}
+    more = {file: _figure(file, Drawn.of(text, file)) for file, text in drawn.items()}
+    tables = files.tables
+    source = SiteSource(
+        name=name,
+        title=name if spec is None else spec.title,
+        about=about,
+        board=files.board,
+        rates=book,
+        contrasts=tables["contrasts"],
+        falsifiers=tables["falsifiers"],
+        controls=tables["controls"],
+        scores=tables["scores"],
+        protection=tables["protection"],
+        registered=_registered(files, spec),
+        reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
+        figures=tuple(_figure(file, item) for file, item in files.figures.items()),
+        downloads=tuple(
+            Download(file=file, size_bytes=len(data), what=what) for file, (data, what) in files.downloads.items()
+        ),
+        pictures=_pictures(files.pictures),
+        spots=spots,
+        parts=parts,
+        rates_figure=more[_RATES],
+        map_figure=more.get(_MAP),
+    )
+    return source, drawn
+
+
+def _figure(file: str, drawn: Drawn) -> SiteFigure:
+    return SiteFigure(file=file, title=drawn.title, width=drawn.width, height=drawn.height)
+
+
+def _name_of(files: BoardFiles) -> str:
+    pipeline = files.about.get("pipeline")
+    return str(pipeline["id"]) if pipeline else files.folder.resolve().name
+
+
+def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
+    """The shipped pipeline that a board was made by; None of any other, even of the same name."""
+    said = about.get("pipeline")
+    if not said:
+        return None
+    try:
+        spec = read_pipeline_file(find_pipeline_file(str(said["id"])))
+    except ConfigError:
+        return None
+    return spec if spec.sha256 == said["sha256"] else None
+
+
+def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast, ...]:
+    """Contrasts as they were registered: as the board says, its stored settings, or its pipeline."""
+    said = files.about.get("contrasts") or files.settings.get("contrasts")
+    if said is None:
+        said = [] if spec is None else [item.model_dump(exclude={"why"}) for item in spec.contrast]
+    try:
+        return tuple(
+            Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])}) for item in said
+        )
+    except (KeyError, TypeError) as error:
+        message = f"{files.folder} does not say which contrasts were registered ({error!r}): score again"
+        raise StoreError(message) from error
+
+
+def _spots() -> dict[str, Spot]:
+    """Where the shipped regions lie."""
+    found = {}
+    for name, path in list_region_files().items():
+        spec = read_region_file(path)
+        west, south, east, north = spec.lonlat_box()
+        found[name] = Spot(
+            region=name,
+            title=spec.title,
+            longitude_deg=(west + east) / 2,
+            latitude_deg=(south + north) / 2,
+            scenes=tuple(spec.scenes),
+            is_made_up=any(item.town is not None for item in spec.extract),
+        )
+    return found
+
+
+def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """By region its place, and its half or part, of a shipped split; nothing of another one."""
+    try:
+        spec = read_split_file(find_split_file(str(about.get("split") or "")))
+    except ConfigError:
+        return {}
+    return {region: (place.name, place.half or place.part or "") for place in spec.place for region in place.regions}
+
+
+def _pictures(said: Mapping[str, Any]) -> Pictures:
+    def plain(item: Mapping[str, Any], *names: str) -> dict[str, str]:
+        """Some fields of a picture as text, empty where it has none."""
+        return {name: str(item.get(name, "")) for name in names}
+
+    return Pictures(
+        regions=tuple(
+            Picture(of=str(item.get("region", "")), **plain(item, "file", "alt")) for item in said.get("regions", ())
+        ),
+        suites=tuple(
+            Picture(of=str(item.get("suite", "")), **plain(item, "file", "alt")) for item in said.get("suites", ())
+        ),
+        cases=tuple(
+            Case(
+                **plain(item, "query_id", "matcher", "failure", "file", "alt", "suite", "region", "kind"),
+                said={str(name): str(value) for name, value in dict(item.get("said") or {}).items()},
+            )
+            for item in said.get("cases", ())
+        ),
+    )

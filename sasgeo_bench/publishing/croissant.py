@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`croissant.json`: a release as Croissant 1.1 metadata; record sets are queries, truths, and the tables of maps."""
+
+import datetime as dt
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pyarrow as pa
+
+from sasgeo_bench.files.parquet import read_schema
+from sasgeo_bench.publishing.column_texts import FEATURE_TEXTS, QUERY_TEXTS, TRUTH_TEXTS
+from sasgeo_bench.publishing.release_files import LICENCE_URL, TRUTHS, Release
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
+from sasgeo_bench.texts import json_text
+
+if TYPE_CHECKING:
+    import mlcroissant as mlc
+
+CROISSANT: Final = "croissant.json"
+PARQUET: Final = "application/x-parquet"
+_MEDIA_TYPES: Final = {
+    ".parquet": PARQUET,
+    ".tif": "image/tiff",
+    ".json": "application/json",
+    ".png": "image/png",
+}
+_MAP_TABLES: Final = {
+    "map-features": (region_files.FEATURES, "Classified geometry of the maps", FEATURE_TEXTS),
+    "map-nodes": (region_files.NODES, "Nodes of the map graphs", {}),
+    "map-edges": (region_files.EDGES, "Edges of the map graphs", {}),
+}
+_SCHEMA_ORG: Final = "https://schema.org/"
+_ML_COMMONS: Final = "http://mlcommons.org/croissant/"
+_CONFORMS_TO: Final = f"{_ML_COMMONS}1.1"
+# What the context of 1.1 has besides that of 1.0, which mlcroissant writes by itself.
+_NEW_TERMS: Final = {
+    "arrayShape": "cr:arrayShape",
+    "containedIn": "cr:containedIn",
+    "description": {"@container": "@language"},
+    "isArray": "cr:isArray",
+    "name": {"@container": "@language"},
+}
+# Croissant has no type for bytes: mlcroissant hands those of a "Text" over as they are.
+_TYPES: Final = (
+    (pa.types.is_boolean, f"{_SCHEMA_ORG}Boolean"),
+    (pa.types.is_int16, f"{_ML_COMMONS}Int16"),
+    (pa.types.is_int32, f"{_ML_COMMONS}Int32"),
+    (pa.types.is_int64, f"{_ML_COMMONS}Int64"),
+    (pa.types.is_float32, f"{_ML_COMMONS}Float32"),
+    (pa.types.is_float64, f"{_ML_COMMONS}Float64"),
+    (pa.types.is_date, f"{_SCHEMA_ORG}Date"),
+    (pa.types.is_timestamp, f"{_SCHEMA_ORG}DateTime"),
+)
+
+
+def write_croissant(folder: Path, release: Release) -> None:
+    """Write the metadata.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the release, its data written.
+    release : Release
+        What is in it, sizes and hashes of its files included.
+    """
+    import mlcroissant as mlc  # noqa: PLC0415 - an extra: only whoever writes a release needs it
+
+    versions = type(mlc.Context().conforms_to)  # the package shows it nowhere else
+    tables = [*_query_tables(release), *_map_tables(folder, release)]
+    metadata = mlc.Metadata(
+        ctx=mlc.Context(conforms_to=versions(_CONFORMS_TO), rdf=mlc.Rdf(context={**mlc.Rdf().context, **_NEW_TERMS})),
+        name="sasgeo-bench",
+        description=(
+            f"Semantic maps of {len(release.regions)} regions and {release.queries} queries for map localization of "
+            f"UAVs without GNSS, made from dated OpenStreetMap extracts. {ATTRIBUTION}"
+        ),
+        license=[LICENCE_URL],
+        url=release.url,
+        version=release.version,
+        date_published=dt.datetime.fromisoformat(release.published),
+        keywords=["map localization", "UAV", "OpenStreetMap", "geolocalization"],
+        creators=[mlc.Organization(name="The sasgeo-bench authors")],
+        cite_as=cite_as(release),
+        data_biases=["OpenStreetMap is denser in some countries than in others."],
+        personal_sensitive_information=["None: names and ids of the accounts that edited the map are not kept."],
+        distribution=[*_file_objects(release), *map(_file_set, tables)],
+        record_sets=[_record_set(table) for table in tables],
+    )
+    (folder / CROISSANT).write_text(json_text(metadata.to_json()), encoding="utf-8")
+
+
+def cite_as(release: Release) -> str:
+    """How a release is cited, as BibTeX."""
+    year = release.published[:4]
+    return (
+        f"@misc{{sasgeo_bench_{year}, title = {{sasgeo-bench, dataset release {release.version}}}, "
+        f"author = {{{{The sasgeo-bench authors}}}}, year = {{{year}}}, "
+        f"note = {{Data {ATTRIBUTION}}}}}"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Table:
+    """Files of one kind: a file set and a record set. `texts` say what the columns mean."""
+
+    name: str
+    pattern: str
+    description: str
+    schema: pa.Schema
+    texts: Mapping[str, str]
+
+    @property
+    def files(self) -> str:
+        """Id of the file set."""
+        return f"{self.name}-files"
+
+
+def _query_tables(release: Release) -> Iterator[_Table]:
+    for suite in release.suites:
+        title = release.tasks_of(suite)[0].about["title"]
+        yield _Table(
+            name=suite,
+            pattern=f"tasks/{suite}/*/*.parquet",
+            description=f"Queries: {title}",
+            schema=FILE_SCHEMA,
+            texts=QUERY_TEXTS,
+        )
+        if release.tables_of(suite, kind="truth"):
+            yield _Table(
+                name=f"{suite}-{TRUTHS}",
+                pattern=f"truth/{suite}/*/*.parquet",
+                description=f"Truths: {title}",
+                schema=PLAIN_TRUTH_SCHEMA,
+                texts=TRUTH_TEXTS,
+            )
+
+
+def _map_tables(folder: Path, release: Release) -> Iterator[_Table]:
+    first = folder / "regions" / release.maps[0].name
+    for name, (file, title, texts) in _MAP_TABLES.items():
+        schema = read_schema(first / file, mend="build the region again")
+        yield _Table(name=name, pattern=f"regions/*/{file}", description=title, schema=schema, texts=texts)
+
+
+def _file_objects(release: Release) -> list["mlc.FileObject"]:
+    import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
+
+    return [
+        mlc.FileObject(
+            id=path,
+            name=path,
+            content_url=path,
+            content_size=f"{record.bytes} B",
+            encoding_formats=[_MEDIA_TYPES.get(Path(path).suffix, "text/plain")],
+            sha256=record.sha256,
+        )
+        for path, record in release.files.items()
+    ]
+
+
+def _file_set(table: _Table) -> "mlc.FileSet":
+    import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
+
+    return mlc.FileSet(id=table.files, name=table.files, includes=[table.pattern], encoding_formats=[PARQUET])
+
+
+def _record_set(table: _Table) -> "mlc.RecordSet":
+    import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
+
+    fields = [_field(table, item) for item in table.schema if not pa.types.is_struct(item.type)]
+    if table.pattern.startswith("regions/"):
+        fields.insert(0, _map_field(table))
+    return mlc.RecordSet(id=table.name, name=table.name, description=table.description, fields=fields)
+
+
+def _map_field(table: _Table) -> "mlc.Field":
+    """The map that a row is of, which its file's path alone says."""
+    import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
+
+    return mlc.Field(
+        id=f"{table.name}/region",
+        name="region",
+        description="the map, a folder of regions/",
+        data_types=[_type(pa.string())],
+        source=mlc.Source(
+            file_set=table.files,
+            extract=mlc.Extract(file_property="fullpath"),
+            transforms=[mlc.Transform(regex="regions/([^/]+)/.*")],
+        ),
+    )
+
+
+def _field(table: _Table, column: pa.Field) -> "mlc.Field":
+    import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
+
+    is_list = pa.types.is_list(column.type)
+    inner = column.type.value_type if is_list else column.type
+    name = f"{table.name}/{column.name}"
+    said = {"id": name, "name": column.name, "description": table.texts.get(column.name)}
+    if not pa.types.is_struct(inner):
+        is_array = True if is_list else None
+        return mlc.Field(**said, data_types=[_type(inner)], is_array=is_array, source=_source(table, column.name))
+    parts = [
+        mlc.Field(
+            id=f"{name}/{part.name}",
+            name=part.name,
+            data_types=[_type(part.type)],
+            source=_source(table, column.name, within=part.name),
+        )
+        for part in inner
+    ]
+    return mlc.Field(**said, is_array=True, sub_fields=parts)
+
+
+def _source(table: _Table, column: str, *, within: str | None = None) -> "mlc.Source":
+    import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
+
+    transforms = [] if within is None else [mlc.Transform(json_path=within)]
+    return mlc.Source(file_set=table.files, extract=mlc.Extract(column=column), transforms=transforms)
+
+
+def _type(kind: pa.DataType) -> str:
+    """Croissant's type of a column."""
+    return next((name for is_it, name in _TYPES if is_it(kind)), f"{_SCHEMA_ORG}Text")

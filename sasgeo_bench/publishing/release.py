@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Regions and tasks -> a dataset release that others load: what is refused, and the order of the steps."""
+
+import datetime as dt
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.leaderboard.private_board import check_public
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.publishing.croissant import write_croissant
+from sasgeo_bench.publishing.dataset_card import CARD, card_text
+from sasgeo_bench.publishing.datasheet import DATASHEET, datasheet_text
+from sasgeo_bench.publishing.release_files import (
+    Release,
+    ReleaseMap,
+    ReleaseTask,
+    check_target,
+    copy_data,
+    count_parts,
+    has_images,
+    open_release,
+    read_records,
+    write_index,
+    write_sums,
+    write_texts,
+)
+from sasgeo_bench.publishing.stac import write_stac
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.layer_file import cog_faults
+from sasgeo_bench.regions.region import LICENCE, Manifest
+from sasgeo_bench.regions.region_spec import find_region_file
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import built_anew, is_of_region
+from sasgeo_bench.tasks.private_seed import LEAST_BITS
+from sasgeo_bench.tasks.split import SplitFile, find_split_file, read_split_file
+from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.texts import FOLDER
+
+HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
+_EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": "rio-cogeo"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleaseRequest:
+    """What a user asks for.
+
+    Parameters
+    ----------
+    regions : tuple of str
+        Ids of regions that are built.
+    suites : tuple of str
+        Names; none are all that have been drawn on the regions, controls left out.
+    split : str
+        Id or file of the split the queries were drawn by.
+    with_truth : bool
+        Whether the truths of test queries are in the release too.
+    out, into : Path
+        Root of what is built; the folder of the release.
+    published : str, optional
+        Day of publication as in 2026-01-31; the newest date of a map unless given.
+    url : str, optional
+        Where the release will be found.
+    """
+
+    regions: tuple[str, ...]
+    suites: tuple[str, ...]
+    split: str
+    with_truth: bool
+    out: Path
+    into: Path
+    published: str | None = None
+    url: str | None = None
+
+
+def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
+    """Write a release, whole or not at all; the same regions and tasks give the same bytes.
+
+    Parameters
+    ----------
+    request : ReleaseRequest
+        What is asked for.
+    tell : callable
+        Gets one line for every step.
+
+    Returns
+    -------
+    Release
+        What was written, sizes and hashes included.
+
+    Raises
+    ------
+    SasgeoError
+        If anything is refused (see `plan_release`) or cannot be written; an older release is then as it was.
+    """
+    planned = plan_release(request, tell=tell)
+    with open_release(request.into, tell=tell) as folder:
+        tell(f"copying {counted(len(planned.maps), 'map')} and {counted(len(planned.tasks), 'task')}")
+        copy_data(folder, planned)
+        release = replace(planned, files=read_records(folder, planned))
+        tell("writing the STAC catalog, Croissant metadata, the card and the datasheet")
+        write_stac(folder, release)
+        write_croissant(folder, release)
+        write_index(folder, release)
+        write_texts(folder, {CARD: card_text(release), DATASHEET: datasheet_text(release)})
+        write_sums(folder, release.files)
+    return release
+
+
+def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
+    """Say what a release would hold; everything that can be refused is refused here, before anything is written.
+
+    Raises
+    ------
+    ConfigError
+        If a region, suite or split is unknown, the address is none, there are no tasks, or the extra packages are
+        missing.
+    StoreError
+        If a region is not built, says no licence, or its layers are no valid COG; if a task is of another map, another
+        split, or lacks its truths; or if the folder holds something else.
+    """
+    check_installed()
+    _check_address(request.url)
+    _check_folder(request.into, request.out)
+    split = read_split_file(find_split_file(request.split))
+    regions = tuple(dict.fromkeys(request.regions))
+    for name in regions:
+        _check_region(name, split, request.out)
+    tasks = _tasks(regions, request, tell)
+    names = sorted({*regions, *(task.map_name for task in tasks)})
+    maps = tuple(_map(request.out / "regions" / name) for name in names)
+    manifests = {item.name: item.manifest for item in maps}
+    for task in tasks:
+        _check_task(task, manifests[task.map_name], split)
+    _warn_of_seeds(tasks, tell)
+    return Release(
+        regions=regions,
+        split=split,
+        maps=maps,
+        tasks=tasks,
+        with_truth=request.with_truth,
+        published=_published(request.published, maps),
+        url=request.url,
+        made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+    )
+
+
+def check_installed() -> None:
+    """Refuse to begin where the packages that describe a release are not installed."""
+    missing = [shown for module, shown in _EXTRA.items() if find_spec(module) is None]
+    if missing:
+        message = f"a release needs {', '.join(missing)}: pip install 'sasgeo-bench[publish]'"
+        raise ConfigError(message)
+
+
+def _check_folder(into: Path, out: Path) -> None:
+    inside = next(
+        (
+            name
+            for name in ("regions", "tasks", "truth", "runs", "boards")
+            if into.resolve().is_relative_to((out / name).resolve())
+        ),
+        None,
+    )
+    if inside is not None:
+        message = f"{into} lies inside {out / inside}, which others read: name another folder with --into"
+        raise ConfigError(message)
+    check_target(into)
+
+
+def _check_region(name: str, split: SplitFile, out: Path) -> None:
+    if not is_of_region(name, name):
+        message = (
+            f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries are searched in come by themselves"
+        )
+        raise ConfigError(message)
+    if not (out / "regions" / name / region_files.MANIFEST).is_file():
+        find_region_file(name)  # an unknown one is named with the nearest there is
+        message = f"{out / 'regions'} holds no map of {name}: sasgeo-bench build-region {name}"
+        raise StoreError(message)
+    if name not in split.region_ids:
+        message = f"split {split.id!r} does not speak of region {name!r}: name the split of its queries with --split"
+        raise ConfigError(message)
+
+
+def _tasks(regions: Sequence[str], request: ReleaseRequest, tell: Tell) -> tuple[ReleaseTask, ...]:
+    """Tasks of the regions and of their older and edited maps, by suite and map."""
+    suites = [find_suite(name).card.name for name in dict.fromkeys(request.suites)] or list(SUITES)
+    found = []
+    for suite in sorted(suites):
+        folders = sorted(path.parent for path in (request.out / "tasks" / suite).glob(f"*/{task_files.TASK}"))
+        own = {name: [one for one in folders if is_of_region(one.name, name)] for name in regions}
+        lacking = [name for name in regions if not own[name]]
+        if request.suites and len(lacking) == len(regions):
+            raise _no_queries(suite, regions, request.out)
+        if request.suites and lacking:
+            tell(f"{suite}: no queries on {', '.join(lacking)}, left out")
+        found += [_task(folder, request) for name in regions for folder in own[name]]
+    bare = [name for name in regions if not any(is_of_region(task.map_name, name) for task in found)]
+    if bare:
+        fault = _no_queries("any suite", bare, request.out)
+        raise fault
+    return tuple(sorted(found, key=lambda task: (task.suite, task.map_name)))
+
+
+def _no_queries(suite: str, regions: Sequence[str], out: Path) -> StoreError:
+    mend = f"sasgeo-bench make-queries --regions {regions[0]}"
+    return StoreError(f"{out / 'tasks'} holds no queries of {suite} on {', '.join(regions)}: {mend}")
+
+
+def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
+    about, parts = task_files.read_task(folder), count_parts(folder)
+    odd = next((name for name in (folder.name, *parts) if not re.fullmatch(FOLDER, name)), None)
+    if odd is not None:
+        message = f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
+        raise StoreError(message)
+    told = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
+    truth = request.out / "truth" / str(about["suite"]) / str(about["region"])
+    return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, told=told)
+
+
+def _map(folder: Path) -> ReleaseMap:
+    """Read a map, after a look at its licence and its raster."""
+    manifest = region_files.read_manifest(folder)
+    path = folder / region_files.MANIFEST
+    stray = next((name for name in manifest.files if Path(name).name != name), None)
+    if stray is not None:
+        message = f"{path} is damaged (it names the file {stray!r}): build the region again"
+        raise StoreError(message)
+    if not manifest.licence.strip() or not manifest.attribution.strip():
+        message = f"{path} says no licence or no attribution, and a release must: build the region again"
+        raise StoreError(message)
+    if manifest.licence != LICENCE:
+        message = f"{path} says licence {manifest.licence!r}: a release holds data under {LICENCE} alone, leave it out"
+        raise StoreError(message)
+    faults = cog_faults(folder / region_files.LAYERS)
+    if faults:
+        message = f"{folder / region_files.LAYERS} is no cloud-optimized GeoTIFF ({faults[0]}): build the region again"
+        raise StoreError(message)
+    return ReleaseMap(folder=folder, manifest=manifest)
+
+
+def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None:
+    check_public(task.about.get(task_files.PRIVATE), str(task.folder))
+    if not task_files.is_of_map(task.about, manifest):
+        raise StoreError(built_anew(task.map_name))
+    if task.about.get("split") != split.id:
+        message = (
+            f"{task.folder} was drawn by split {task.about.get('split')!r}, not by {split.id!r}: name it with --split, "
+            "or make the queries again"
+        )
+        raise StoreError(message)
+    if has_images(task.folder):
+        message = f"{task.folder} holds images, whose licence is not that of the map: leave the suite out"
+        raise StoreError(message)
+    if task.told:
+        task_files.check_truths(task.folder, task.truth)
+
+
+def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
+    """Say where truths that are kept back could be drawn again by whoever tries a few seeds."""
+    hiding = [task for task in tasks if set(task.parts) - task.told]
+    seeds: list[Any] = [task_files.read_hidden(task.truth).get("seed") for task in hiding]
+    guessable = sum(isinstance(seed, int) and abs(seed) < 2**LEAST_BITS for seed in seeds)
+    if guessable:
+        tell(
+            f"warning: truths of {counted(guessable, 'task')} are kept back, but their seed is so small that anyone "
+            "can find it and draw them again: make the queries with a --seed of 20 random digits or more"
+        )
+
+
+def _check_address(url: str | None) -> None:
+    if url is not None and not url.startswith(("https://", "http://")):
+        message = f"--url is {one_line(url)[:80]!r}: the address of a release begins with https:// or http://"
+        raise ConfigError(message)
+
+
+def _published(published: str | None, maps: Sequence[ReleaseMap]) -> str:
+    if published is None:
+        return max(item.manifest.extract.date for item in maps).isoformat()
+    return dt.date.fromisoformat(published).isoformat()

@@ -1,0 +1,411 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A dataset release on disk: maps, tasks and truths as others load them, with their hashes; whole or not at all."""
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.hashes import FileRecord, file_record
+from sasgeo_bench.files.parquet import open_table, read_table, table_writer
+from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
+from sasgeo_bench.regions.region_files import MANIFEST
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import TASK_VERSION
+from sasgeo_bench.tasks.split import Place, SplitFile
+from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA
+from sasgeo_bench.texts import json_text
+
+INDEX: Final = "release.json"
+SUMS: Final = "SHA256SUMS"
+NOTICE: Final = "LICENSE-ODbL.txt"
+IMAGERY: Final = "imagery/README.md"
+LICENCE_URL: Final = "https://opendatacommons.org/licenses/odbl/1-0/"
+COPYRIGHT_URL: Final = "https://www.openstreetmap.org/copyright"
+SCHEMA_VERSION: Final = 1
+TRUTHS: Final = "truth"  # configuration and record set of a suite's truths: its name, a dash, and this
+
+_NOTICE: Final = f"""\
+{ATTRIBUTION}
+
+The data of this release is made available under the Open Database License 1.0 (ODbL-1.0).
+Licence text: {LICENCE_URL}
+Source and its copyright: {COPYRIGHT_URL}
+
+Whoever passes the data on, changed or not, keeps this notice, names OpenStreetMap and its contributors where a
+reader sees it, and offers what is derived from the data under the ODbL as well. A picture or a score made from
+the data may have another licence and carries the attribution.
+"""
+
+_NO_IMAGERY: Final = f"""\
+# Imagery
+
+None is in this release: every file of it is derived from OpenStreetMap ({ATTRIBUTION}), and the column `image` of the
+queries is empty. Imagery has a licence of its own; a release that holds some keeps it in this folder, apart from what
+is
+under the ODbL, each source with its licence beside it.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleaseMap:
+    """One map of a release: a folder of `regions/`, and what its `region.json` says."""
+
+    folder: Path
+    manifest: Manifest
+
+    @property
+    def name(self) -> str:
+        """The folder's name, which is what queries call the map: as in "vaduz" or "vaduz@2021-10-28"."""
+        return self.folder.name
+
+    @property
+    def region(self) -> str:
+        """The region it is a map of, whatever its date and whether a suite has edited it."""
+        return self.name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleaseTask:
+    """One task of a release.
+
+    `folder` and `truth` are those of the task and its truths, `about` is what `task.json` says, `parts` how many
+    queries each part has, `told` the parts whose truths are released.
+    """
+
+    folder: Path
+    truth: Path
+    about: Mapping[str, Any]
+    parts: Mapping[str, int]
+    told: frozenset[str] = frozenset()
+
+    @property
+    def suite(self) -> str:
+        """Name of the suite."""
+        return str(self.about["suite"])
+
+    @property
+    def map_name(self) -> str:
+        """The map that is searched."""
+        return str(self.about["region"])
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all its queries are of one part, so that its file is released as it is."""
+        return len(self.parts) == 1
+
+    def file_of(self, part: str, *, kind: str = "queries") -> str:
+        """Path in the release of a part's queries, or of its truths."""
+        root = "tasks" if kind == "queries" else "truth"
+        name = f"{kind}.parquet" if self.is_whole else f"{kind}-{part}.parquet"
+        return f"{root}/{self.suite}/{self.map_name}/{name}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Release:
+    """What is in a release, before and after it is written.
+
+    `published` is a day as in 2026-01-31, `url` where it will be found, `with_truth` whether all truths are in it;
+    `files` says size and hash of each file of maps and tasks by its path, once they are copied.
+    """
+
+    regions: tuple[str, ...]
+    split: SplitFile
+    maps: tuple[ReleaseMap, ...]
+    tasks: tuple[ReleaseTask, ...]
+    with_truth: bool
+    published: str
+    made_by: str
+    url: str | None = None
+    files: Mapping[str, FileRecord] = field(default_factory=dict)
+
+    @property
+    def version(self) -> str:
+        """How maps are made, then how queries are: as in 1.1.0; not which regions there are."""
+        return f"{DATA_VERSION}.{TASK_VERSION}.0"
+
+    @property
+    def suites(self) -> tuple[str, ...]:
+        """Suites in the order of their names."""
+        return tuple(sorted({task.suite for task in self.tasks}))
+
+    @property
+    def queries(self) -> int:
+        """How many queries there are in all."""
+        return sum(sum(task.parts.values()) for task in self.tasks)
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files that are written."""
+        return sum(record.bytes for record in self.files.values())
+
+    def tasks_of(self, suite: str) -> list[ReleaseTask]:
+        """Tasks of one suite, in the order of their maps."""
+        return [task for task in self.tasks if task.suite == suite]
+
+    def tables_of(self, suite: str, *, kind: str = "queries") -> dict[str, list[str]]:
+        """Files of a suite's queries or truths by part; a part without any is left out."""
+        found: dict[str, list[str]] = {}
+        for task in self.tasks_of(suite):
+            for part in task.parts if kind == "queries" else sorted(task.told):
+                found.setdefault(part, []).append(task.file_of(part, kind=kind))
+        return {part: found[part] for part in sorted(found)}
+
+
+def count_parts(task_folder: Path) -> dict[str, int]:
+    """How many queries of a task each part has; no view is read.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be read, or lacks a column that this version writes.
+    """
+    path, found = task_folder / task_files.QUERIES, Counter[str]()
+    task_files.check_columns(path, FILE_SCHEMA.names)
+    for batch in task_files.read_batches(path, ["part"]):
+        found.update(batch["part"].to_pylist())
+    return {part: found[part] for part in sorted(found)}
+
+
+def has_images(task_folder: Path) -> bool:
+    """Whether any query of a task holds an image, as the file's own counts say it."""
+    with open_table(task_folder / task_files.QUERIES, mend="make the queries again", is_whole=False) as source:
+        metadata = source.metadata
+    columns = [
+        metadata.row_group(group).column(at)
+        for group in range(metadata.num_row_groups)
+        for at in range(metadata.num_columns)
+        if metadata.schema.column(at).path == "image"
+    ]
+    return any(one.statistics is None or one.statistics.null_count < one.num_values for one in columns)
+
+
+def check_target(folder: Path) -> None:
+    """Refuse a folder that a release cannot replace: one with a file in it that no release has written.
+
+    Raises
+    ------
+    StoreError
+        Naming the file.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        message = f"{folder} is a file or a link: move it away, a release goes there"
+        raise StoreError(message)
+    known = {SUMS, *_named_in_sums(folder)} if (folder / INDEX).is_file() else set()
+    other = next((path for path in sorted(folder.rglob("*")) if _is_strange(path, folder, known)), None)
+    if other is not None:
+        message = f"{other} is no part of a release and would be lost: move it away, or name another folder with --into"
+        raise StoreError(message)
+
+
+def _is_strange(path: Path, folder: Path, known: Collection[str]) -> bool:
+    return (path.is_file() or path.is_symlink()) and path.relative_to(folder).as_posix() not in known
+
+
+def _named_in_sums(folder: Path) -> list[str]:
+    try:
+        lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    return [line[66:] for line in lines]  # after 64 digits and two spaces
+
+
+@contextmanager
+def open_release(folder: Path, *, tell: Callable[[str], None]) -> Iterator[Path]:
+    """Yield an empty folder that becomes the release when the block ends well; an older release is whole until then.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds something else, or cannot be written.
+    """
+    try:
+        with locked(folder, tell=tell):
+            check_target(folder)
+            with fresh_folder(folder) as scratch:
+                yield scratch
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = (
+            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights, and "
+            "release again; a release that was there is as it was"
+        )
+        raise StoreError(message) from error
+
+
+def copy_data(folder: Path, release: Release) -> None:
+    """Copy maps and tasks into a release; files are copied whole, or a row group at a time where parts are mixed.
+
+    Raises
+    ------
+    StoreError
+        If a file is not what its manifest says.
+    """
+    for item in release.maps:
+        target = folder / "regions" / item.name
+        target.mkdir(parents=True)
+        for name in (MANIFEST, *item.manifest.files):
+            _copy(item.folder / name, target / name)
+    for task in release.tasks:
+        _copy_queries(folder, task)
+        if task.told:
+            _copy_truths(folder, task)
+
+
+def _copy(source: Path, target: Path) -> None:
+    try:
+        shutil.copyfile(source, target)
+    except FileNotFoundError as error:
+        message = f"{source} is missing: build the region, or make the queries, again"
+        raise StoreError(message) from error
+
+
+def _copy_queries(folder: Path, task: ReleaseTask) -> None:
+    target = folder / "tasks" / task.suite / task.map_name
+    target.mkdir(parents=True)
+    if task.is_whole:
+        for name in (task_files.QUERIES, task_files.TASK):
+            _copy(task.folder / name, target / name)
+        return
+    for part in task.parts:
+        rows = task_files.read_batches(task.folder / task_files.QUERIES, FILE_SCHEMA.names)
+        chosen = (batch.filter(pc.equal(batch["part"], part)) for batch in rows)
+        _write_batches(folder / task.file_of(part), FILE_SCHEMA, chosen)
+
+
+def _copy_truths(folder: Path, task: ReleaseTask) -> None:
+    target = folder / "truth" / task.suite / task.map_name
+    target.mkdir(parents=True)
+    heads = read_table(task.folder / task_files.QUERIES, mend="make the queries again", columns=["query_id", "part"])
+    for part in sorted(task.told):
+        ids = heads.filter(pc.equal(heads["part"], part))["query_id"].combine_chunks()
+        rows = task_files.read_batches(task.truth / task_files.TRUTH, TRUTH_SCHEMA.names)
+        plain = (_plain(batch.filter(pc.is_in(batch["query_id"], ids))) for batch in rows)
+        _write_batches(folder / task.file_of(part, kind="truth"), PLAIN_TRUTH_SCHEMA, plain)
+    if task.is_whole:  # neither the seed nor the hash of the request, which would tell it
+        _write_json(target / task_files.TRUTH_OF, {"queries_sha256": task.about["files"][task_files.QUERIES]["sha256"]})
+
+
+def _plain(batch: pa.RecordBatch) -> pa.RecordBatch:
+    """Truths with lists of pairs for maps, which not every reader of parquet knows."""
+    columns = [column.cast(item.type) for column, item in zip(batch.columns, PLAIN_TRUTH_SCHEMA, strict=True)]
+    return pa.RecordBatch.from_arrays(columns, schema=PLAIN_TRUTH_SCHEMA)
+
+
+def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> None:
+    with table_writer(path, schema, compression_level=9) as target:
+        for batch in batches:
+            if batch.num_rows:
+                target.write_batch(batch.select(schema.names).cast(schema))
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    said = {**content, "licence": LICENCE, "attribution": ATTRIBUTION}
+    path.write_text(json_text(said), encoding="utf-8")
+
+
+def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
+    """Size and hash of every file, by its path; those of maps and tasks are held against what their manifests say.
+
+    Raises
+    ------
+    StoreError
+        If one differs.
+    """
+    found = {
+        path.relative_to(folder).as_posix(): file_record(path) for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+    for item in release.maps:
+        for name, record in item.manifest.files.items():
+            if found[f"regions/{item.name}/{name}"] != record:
+                message = f"{item.folder / name} is not what {MANIFEST} says: build the region again"
+                raise StoreError(message)
+    for task in (one for one in release.tasks if one.is_whole):
+        part = next(iter(task.parts))
+        if found[task.file_of(part)].sha256 != task.about["files"][task_files.QUERIES]["sha256"]:
+            message = f"{task.folder / task_files.QUERIES} is not what {task_files.TASK} says: make the queries again"
+            raise StoreError(message)
+    return found
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write the licence notice, the note on imagery, and further texts by their paths."""
+    for name, text in {NOTICE: _NOTICE, IMAGERY: _NO_IMAGERY, **texts}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def write_index(folder: Path, release: Release) -> None:
+    """Write `release.json`: what is in the release, for programs."""
+    split = release.split
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "version": release.version,
+        "data_version": DATA_VERSION,
+        "task_version": TASK_VERSION,
+        "made_by": release.made_by,
+        "published": release.published,
+        "regions": list(release.regions),
+        "split": {"id": split.id, "title": split.title, "kind": split.kind, "buffer_m": split.buffer_m},
+        "places": [place.model_dump(mode="json", exclude_defaults=True) for place in places_of(release)],
+        "maps": [_map_said(item) for item in release.maps],
+        "tasks": [_task_said(task) for task in release.tasks],
+        "truths": "of all queries" if release.with_truth else "of the test part left out",
+        "licence_url": LICENCE_URL,
+    }
+    _write_json(folder / INDEX, content)
+
+
+def places_of(release: Release) -> list[Place]:
+    """Places of the split that hold regions of the release, without those that it does not hold."""
+    found = []
+    for place in release.split.place:
+        own = [name for name in place.regions if name in release.regions]
+        blocks = [name for name in place.blocks if name.split("/")[0] in release.regions]
+        if own or blocks:
+            found.append(place.model_copy(update={"regions": own, "blocks": blocks}))
+    return found
+
+
+def _map_said(item: ReleaseMap) -> dict[str, Any]:
+    about = item.manifest
+    return {
+        "map": item.name,
+        "region": item.region,
+        "title": about.title,
+        "date": about.extract.date.isoformat(),
+        "epsg": about.epsg,
+        "bounds_lonlat": list(about.bounds_lonlat),
+        "fingerprint": about.fingerprint,
+        "extract": {"file": about.extract.file, "sha256": about.extract.sha256},
+    }
+
+
+def _task_said(task: ReleaseTask) -> dict[str, Any]:
+    return {
+        "suite": task.suite,
+        "suite_version": task.about["suite_version"],
+        "map": task.map_name,
+        "queries": dict(task.parts),
+        "truths": sorted(task.told),
+        "files": {part: task.file_of(part) for part in task.parts},
+    }
+
+
+def write_sums(folder: Path, known: Mapping[str, FileRecord]) -> None:
+    """Write `SHA256SUMS`, the last file of a release: `sha256sum -c SHA256SUMS` holds all others against it.
+
+    What is `known` is not read again.
+    """
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    lines = [f"{(known.get(name) or file_record(folder / name)).sha256}  {name}\n" for name in names]
+    (folder / SUMS).write_text("".join(lines), encoding="utf-8")

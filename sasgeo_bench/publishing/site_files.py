@@ -1,0 +1,358 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board's folder read for its site, and the folder of the site; written whole or not at all."""
+
+import gzip
+import html
+import re
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+import pyarrow as pa
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.files.file_manifest import IMAGES, SITE_FOLDERS, check_site, list_files
+from sasgeo_bench.files.file_manifest import SITE_SAYS as MANIFEST
+from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.files.parquet import read_frame
+from sasgeo_bench.leaderboard.archive_record import PicturesSaid, parse_said
+from sasgeo_bench.leaderboard.board_files import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
+from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.publishing.svg import svg_fault
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.texts import json_text
+
+PICTURES: Final = "pictures"
+FILES: Final = "files"
+MOST_BYTES: Final = 5_000_000  # of a site, pictures of regions and cases apart; more is said
+_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, PROTECTION)
+_OFFERED: Final = {  # what is offered for download, and what it is
+    f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
+    f"{LEADERBOARD}.csv": "the same for a spreadsheet",
+    f"{LEADERBOARD}.tex": "tables for a paper",
+    f"{LEADERBOARD}.md": "tables as text",
+    "contrasts.parquet": "registered contrasts",
+    "falsifiers.parquet": "the same two methods where they should not differ",
+    "controls.parquet": "controls of every matcher",
+    f"{PROTECTION}.parquet": "protection levels, counted",
+    "paper.md": "the paper's experiment beside its Table II",
+    "paper.parquet": "the same as a table",
+    f"{SCORES}.parquet": "a row for each query of each matcher",
+    BOARD: "versions, hashes and cards",
+}
+_LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
+_LEFT_OUT_BYTES: Final = 1_500_000  # what is more, packed, stays with the board
+_MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz: what holds more is no text of ours
+_MOST_POINTS: Final = 100_000.0  # of a figure, either way
+_TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
+_SIZE: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
+_HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drawn:
+    """An SVG: its text, and what it says of its title and size in points."""
+
+    text: str
+    title: str
+    width: float
+    height: float
+
+    @classmethod
+    def of(cls, text: str, name: str) -> "Drawn":
+        """Of the text of a figure; one without a title has its name.
+
+        Examples
+        --------
+        >>> drawn = Drawn.of('<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>', "mine")
+        >>> drawn.title, drawn.width, drawn.height
+        ('A & B', 90.0, 45.0)
+        """
+        title, *sizes = (pattern.search(text) for pattern in (_TITLE, _SIZE, _HEIGHT))
+        said = (float(found[1]) if found else 0.0 for found in sizes)
+        width, height = (size if 0 < size < _MOST_POINTS else 480.0 for size in said)
+        shown = html.unescape(title[1]).strip() if title else name
+        return cls(text=text, title=" ".join(shown.split()), width=width, height=height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardFiles:
+    """What a board's folder holds for a site.
+
+    `tables` are contrasts, controls, scores and protection, empty where there is none; `figures` by file name;
+    `downloads` the bytes to be offered, by file name, with what each is; `pictures` what `pictures.json` says;
+    `settings` how stored results were scored, empty of a board that is not stored.
+    """
+
+    folder: Path
+    about: Mapping[str, Any]
+    board: pd.DataFrame
+    tables: Mapping[str, pd.DataFrame]
+    figures: Mapping[str, Drawn]
+    downloads: Mapping[str, tuple[bytes, str]]
+    pictures: Mapping[str, Sequence[Mapping[str, Any]]]
+    settings: Mapping[str, Any]
+
+
+def read_board_files(folder: Path) -> BoardFiles:
+    """Read a board, or stored results, for its site.
+
+    Raises
+    ------
+    StoreError
+        If there is no board, or a file of it is damaged, a link, or a figure that does more than draw.
+    """
+    with _sound(folder):
+        list_files(folder, without=SITE_FOLDERS)
+    about, board = read_board(folder)
+    with _sound(folder):
+        return BoardFiles(
+            folder=folder,
+            about=about,
+            board=board,
+            tables={name: _read_table(folder / f"{name}.parquet") for name in _TABLES},
+            figures=_read_figures(folder / FIGURES),
+            downloads=dict(_read_downloads(folder)),
+            pictures=_read_pictures(folder / PICTURES),
+            settings=read_settings(folder) if is_pack(folder) else {},
+        )
+
+
+@contextmanager
+def _sound(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except SasgeoError:
+        raise
+    except (
+        *(OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, pa.ArrowException),
+        *(zlib.error, RecursionError, MemoryError),
+    ) as error:
+        text = one_line(str(error))
+        message = f"{folder} holds a damaged board ({text}): score it again, or fetch the results again"
+        raise StoreError(message) from error
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    return read_frame(path, mend=MEND) if path.is_file() else pd.DataFrame()
+
+
+def _plain_or_packed(path: Path) -> bytes | None:
+    """Bytes of a file, or of its .gz unpacked; None where there is neither."""
+    packed = path.with_name(f"{path.name}.gz")
+    if path.is_file():
+        return path.read_bytes()
+    return _unpacked(packed) if packed.is_file() else None
+
+
+def _unpacked(path: Path) -> bytes:
+    """Text of a .gz, as much as anything of ours holds."""
+    try:
+        with gzip.open(path) as source:
+            data = source.read(_MOST_UNPACKED + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        message = f"{path.name} cannot be unpacked: {error}"
+        raise ValueError(message) from error
+    if len(data) > _MOST_UNPACKED:
+        message = f"{path.name} unpacks to more than {_MOST_UNPACKED / 1e6:g} MB"
+        raise ValueError(message)
+    return data
+
+
+def _read_figures(folder: Path) -> dict[str, Drawn]:
+    names = sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")})
+    found = {name: _plain_or_packed(folder / name) for name in names if name.endswith(".svg")}
+    return {name: _figure_of(folder / name, data) for name, data in found.items() if data}
+
+
+def _figure_of(path: Path, data: bytes) -> Drawn:
+    """A figure that draws and does nothing else: a page leads to it."""
+    try:
+        text = data.decode()
+        fault = svg_fault(text)
+    except ValueError as error:
+        message = f"{path.name}: {error}"
+        raise ValueError(message) from error
+    if fault is not None:
+        message = f"{path} holds {fault}, as no figure of a board does: score it again, or remove the file"
+        raise StoreError(message)
+    return Drawn.of(text, path.stem)
+
+
+def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
+    for name, what in _OFFERED.items():
+        data = _plain_or_packed(folder / name)
+        if data is None:
+            continue
+        is_packed = len(data) > _LARGE_BYTES and not name.endswith(".parquet")
+        data = gzip.compress(data, mtime=0) if is_packed else data
+        if len(data) <= _LEFT_OUT_BYTES:
+            yield f"{name}.gz" if is_packed else name, (data, what)
+
+
+def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """What `pictures.json` says of regions, suites and cases, every file of it held against the folder."""
+    said = folder / f"{PICTURES}.json"
+    if not said.is_file():
+        return {}
+    try:
+        data = said.read_bytes()
+        parse_said(data, PicturesSaid)
+        content = parse_json(data)
+        found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
+        for item in (one for listed in found.values() for one in listed):
+            _check_picture(folder, str(item["file"]))
+    except SasgeoError:
+        raise
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        text = one_line(str(error))
+        message = f"{said} is damaged ({text}): make the pictures again, or move the folder away"
+        raise StoreError(message) from error
+    return found
+
+
+def _check_picture(folder: Path, name: str) -> None:
+    """Refuse a picture that is none, is missing, or lies elsewhere."""
+    path = folder / name
+    is_inside = path.resolve().is_relative_to(folder.resolve()) and not Path(name).is_absolute()
+    if not is_inside or path.suffix.lower() not in IMAGES or not path.is_file():
+        message = (
+            f"{folder / PICTURES}.json names {name!r}, which is no picture in {folder}: "
+            "make the pictures again, or move the folder away"
+        )
+        raise StoreError(message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Written:
+    """What was written: the folder, its bytes without pictures and those of pictures, and how many pages."""
+
+    folder: Path
+    site_bytes: int
+    picture_bytes: int
+    pages: int
+
+    def to_text(self) -> str:
+        """In a line.
+
+        Examples
+        --------
+        >>> Written(folder=Path("site"), site_bytes=1_200_000, picture_bytes=0, pages=12).to_text()
+        'site: 12 pages, 1.20 MB and 0.00 MB of pictures'
+        """
+        sizes = f"{self.site_bytes / 1e6:.2f} MB and {self.picture_bytes / 1e6:.2f} MB of pictures"
+        return f"{self.folder}: {self.pages} pages, {sizes}"
+
+
+@contextmanager
+def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
+    """Hold a board, and the site that is made of it: nobody else writes either of them meanwhile.
+
+    Raises
+    ------
+    StoreError
+        If there is no board, or the target holds something that is no site.
+    """
+    if not (folder / BOARD).is_file():
+        message = f"{folder} holds no board ({BOARD}): name the folder of one, as out/boards/demo"
+        raise StoreError(message)
+    check_target(target)
+    if target.parent.resolve() == folder.resolve():
+        with locked(folder, tell=tell):  # a lock beside the site would be a strange file in the board's folder
+            yield
+        return
+    with locked(folder, tell=tell), locked(target, tell=tell):
+        yield
+
+
+def check_target(target: Path) -> None:
+    """Refuse a folder that a site cannot take the place of.
+
+    Raises
+    ------
+    StoreError
+        If it is a file, or holds something and is no site, or one with files of somebody else.
+    """
+    if target.exists() and not target.is_dir():
+        message = f"{target} is a file: move it away, or name another folder"
+        raise StoreError(message)
+    if target.is_dir() and any(target.iterdir()) and not (target / MANIFEST).is_file():
+        message = f"{target} holds something else than a site, which would be lost: name another folder"
+        raise StoreError(message)
+    check_site(target)
+
+
+def write_site(
+    target: Path,
+    board: BoardFiles,
+    *,
+    pages: Mapping[str, str],
+    drawn: Mapping[str, str],
+    about: Mapping[str, Any],
+) -> Written:
+    """Write a site, whole or not at all.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of the site; an older one there is replaced.
+    board : BoardFiles
+        Whose figures, downloads and pictures go with it.
+    pages : mapping of str to str
+        File name -> text: pages, style and script.
+    drawn : mapping of str to str
+        More figures, by file name.
+    about : mapping
+        What `site.json` says.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be written; an older site is then as it was.
+    """
+    check_target(target)
+    named = {str(item["file"]) for listed in board.pictures.values() for item in listed}
+    figures = {name: item.text for name, item in board.figures.items()} | dict(drawn)
+    files: dict[str, bytes] = {name: text.encode() for name, text in pages.items()}
+    files |= {f"{FIGURES}/{name}": text.encode() for name, text in figures.items()}
+    files |= {f"{FILES}/{name}": data for name, (data, _) in board.downloads.items()}
+    pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
+    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION, "files": sorted({*files, *pictures})}
+    files[MANIFEST] = json_text(content).encode()
+    try:
+        with fresh_folder(target) as scratch:
+            for name, data in files.items():
+                _put(scratch / name, data)
+            for name, path in pictures.items():
+                _put(scratch / name, path.read_bytes())
+        picture_bytes = sum((target / name).stat().st_size for name in pictures)
+    except OSError as error:
+        message = (
+            f"{target} cannot be written ({error.strerror or error}): check the free space and your rights, and "
+            "publish again; a site that was there is as it was"
+        )
+        raise StoreError(message) from error
+    return Written(
+        folder=target,
+        site_bytes=sum(map(len, files.values())),
+        picture_bytes=picture_bytes,
+        pages=sum(name.endswith(".html") for name in pages),
+    )
+
+
+def _put(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+def draw_text(draw: Callable[[Path], None], folder: Path) -> str:
+    """Text of an SVG that a function draws into a path; the folder is scratch."""
+    path = folder / "drawn.svg"
+    draw(path)
+    return path.read_text(encoding="utf-8")

@@ -1,0 +1,509 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the other pages of a site show: suites, matchers, rejection, costs, places and measured ageing."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
+from sasgeo_bench.errors import counted
+from sasgeo_bench.leaderboard.text import interval_text
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.publishing.site_board import Book, group_table
+from sasgeo_bench.publishing.site_source import Picture, SiteFigure, SiteSource, Spot
+from sasgeo_bench.publishing.site_table import (
+    Cell,
+    Key,
+    Record,
+    Row,
+    Table,
+    figure_cell,
+    file_stem,
+    number_cell,
+    plain_cell,
+    rank_cell,
+)
+from sasgeo_bench.publishing.site_words import column, prior_words
+from sasgeo_bench.scoring.integrity import AS_DRAWN
+from sasgeo_bench.scoring.measures import primary_of
+from sasgeo_bench.scoring.rows import ALL_SUITES
+from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.suites.base import SuiteCard
+
+_JUDGED: Final = (
+    *("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
+    *("brier", "ece", "cost_20", "cost_20_place"),
+)
+_COSTS: Final = (
+    *("latency_p50", "latency_p95", "prepare", "peak_memory"),
+    *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
+)
+_AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
+MOST_COLUMNS: Final = 8  # matchers beside each other: as many as a screen of 1280 px holds
+KINDS: Final = {  # of figures, by how their names begin, in the order they are shown
+    "contrast": "Registered contrasts, place by place",
+    "stress": "Success under stress",
+    "age": "Success against the age of the map",
+    "strength": "Success against strength",
+    "risk": "Risk against coverage",
+    "reliability": "Reliability",
+    "stanford": "Protection levels against errors",
+}
+
+
+def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]]:
+    """Figures under the titles of their kinds.
+
+    Examples
+    --------
+    >>> figures_by_kind([SiteFigure(file="age-real-age.svg", title="", width=1, height=1)]).keys()
+    dict_keys(['Success against the age of the map'])
+    """
+    found: dict[str, list[SiteFigure]] = {}
+    for kind, title in (*KINDS.items(), ("", "Other figures")):
+        mine = [item for item in figures if _kind_of(item) == kind]
+        if mine:
+            found[title] = mine
+    return found
+
+
+def _kind_of(figure: SiteFigure) -> str:
+    kind = figure.file.partition("-")[0]
+    return kind if kind in KINDS else ""
+
+
+def _groups(book: Book) -> dict[tuple[str, str], list[Key]]:
+    """Keys of the board by track and prior group."""
+    found: dict[tuple[str, str], list[Key]] = {}
+    for key in book.matchers:
+        found.setdefault(key[1:], []).append(key)
+    return dict(sorted(found.items()))
+
+
+# --- suites -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuitePage:
+    """A suite: its card where this version knows it, results, figures and example pictures."""
+
+    name: str
+    page: str
+    card: SuiteCard | None
+    tables: tuple[Table, ...]
+    figures: tuple[SiteFigure, ...]
+    pictures: tuple[Picture, ...]
+    regions: tuple[str, ...]
+
+
+def suites_of(source: SiteSource, book: Book) -> tuple[SuitePage, ...]:
+    """A page for each suite on the board."""
+    return tuple(_suite(name, page, source, book) for name, page in book.suite_pages.items())
+
+
+def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
+    suite = EVERY_SUITE.get(name)
+    keys = [key for key in book.matchers if key[0] == name]
+    starts = tuple(f"{file_stem(kind, name, track)}-" for kind in KINDS for _, track, _ in keys)
+    tasks = [str(task["region"]) for task in source.about.get("tasks", ()) if task["suite"] == name]
+    return SuitePage(
+        name=name,
+        page=page,
+        card=None if suite is None else suite.card,
+        tables=tuple(
+            table for key in keys for table in (group_table(book, key, book.matchers[key]), *_strata_tables(book, key))
+        ),
+        figures=tuple(item for item in source.figures if item.file.startswith(starts)),
+        pictures=tuple(item for item in source.pictures.suites if item.of == name),
+        regions=tuple(sorted({base_of(region) for region in tasks})),
+    )
+
+
+def _strata_tables(book: Book, key: Key) -> Iterator[Table]:
+    """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
+    names = book.matchers[key]
+    for first in range(0, len(names), MOST_COLUMNS):
+        yield _strata_table(book, key, names[first : first + MOST_COLUMNS], number=first // MOST_COLUMNS + 1)
+
+
+def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) -> Table:
+    suite, track, prior_group = key
+    primary = primary_of(track).name
+    more = "" if number == 1 else f", table {number}"
+    rows = []
+    for stratum in book.strata[key]:
+        found = {name: book.pick(key, name, primary, stratum) for name in names}
+        counts = sorted({int(row["n"]) for row in found.values() if row is not None})
+        if counts:
+            first = Cell(text=stratum)
+            cells = [figure_cell(row) for row in found.values()]
+            rows.append(Row(cells=(first, Cell(text="-".join(map(str, counts)), key=float(counts[0])), *cells)))
+    meaning = column(primary).meaning
+    columns = [column(primary, title=name) for name in names]
+    return Table(
+        name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
+        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
+        columns=(column("part", is_number=False), column("n"), *columns),
+        rows=tuple(rows),
+        notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),
+    )
+
+
+# --- matchers ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherPage:
+    """A contestant: what it says of itself, how it fared, what it cannot do, what it costs."""
+
+    name: str
+    page: str
+    entry: Mapping[str, Any]
+    cell: Cell
+    card: Mapping[str, Any]
+    trained: str
+    taught: tuple[str, ...]
+    cannot: tuple[str, ...]
+    results: tuple[Table, ...]
+    judged: Table | None
+    costs: tuple[tuple[str, str, str], ...]
+
+
+def matchers_of(source: SiteSource, book: Book) -> tuple[MatcherPage, ...]:
+    """A page for each contestant of the board."""
+    judged = dict(tuple(_judged_rows(source.board).groupby("matcher", sort=True))) if len(source.board) else {}
+    return tuple(_matcher(name, book, judged.get(name)) for name in book.matcher_pages)
+
+
+def _matcher(name: str, book: Book, judged: pd.DataFrame | None) -> MatcherPage:
+    entry = book.entries.get(name, {})
+    card = entry.get("card") or {}
+    results = [_results_table(book, name, group, keys) for group, keys in _groups(book).items()]
+    return MatcherPage(
+        name=name,
+        page=book.matcher_pages[name],
+        entry=entry,
+        cell=book.name_cell(name),
+        card=card,
+        trained=_trained(card.get("trained_on")),
+        taught=tuple(_taught(entry)),
+        cannot=tuple(_cannot(book, name, card)),
+        results=tuple(table for table in results if table.rows),
+        judged=None if judged is None else _judged_table(judged, "judged", "Rejection, all suites"),
+        costs=tuple(_costs_of(book, name)),
+    )
+
+
+def _trained(said: object) -> str:
+    """What a card says of places that taught its method: "none", some, or some for each half."""
+    if isinstance(said, Mapping):
+        return "; ".join(f"half {half}: {_trained(places)}" for half, places in said.items())
+    places = [] if isinstance(said, str) or not isinstance(said, Sequence) else list(map(str, said))
+    return ", ".join(places) or "no place that its card names"
+
+
+def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
+    """What the runner taught a contestant, and where it was asked so: regions, for tasks are hundreds."""
+    for one in entry.get("learned") or ():
+        verb = "Learnt" if one["file"] else "Could not learn"
+        regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
+        yield (
+            f"{verb} from {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; asked so in "
+            f"{counted(len(one['asked']), 'task')} on {', '.join(regions)}."
+        )
+
+
+def _cannot(book: Book, name: str, card: Mapping[str, Any]) -> Iterator[str]:
+    """What a contestant says that it cannot, and what the board shows of it."""
+    if card.get("limits"):
+        yield str(card["limits"])
+    if card.get("needs"):
+        yield f"Needs {', '.join(map(str, card['needs']))}; where a query lacks that it is not applicable"
+    tracks = card.get("tracks")
+    yield from (f"Does not answer {track}" for track in ("localization", "retrieval") if tracks and track not in tracks)
+    rows = [(key, book.main(key, name, primary_of(key[1]).name)) for key in book.matchers if name in book.matchers[key]]
+    out = [f"{key[0]} ({key[1]})" for key, row in rows if row is not None and not row["is_applicable"]]
+    if out:
+        yield f"Not applicable to {', '.join(out)}"
+    unasked = [suite for suite in book.suite_pages if not any(key[0] == suite for key, _ in rows)]
+    if unasked:
+        yield f"Not asked on {', '.join(unasked)}"
+
+
+def _results_table(book: Book, name: str, group: tuple[str, str], keys: Sequence[Key]) -> Table:
+    track, prior_group = group
+    primary = primary_of(track).name
+    rows = []
+    for key in keys:
+        main = book.main(key, name, primary) if name in book.matchers[key] else None
+        if main is None:
+            continue
+        ranked = sum(
+            row is not None and not pd.isna(row["rank_best"])
+            for row in (book.main(key, other, primary) for other in book.matchers[key])
+        )
+        rows.append(
+            Row(
+                cells=(
+                    book.suite_cell(key[0]),
+                    figure_cell(main, has_bar=True),
+                    rank_cell(main, ranked=ranked),
+                    figure_cell(book.pick(key, name, primary, "control")),
+                    figure_cell(book.pick(key, name, "answered_absent")),
+                    plain_cell(int(main["n"])),
+                    plain_cell(int(main["missing"])),
+                    plain_cell(int(main["blocks"])),
+                )
+            )
+        )
+    titles = (primary, "rank", "control", "false fixes", "n", "missing", "blocks")
+    return Table(
+        name=file_stem("results", track, prior_group),
+        title=f"{track}, {prior_words(prior_group)}",
+        columns=(column("suite", is_number=False), *map(column, titles)),
+        rows=tuple(rows),
+    ).without_empty("control", "false fixes")
+
+
+def _costs_of(book: Book, name: str) -> Iterator[tuple[str, str, str]]:
+    """What answers cost: figure, its value with its unit, what it means."""
+    for key, row in book.figures.items():
+        suite, track, _, matcher, _, metric = key
+        if suite == ALL_SUITES and matcher == name and metric in _COSTS:
+            cell = number_cell(float(row["value"]), str(row["unit"]))
+            yield (metric if track == "all" else f"{metric}, {track}", cell.text, column(metric).meaning)
+
+
+def cost_table(book: Book) -> Table:
+    """What the answers of all contestants cost, a figure a column."""
+    found = {key: row for key, row in book.figures.items() if key[0] == ALL_SUITES and key[-1] in _COSTS}
+    kinds = sorted({(_COSTS.index(key[-1]), key[-1], key[1]) for key in found})
+    by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
+    units = {key[-1]: str(row["unit"]) for key, row in found.items()}
+    names = sorted({key[3] for key in found})
+    rows = []
+    for name in names:
+        mine = [by_kind.get((name, metric, track)) for _, metric, track in kinds]
+        values = [number_cell(math.nan if row is None else float(row["value"])) for row in mine]
+        rows.append(Row(cells=(book.name_cell(name), *values)))
+    columns = [
+        column(metric, title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})")
+        for _, metric, track in kinds
+    ]
+    notes = ("Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",)
+    first = column("matcher", is_number=False)
+    return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
+
+
+# --- rejection --------------------------------------------------------------------------------------------------------
+
+
+def _judged_rows(board: pd.DataFrame) -> pd.DataFrame:
+    return board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
+
+
+def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Matcher x rejector over all suites, a table for each track and prior group."""
+    if not len(board):
+        return ()
+    found = _judged_rows(board).groupby(["track", "prior_group"], sort=True)
+    return tuple(
+        _judged_table(part, file_stem("rejection", *map(str, key)), f"{key[0]}, {prior_words(str(key[1]))}")
+        for key, part in found
+    )
+
+
+def _judged_table(part: pd.DataFrame, name: str, title: str) -> Table:
+    rows = []
+    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
+        matcher, rejector, track, prior_group = map(str, key)
+        by_name: dict[str, Record] = {
+            str(row["metric"]): {str(field): row[field] for field in row} for row in mine.to_dict("records")
+        }
+        where = () if name != "judged" else (Cell(text=f"{track}, {prior_group}"),)
+        figures = [figure_cell(by_name.get(metric)) for metric in _JUDGED]
+        cells = (Cell(text=matcher), Cell(text=rejector), *where, *figures, plain_cell(int(mine["n"].iloc[0])))
+        surest = by_name.get("aurc")
+        rows.append((math.inf if surest is None else float(surest["value"]), matcher, rejector, Row(cells=cells)))
+    rows.sort(key=lambda row: row[:3])
+    where_columns = () if name != "judged" else (column("track", is_number=False, title="queries"),)
+    return Table(
+        name=name,
+        title=title,
+        columns=(
+            column("matcher", is_number=False),
+            column("rejector", is_number=False),
+            *where_columns,
+            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_JUDGED, "n")),
+        ),
+        rows=tuple(row for *_, row in rows),
+        notes=("Brier, ECE and costs have no interval on this board: they decide nothing.",),
+    )
+
+
+def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
+    """How protection levels fared, a table for each prior group; of one alert limit, for three fill a page thrice."""
+    if not len(protection):
+        return ()
+    limits = sorted(set(protection["alert_limit_m"]))
+    shown_m = FIX_M if FIX_M in limits else limits[0]
+    others = " and ".join(f"{limit:g}" for limit in limits if limit != shown_m)
+    notes = (f"Alert limits of {others} m: protection.parquet holds them.",) if others else ()
+    found = []
+    for key, part in protection[protection["alert_limit_m"] == shown_m].groupby("prior_group", sort=True):
+        prior_group = str(key)
+        rows = []
+        for row in part.to_dict("records"):
+            shares = [_share_cell(row, area) for area in _AREAS]
+            names = (Cell(text=str(row["matcher"])), Cell(text=str(row["method"])))
+            rest = (plain_cell(int(row["n"])), Cell(text=str(row["supports"])))
+            rows.append(Row(cells=(*names, number_cell(float(row["risk"])), *shares, *rest)))
+        words = (column("matcher", is_number=False), column("method", is_number=False))
+        columns = (*words, *map(column, ("risk", *_AREAS, "n")), column("supports", is_number=False))
+        title = f"Alert limit {shown_m:g} m, {prior_words(prior_group)}"
+        name = file_stem("protection", prior_group)
+        found.append(Table(name=name, title=title, columns=columns, rows=tuple(rows), notes=notes))
+    return tuple(found)
+
+
+def _share_cell(row: Mapping[Any, Any], area: str) -> Cell:
+    value, lo, hi = (float(row[f"{area}{end}"]) for end in ("", "_lo", "_hi"))
+    return figure_cell({"value": value, "lo": lo, "hi": hi, "unit": "1", "interval": "", "is_applicable": True})
+
+
+# --- places -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceOnMap:
+    """A place of the board: its number on the map, where it lies, and the half or part that it belongs to."""
+
+    number: int
+    name: str
+    part: str
+    longitude_deg: float
+    latitude_deg: float
+    is_made_up: bool
+
+
+def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
+    """Tasks of a board by region, whatever date or copy of it they search.
+
+    Examples
+    --------
+    >>> list(regions_of({"tasks": [{"region": "vaduz@2015-07-27"}, {"region": "vaduz+alias"}]}))
+    ['vaduz']
+    """
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for task in about.get("tasks", ()):
+        found.setdefault(base_of(str(task["region"])), []).append(task)
+    return dict(sorted(found.items()))
+
+
+def places_on_map(
+    about: Mapping[str, Any], spots: Mapping[str, Spot], parts: Mapping[str, tuple[str, str]]
+) -> tuple[PlaceOnMap, ...]:
+    """Places of a board that are known to lie somewhere, numbered; of several regions the middle."""
+    by_place: dict[str, list[Spot]] = {}
+    for region in (name for name in regions_of(about) if name in spots):
+        by_place.setdefault(parts.get(region, (region, ""))[0], []).append(spots[region])
+    halves = dict(parts.values())
+    return tuple(
+        PlaceOnMap(
+            number=number,
+            name=name,
+            part=halves.get(name, ""),
+            longitude_deg=sum(spot.longitude_deg for spot in found) / len(found),
+            latitude_deg=sum(spot.latitude_deg for spot in found) / len(found),
+            is_made_up=all(spot.is_made_up for spot in found),
+        )
+        for number, (name, found) in enumerate(sorted(by_place.items()), start=1)
+    )
+
+
+def region_table(source: SiteSource) -> Table:
+    """Every region of the board, where it lies and what was drawn there."""
+    numbers = {item.name: item.number for item in places_on_map(source.about, source.spots, source.parts)}
+    rows = []
+    for region, tasks in regions_of(source.about).items():
+        place, part = source.parts.get(region, (region, "-"))
+        spot = source.spots.get(region)
+        dates = sorted({str(task["map_date"]) for task in tasks if task.get("map_date")})
+        suites = sorted({str(task["suite"]) for task in tasks})
+        rows.append(
+            Row(
+                cells=(
+                    Cell(text=region if spot is None else f"{spot.title} ({region})"),
+                    plain_cell(numbers.get(place)),
+                    Cell(text=place),
+                    Cell(text=part or "-"),
+                    Cell(text="-" if spot is None else ", ".join(spot.scenes)),
+                    Cell(text=", ".join(dates) or "-"),
+                    Cell(text=", ".join(suites)),
+                )
+            )
+        )
+    columns = [
+        column(name, is_number=name == "no.", order="ascending" if name == "regions" else "none")
+        for name in ("regions", "no.", "place", "half or part", "scenes", "dates", "suites")
+    ]
+    return Table(name="regions", title="Regions of this board", columns=tuple(columns), rows=tuple(rows))
+
+
+# --- measured ageing --------------------------------------------------------------------------------------------------
+
+
+def rate_table(book: RateBook) -> Table:
+    """Measured yearly rates with their intervals, a class of a place a line."""
+    titles = {item.name: item.title for item in load_taxonomy().classes}
+    rows = [
+        Row(
+            cells=(
+                Cell(text=titles.get(name, name)),
+                Cell(text=place.name),
+                _short_cell(found.years),
+                Cell(text=f"{found.n_from} to {found.n_to}", key=float(found.n_from)),
+                _rate_cell(found.vanish_per_year),
+                _rate_cell(found.appear_per_year),
+                *_drawn_cells(found),
+            )
+        )
+        for name in titles
+        for place in book.places
+        if (found := place.classes.get(name)) is not None
+    ]
+    names = ("things", "vanishes", "appears", "re-drawn", "shift")
+    shown = {"vanishes": "vanishes (%/year)", "appears": "appears (%/year)", "re-drawn": "re-drawn (%)"}
+    return Table(
+        name="rates",
+        title="Yearly rates by class and place",
+        columns=(
+            column("class", is_number=False),
+            column("place", is_number=False),
+            column("years"),
+            *(column(name, title=shown.get(name, "shift (m)" if name == "shift" else name)) for name in names),
+        ),
+        rows=tuple(rows),
+        notes=("Of few things a rate says little. What appears is mostly mapping that catches up, not new building.",),
+    )
+
+
+def _rate_cell(rate: Estimate | None) -> Cell:
+    if rate is None:
+        return Cell(text="-")
+    ends = [math.nan if end is None else 100 * end for end in (rate.lo, rate.hi)]
+    return Cell(text=interval_text(100 * rate.best, *ends), key=rate.best)
+
+
+def _drawn_cells(found: ClassAgeing) -> tuple[Cell, Cell]:
+    share, shift_m = found.redrawn_share, found.shift_median_m
+    return (_short_cell(None if share is None else 100 * share), _short_cell(shift_m))
+
+
+def _short_cell(value: float | None) -> Cell:
+    return Cell(text="-") if value is None else Cell(text=f"{value:.1f}", key=value)

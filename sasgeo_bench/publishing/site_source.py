@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a site is made of, as values: a board's tables and pictures, and what ships with the package."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.ageing.ratebook import RateBook
+from sasgeo_bench.scoring.contrasts import Contrast
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteFigure:
+    """A figure of the board: name of its file, title, and width and height in points."""
+
+    file: str
+    title: str
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """A picture of a region or suite (`of`), made elsewhere."""
+
+    of: str
+    file: str
+    alt: str
+
+
+_OF_REJECTOR: Final = {"p_false_": "P(false)", "order_": "order"}
+_VERDICT: Final = "accepted_"
+_LEFT_OUT: Final = (_VERDICT, "told_hpl_")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One query that a matcher failed on, with what is said of it by name."""
+
+    query_id: str
+    matcher: str
+    failure: str
+    file: str
+    alt: str
+    suite: str = ""
+    region: str = ""
+    kind: str = ""
+    said: Mapping[str, str] = field(default_factory=dict)
+
+    def lines(self) -> dict[str, str]:
+        """What is said of it, for a page: a line for each rejector, and no protection levels, which are a dozen.
+
+        Examples
+        --------
+        >>> said = {"error_m": "9", "p_false_own": "0.9", "accepted_own": "no", "told_hpl_gauss_0.01_m": "4"}
+        >>> Case(query_id="q", matcher="m", failure="aged", file="a.webp", alt="", said=said).lines()
+        {'error_m': '9', 'own': 'P(false) 0.9, withheld'}
+        """
+        found: dict[str, str] = {}
+        for name, value in self.said.items():
+            kind = next((kind for kind in _OF_REJECTOR if name.startswith(kind)), "")
+            if kind:
+                rejector = name.removeprefix(kind)
+                verdict = {"yes": ", accepted", "no": ", withheld"}.get(self.said.get(f"{_VERDICT}{rejector}", ""), "")
+                found[rejector] = f"{_OF_REJECTOR[kind]} {value}{verdict}"
+            elif not name.startswith(_LEFT_OUT):
+                found[name] = value
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pictures:
+    """What a board's folder holds in `pictures/`; none of anything where there is none."""
+
+    regions: tuple[Picture, ...] = ()
+    suites: tuple[Picture, ...] = ()
+    cases: tuple[Case, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spot:
+    """Where a region lies, as its shipped file says."""
+
+    region: str
+    title: str
+    longitude_deg: float
+    latitude_deg: float
+    scenes: tuple[str, ...]
+    is_made_up: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Download:
+    """A file that the site offers: name, bytes as they are to be fetched, and what is in it."""
+
+    file: str
+    size_bytes: int
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiteSource:
+    """All that the pages of a site are made of.
+
+    Parameters
+    ----------
+    name, title : str
+        Of the board; the title is that of its pipeline where it is known.
+    about : mapping
+        What `board.json` says.
+    board, contrasts, falsifiers, controls, scores, protection : pandas.DataFrame
+        Its tables; empty where it has none.
+    registered : tuple of Contrast
+        As they were registered, where that is known.
+    reasons : mapping of str to str
+        Name of a contrast -> why it was registered.
+    figures, downloads : tuple
+        Files beside the pages.
+    pictures : Pictures
+        Previews, examples and failures.
+    spots : mapping of str to Spot
+        By region; of some regions nobody knows where they lie.
+    parts : mapping of str to (str, str)
+        By region: place, and half or part of the split.
+    rates : RateBook
+        Measured ageing.
+    rates_figure, map_figure : SiteFigure, optional
+        Of the rates and of the places, where they are drawn.
+    """
+
+    name: str
+    title: str
+    about: Mapping[str, Any]
+    board: pd.DataFrame
+    rates: RateBook
+    contrasts: pd.DataFrame = field(default_factory=pd.DataFrame)
+    falsifiers: pd.DataFrame = field(default_factory=pd.DataFrame)
+    controls: pd.DataFrame = field(default_factory=pd.DataFrame)
+    scores: pd.DataFrame = field(default_factory=pd.DataFrame)
+    protection: pd.DataFrame = field(default_factory=pd.DataFrame)
+    registered: tuple[Contrast, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    figures: tuple[SiteFigure, ...] = ()
+    downloads: tuple[Download, ...] = ()
+    pictures: Pictures = field(default_factory=Pictures)
+    spots: Mapping[str, Spot] = field(default_factory=dict)
+    parts: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    rates_figure: SiteFigure | None = None
+    map_figure: SiteFigure | None = None

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of a site as values: cells with what they sort by, columns with what they mean."""
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import pandas as pd
+
+from sasgeo_bench.leaderboard.text import figure_text, number_text, rank_text
+from sasgeo_bench.scoring.rows import is_unranked
+
+Record = Mapping[str, Any]  # a row of the leaderboard
+Key = tuple[str, str, str]  # suite, track, prior group
+
+_PLAIN: Final = re.compile(r"[^a-z0-9]+")
+_MOST_LETTERS: Final = 60  # of a part of a file name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bar:
+    """An interval as a picture beside its numbers: ends, and the figure between them, in per cent of the cell."""
+
+    lo: float
+    hi: float
+    at: float | None = None
+
+    @classmethod
+    def of_share(cls, row: Record) -> Self | None:
+        """Of a share with an interval; None of anything else.
+
+        Examples
+        --------
+        >>> Bar.of_share({"value": 0.5, "lo": 0.25, "hi": 0.75, "unit": "1"})
+        Bar(lo=25.0, hi=75.0, at=50.0)
+        """
+        ends = tuple(float(row[name]) for name in ("lo", "hi", "value"))
+        if row.get("unit") != "1" or not all(0 <= end <= 1 for end in ends):
+            return None
+        lo, hi, at = (round(100 * end, 1) for end in ends)
+        return cls(lo=lo, hi=hi, at=at)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mark:
+    """A word beside a name, and what it says."""
+
+    text: str
+    meaning: str
+    tone: str = "plain"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """What one cell shows; `key` is what it sorts by where that is not its text."""
+
+    text: str
+    key: float | None = None
+    href: str = ""
+    marks: tuple[Mark, ...] = ()
+    bar: Bar | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """Name and meaning of a column; `order` is how the table comes sorted by it, as `aria-sort` says it."""
+
+    name: str
+    meaning: str
+    is_number: bool = True
+    order: str = "none"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A line of a table; the first cell is its head. `tone` says how it looks: plain, control, tied, other-tie."""
+
+    cells: tuple[Cell, ...]
+    tone: str = "plain"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table with its title; `notes` stand below it."""
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+
+    def without_empty(self, *names: str) -> "Table":
+        """The same without those of the named columns that say nothing in any row."""
+        lost = {
+            at
+            for at, column in enumerate(self.columns)
+            if column.name in names and all(row.cells[at].text == "-" for row in self.rows)
+        }
+        keep = [at for at in range(len(self.columns)) if at not in lost]
+        return Table(
+            name=self.name,
+            title=self.title,
+            columns=tuple(self.columns[at] for at in keep),
+            rows=tuple(Row(cells=tuple(row.cells[at] for at in keep), tone=row.tone) for row in self.rows),
+            notes=self.notes,
+        )
+
+
+def plain_cell(value: object) -> Cell:
+    """A cell of a text or a whole number; "-" where there is none.
+
+    Examples
+    --------
+    >>> plain_cell(3), plain_cell("").text
+    (Cell(text='3', key=3.0, href='', marks=(), bar=None), '-')
+    """
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return Cell(text=str(value) if value not in ("", None) else "-", key=float(str(value)) if is_number else None)
+
+
+def number_cell(value: float, unit: str = "") -> Cell:
+    """A cell of one number, with its unit if it has one.
+
+    Examples
+    --------
+    >>> number_cell(12.345, "s").text, number_cell(math.nan).text
+    ('12.3 s', '-')
+    """
+    if math.isnan(value):
+        return Cell(text="-")
+    return Cell(text=f"{number_text(value)} {unit}".strip(), key=value)
+
+
+def figure_cell(row: Record | None, *, has_bar: bool = False) -> Cell:
+    """A cell of a figure with its interval, drawn or not; "-" for none, in words where the matcher cannot."""
+    if row is None:
+        return Cell(text="-")
+    if not row["is_applicable"]:
+        return Cell(text="not applicable")
+    value = float(row["value"])
+    bar = Bar.of_share(row) if has_bar else None
+    return Cell(text=figure_text(row), key=None if math.isnan(value) else value, bar=bar)
+
+
+def rank_cell(row: Record, *, ranked: int, mark: Mark | None = None) -> Cell:
+    """A cell of a rank interval, drawn as the part of all ranks that it covers; not where one matcher alone is ranked.
+
+    Examples
+    --------
+    >>> row = {"matcher": "mine", "rank_best": 1, "rank_worst": 1}
+    >>> rank_cell(row, ranked=2).bar, rank_cell(row, ranked=1).bar
+    (Bar(lo=0.0, hi=50.0, at=None), None)
+    """
+    text = rank_text(row)
+    if pd.isna(row["rank_best"]) or is_unranked(str(row["matcher"])):
+        return Cell(text=text)
+    best, worst = int(row["rank_best"]), int(row["rank_worst"])
+    bar = Bar(lo=round(100 * (best - 1) / ranked, 1), hi=round(100 * worst / ranked, 1)) if ranked > 1 else None
+    return Cell(text=text, key=best + worst / 1e4, bar=bar, marks=() if mark is None else (mark,))
+
+
+def file_stem(*parts: str) -> str:
+    """Parts as letters, digits and hyphens alone.
+
+    Examples
+    --------
+    >>> file_stem("matcher", "<script>alert(1)</script>")
+    'matcher-script-alert-1-script'
+    """
+    words = (_PLAIN.sub("-", part.lower()).strip("-")[:_MOST_LETTERS].strip("-") for part in parts)
+    return "-".join(word for word in words if word) or "page"
+
+
+def page_names(kind: str, names: Iterable[str]) -> dict[str, str]:
+    """Name -> name of its page, no two alike, whatever the names are.
+
+    Examples
+    --------
+    >>> page_names("matcher", ["raster", "raster!", "raster-2"])
+    {'raster': 'matcher-raster.html', 'raster!': 'matcher-raster-3.html', 'raster-2': 'matcher-raster-2.html'}
+    """
+    listed = list(dict.fromkeys(names))
+    own = {name: file_stem(kind, name) for name in listed}
+    taken = {stem for name, stem in own.items() if stem == f"{kind}-{name}"}  # names that are plain keep theirs
+    found = {}
+    for name, stem in own.items():
+        free, number = stem, 1
+        while stem != f"{kind}-{name}" and free in taken:
+            number += 1
+            free = f"{stem}-{number}"
+        taken.add(free)
+        found[name] = f"{free}.html"
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tie:
+    """Matchers whose ranks overlap one another's in a chain, best first, and from which rank to which."""
+
+    names: tuple[str, ...]
+    best: int
+    worst: int
+
+    def to_text(self) -> str:
+        """In a line.
+
+        Examples
+        --------
+        >>> Tie(names=("a", "b"), best=1, worst=2).to_text()
+        'a, b share ranks 1 to 2'
+        """
+        return f"{', '.join(self.names)} share ranks {self.best} to {self.worst}"
+
+
+def ties_of(rows: Sequence[Record]) -> tuple[Tie, ...]:
+    """Ties among the ranked rows of one table.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        With `matcher`, `rank_best` and `rank_worst`; those without a rank have no part.
+
+    Examples
+    --------
+    >>> ranked = [("a", 1, 2), ("b", 1, 2), ("c", 3, 3)]
+    >>> ties_of([dict(zip(("matcher", "rank_best", "rank_worst"), row)) for row in ranked])
+    (Tie(names=('a', 'b'), best=1, worst=2),)
+    """
+    told = [row for row in rows if not pd.isna(row["rank_best"]) and not is_unranked(str(row["matcher"]))]
+    ranked = sorted((int(row["rank_best"]), int(row["rank_worst"]), str(row["matcher"])) for row in told)
+    chains: list[list[tuple[int, int, str]]] = []
+    for item in ranked:
+        if chains and item[0] <= max(worst for _, worst, _ in chains[-1]):
+            chains[-1].append(item)
+        else:
+            chains.append([item])
+    return tuple(
+        Tie(names=tuple(name for _, _, name in chain), best=chain[0][0], worst=max(worst for _, worst, _ in chain))
+        for chain in chains
+        if len(chain) > 1
+    )

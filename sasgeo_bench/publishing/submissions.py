@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers of others: a submission made of predictions and a card, held against a board, and scored with it."""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.leaderboard.build import Board
+from sasgeo_bench.matching.plugins import shipped_names
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskSaid
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_settings
+from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.scoring.rows import is_unranked, name_alone
+from sasgeo_bench.scoring.score import SCORER_VERSION
+from sasgeo_bench.scoring.scored_tasks import AskedTask
+from sasgeo_bench.scoring.submission_files import list_submissions, read_card, read_submission, write_submission
+from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION
+from sasgeo_bench.tasks.split import Split, find_split
+
+FOLDER: Final = Path("submissions")  # where they lie, unless said otherwise
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmitRequest:
+    """What is to be submitted.
+
+    Parameters
+    ----------
+    predictions : Path
+        A file of predictions, or the folder of a matcher's runs.
+    card : Path
+        The card, TOML.
+    board : Path
+        Stored results of the board it is for.
+    into : Path, optional
+        Folder to write; submissions/<name> unless said.
+    """
+
+    predictions: Path
+    card: Path
+    board: Path
+    into: Path | None = None
+
+
+def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
+    """Put predictions and a card into a folder that `validate` accepts.
+
+    Parameters
+    ----------
+    request : SubmitRequest
+        What is asked for.
+    tell : callable
+        Gets a line for whatever the author should know: misses, controls that are not answered.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    ConfigError
+        If the card does not fit the board or the runs, or the predictions hold faults; nothing is written.
+    StoreError
+        If something cannot be read or written.
+    """
+    card = read_card(request.card)
+    if not is_pack(request.board):
+        message = f"{request.board} holds no stored results: name those of the board, as in --for docs/results/demo"
+        raise StoreError(message)
+    split = _split_of(request.board)
+    _check_card(card, request.board, split, request.card)
+    with laid_tasks([request.board]) as folders:
+        tasks = [AskedTask.of(folder) for folder in folders]
+        _check_runs(card, request.predictions, split, tasks)
+        _check_rows(request.predictions, folders)
+        rows = _rows_of(request.predictions, tasks)
+    said = Submission(
+        schema_version=SCHEMA_VERSION,
+        card=card,
+        board=board_of([request.board]),
+        split=None if split is None else split.spec.id,
+        task_version=TASK_VERSION,
+        data_version=DATA_VERSION,
+        scorer_version=SCORER_VERSION,
+        made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+        tasks=_answered(tasks, rows, request.predictions),
+        files={},
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
+    )
+    asked = {name: one for task in tasks for name, one in task.asked.items()}
+    folder = request.into or FOLDER / card.name
+    write_submission(folder, said, list(rows.values()), asked)
+    for line in _remarks(said):
+        tell(line)
+    return folder
+
+
+def _split_of(board: Path) -> Split | None:
+    name = stored_settings([board]).split
+    return None if name is None else find_split(name)
+
+
+def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> None:
+    """Refuse a name that another row has, and training on places that nobody knows."""
+    taken = {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
+    kinds = {
+        "a control of every board": is_unranked(card.name),
+        f"a matcher on the board {board.name}": card.name in taken,
+        "a matcher that ships": card.name in shipped_names(),
+    }
+    whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
+    if whose is not None:
+        message = f"{path}: {card.name!r} is the name of {whose}: choose another name"
+        raise ConfigError(message)
+    if not board_of([board]):
+        message = f"{board} are stored results of no pipeline: name those of a board that one has made"
+        raise ConfigError(message)
+    known = () if split is None else tuple(split.blocks)
+    unknown = next((place for place in card.places if place not in known), None)
+    if unknown is not None:
+        message = (
+            f"{path}: trained_on names {unknown!r}, {_hint(unknown, split)}; what is no place of the split goes into "
+            "trained_elsewhere"
+        )
+        raise ConfigError(message)
+    if card.is_by_half and (split is None or not split.half_of):
+        message = f"{path}: trained_on speaks of halves, and the split of this board has none: list the places"
+        raise ConfigError(message)
+
+
+def _hint(unknown: str, split: Split | None) -> str:
+    """What was meant by a place that the split does not know."""
+    if split is None:
+        return "and this board has no split"
+    home = split.places_in(unknown)
+    near = difflib.get_close_matches(unknown, split.blocks, n=1)
+    if home:
+        return f"a region of the place {home[0]!r}"
+    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(split.blocks)}"
+
+
+def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Sequence[AskedTask]) -> None:
+    """Refuse a card that does not say what the runs say: whose they are, and which places taught them."""
+    named = {(task.about["suite"], task.about["region"]) for task in tasks}
+    for about in _runs_in(predictions):
+        said = about.get("matcher")
+        found = {name: said.get(name) for name in ("name", "version")} if isinstance(said, dict) else {}
+        if found != {"name": card.name, "version": card.version}:
+            message = (
+                f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {found.get('name')!r} "
+                f"{found.get('version')}: make them agree, or name the folder of the runs that the card is of, as in "
+                f"{predictions / str(about.get('hash', '<hash>'))}"
+            )
+            raise ConfigError(message)
+        if (about.get("suite"), about.get("region")) in named:
+            _check_taught(card, about, split)
+
+
+def _runs_in(predictions: Path) -> Iterator[Mapping[str, Any]]:
+    prediction_files.check_one_matcher([predictions])
+    for path in sorted(predictions.rglob(prediction_files.RUN)) if predictions.is_dir() else ():
+        about = prediction_files.read_run(path.parent)
+        if about is not None:
+            yield about
+
+
+def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> None:
+    """What the runner has taught a matcher must stand on the card, for the half it was asked about."""
+    said = about.get("learned")
+    taught = said.get("trained_on", ()) if isinstance(said, dict) else ()
+    region = str(about["region"]).split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+    places = () if split is None else split.places_in(region)
+    half = split.half_of.get(places[0]) if split is not None and places else None
+    lost = sorted(set(taught) - set(card.taught(half)))
+    if lost:
+        message = (
+            f"the runs on {about['suite']}/{about['region']} learnt from {lost[0]}, which trained_on of the card does "
+            f"not say{'' if half is None else f' for half {half}'}: add it"
+        )
+        raise ConfigError(message)
+
+
+def _check_rows(predictions: Path, folders: Sequence[Path]) -> None:
+    faults = [fault for fault in validate(predictions, folders) if not fault.is_missing_row]
+    if faults:
+        message = (
+            f"{predictions} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all); "
+            "nothing was written"
+        )
+        raise ConfigError(message)
+
+
+def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Prediction]:
+    """Answers to the board's queries, by id; those of runs to other queries are left out."""
+    asked = {name: one for task in tasks for name, one in task.asked.items()}
+    if predictions.is_dir():
+        return prediction_files.read_answers(predictions, asked, is_tied=False).found
+    return {item.query_id: item for item in prediction_files.read_predictions(predictions)}
+
+
+def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predictions: Path) -> list[TaskSaid]:
+    """All tasks of every suite that is answered at all: whoever answers chooses suites, and nothing within them."""
+    counts = [(task, sum(name in rows for name in task.asked)) for task in tasks]
+    suites = {task.about["suite"] for task, count in counts if count}
+    if not suites:
+        message = (
+            f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/adding-a-matcher.md)"
+        )
+        raise ConfigError(message)
+    return [
+        TaskSaid(
+            suite=task.about["suite"],
+            region=task.about["region"],
+            queries_sha256=task.about["files"][task_files.QUERIES]["sha256"],
+            queries=len(task.asked),
+            answered=count,
+        )
+        for task, count in counts
+        if task.about["suite"] in suites
+    ]
+
+
+def _remarks(said: Submission) -> Iterator[str]:
+    """What an author should know before anyone else does."""
+    queries, answered = (sum(getattr(task, name) for task in said.tasks) for name in ("queries", "answered"))
+    yield f"{said.card.name}: {answered} of {counted(queries, 'query', 'queries')} of the board {said.board} have a row"
+    if answered < queries:
+        yield f"  {queries - answered} have none and count as misses"
+    if CONTROLS not in {task.suite for task in said.tasks}:
+        yield f"  the suite {CONTROLS!r} is not answered: nothing vouches for these answers but their author"
+
+
+def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tuple[Violation, ...]]:
+    """Hold a submission against itself and against tasks.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the submission.
+    tasks : sequence of Path
+        Task folders and stored results; without any, its rows are held against nothing.
+
+    Returns
+    -------
+    tuple of Submission and tuple of Violation
+        What it says, and all that is wrong with it, queries without a row among them.
+
+    Raises
+    ------
+    StoreError
+        If its files are not what it says, or something cannot be read.
+    ConfigError
+        If what it says is wrong in itself.
+    """
+    said = read_submission(folder)
+    split = None if said.split is None else find_split(said.split)
+    places = () if split is None else tuple(split.blocks)
+    if not tasks:
+        return said, tuple(submission_faults(folder, said, None, places=places))
+    with laid_tasks(tasks) as folders:
+        faults = submission_faults(folder, said, folders, board=board_of(tasks), places=places)
+        return said, tuple(faults)
+
+
+def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:
+    """Submissions that are for a board, by name; how many are for others is told.
+
+    Parameters
+    ----------
+    board : str
+        Its id.
+    paths : sequence of Path
+        Submissions, and folders of them.
+    tell : callable
+        Gets a line where some are left out.
+
+    Raises
+    ------
+    StoreError
+        If something is no submission, or not what it says.
+    ConfigError
+        If nobody says which board it is.
+    """
+    if not board:
+        message = "submissions are scored beside the stored results of a board: name them with --predictions"
+        raise ConfigError(message)
+    found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
+    boards = {folder: _board_said(folder, board) for folder in found.values()}
+    others = sorted({name for name in boards.values() if name != board})
+    if others:
+        count = sum(name != board for name in boards.values())
+        tell(f"left out: {counted(count, 'submission')} for other boards ({', '.join(islice(others, 3))})")
+    return tuple(folder for folder, name in boards.items() if name == board)
+
+
+def _board_said(folder: Path, board: str) -> str:
+    """Which board a submission is for; of one that cannot be read the board that is made, which says that it failed."""
+    try:
+        return read_submission(folder).board
+    except (StoreError, ConfigError):
+        return board
+
+
+def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell) -> Board:
+    """Score stored results again together with submissions, and write the board of both.
+
+    Parameters
+    ----------
+    stored : Path
+        Stored results.
+    submissions : sequence of Path
+        Submissions, and folders of them; those for other boards are left out.
+    board : Path
+        Folder to write.
+    tell : callable
+        Gets a line now and then.
+
+    Returns
+    -------
+    Board
+        As it was written: submissions are `as submitted`, runs as the stored results say.
+
+    Raises
+    ------
+    StoreError, ConfigError
+        If results or submissions are damaged or do not fit; nothing is written.
+    """
+    if not is_pack(stored):
+        message = f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written"
+        raise StoreError(message)
+    found = submissions_for(board_of([stored]), submissions, tell=tell)
+    return score_all(replace(request_of([stored], board=board, root=stored), submissions=found), tell=tell)

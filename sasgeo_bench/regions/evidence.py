@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Three-state rasters: present, absent or unknown per class, as a view saw them; packing, and warping to the map."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Self, TypeVar
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, inverse
+
+ABSENT: Final = 0
+PRESENT: Final = 1
+UNKNOWN: Final = 2
+
+_STATES: Final = 3
+_MOST_CLASSES: Final = 31
+_NOT_KNOWN: Final = np.uint32(1 << 31)
+Value = TypeVar("Value", np.uint8, np.uint32)
+
+CELLS_PER_BYTE: Final = 4
+_SHIFTS: Final = np.arange(0, 8, 2, dtype=np.uint8)  # of the four cells within a byte, the first one lowest
+_CELLS: Final = np.arange(256, dtype=np.uint8)[:, None] >> _SHIFTS & 3  # shape (256, 4): the cells of each byte
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What one view says about each class and cell.
+
+    Parameters
+    ----------
+    classes : tuple of str
+        Class names in band order.
+    cells : ndarray of uint8, shape (C, rows, cols)
+        ABSENT, PRESENT or UNKNOWN; row 0 is the top of the view. Kept read-only.
+    cell_size_m : float
+        Metres on the ground a side of a cell, for scale 1.
+    confidence : ndarray of uint8, shape (C, rows, cols), optional
+        0..255 for how sure perception is of each cell.
+
+    Raises
+    ------
+    ShapeError
+        If shapes, types or values do not fit.
+
+    Examples
+    --------
+    >>> seen = Evidence(classes=("water",), cells=np.full((1, 2, 2), UNKNOWN, dtype=np.uint8), cell_size_m=1.0)
+    >>> seen.unknown_share
+    1.0
+    """
+
+    classes: tuple[str, ...]
+    cells: NDArray[np.uint8]
+    cell_size_m: float
+    confidence: NDArray[np.uint8] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no three-state raster; lock the arrays."""
+        if self.cells.dtype != np.uint8 or self.cells.ndim != 3 or len(self.cells) != len(self.classes):  # noqa: PLR2004
+            message = (
+                f"evidence for {len(self.classes)} classes is uint8 of shape (C, rows, cols), "
+                f"got {self.cells.dtype} of shape {self.cells.shape}"
+            )
+            raise ShapeError(message)
+        if self.cells.size == 0 or self.cells.max() >= _STATES:
+            message = "evidence cells are 0 absent, 1 present or 2 unknown, and there is at least one"
+            raise ShapeError(message)
+        if not (np.isfinite(self.cell_size_m) and self.cell_size_m > 0):
+            message = f"cell_size_m must be positive and finite, got {self.cell_size_m!r}"
+            raise ShapeError(message)
+        if self.confidence is not None:
+            if self.confidence.dtype != np.uint8 or self.confidence.shape != self.cells.shape:
+                found = f"{self.confidence.dtype} of shape {self.confidence.shape}"
+                message = f"confidence is uint8 of shape {self.cells.shape}, got {found}"
+                raise ShapeError(message)
+            self.confidence.flags.writeable = False
+        self.cells.flags.writeable = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (self.cells.shape[1], self.cells.shape[2])
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height on the ground for scale 1, metres."""
+        return (self.cells.shape[2] * self.cell_size_m, self.cells.shape[1] * self.cell_size_m)
+
+    @cached_property
+    def unknown_share(self) -> float:
+        """Share of unknown cells over all classes."""
+        return float((self.cells == UNKNOWN).mean())
+
+    def replace(self, cells: NDArray[np.uint8], confidence: NDArray[np.uint8] | None = None) -> Self:
+        """Return the same view with other cells (and confidence, none unless given)."""
+        return type(self)(classes=self.classes, cells=cells, cell_size_m=self.cell_size_m, confidence=confidence)
+
+    def layer(self, class_name: str) -> NDArray[np.uint8]:
+        """Cells of one class, shape (rows, cols)."""
+        return np.asarray(self.cells[self.classes.index(class_name)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerBits:
+    """All classes of a map in one integer a cell: many views are cut from it at the price of one layer.
+
+    `bits` is uint32 of shape (rows, cols), bit i set where class i is present, the highest where nothing is known;
+    `count` is the number of classes. Made by `of`.
+    """
+
+    bits: NDArray[np.uint32]
+    count: int
+
+    @classmethod
+    def of(cls, layers: NDArray[np.uint8]) -> Self:
+        """Gather layers, uint8 of shape (C, rows, cols); a cell that one class does not know, none does.
+
+        Examples
+        --------
+        >>> LayerBits.of(np.array([[[1, 0, 255]], [[1, 1, 255]]], dtype=np.uint8)).bits.tolist()
+        [[3, 2, 2147483648]]
+        """
+        if len(layers) > _MOST_CLASSES:
+            message = f"at most {_MOST_CLASSES} classes fit into the bits of one cell, got {len(layers)}"
+            raise ShapeError(message)
+        bits = np.zeros(layers.shape[1:], dtype=np.uint32)
+        for index, layer in enumerate(layers):
+            bits |= (layer == PRESENT).astype(np.uint32) << np.uint32(index)
+            bits[layer > PRESENT] = _NOT_KNOWN
+        bits.flags.writeable = False
+        return cls(bits=bits, count=len(layers))
+
+
+def pack(cells: NDArray[np.uint8]) -> bytes:
+    """Pack three-state cells to two bits each, in C order, four to a byte, the first cell in the lowest bits.
+
+    Parameters
+    ----------
+    cells : ndarray of uint8
+        ABSENT, PRESENT or UNKNOWN, any shape.
+
+    Returns
+    -------
+    bytes
+        ceil(cells / 4) bytes; unused bits are 0.
+
+    Examples
+    --------
+    >>> pack(np.array([1, 2, 0, 1, 2], dtype=np.uint8)).hex()
+    '4902'
+    """
+    flat = np.zeros(-(-cells.size // CELLS_PER_BYTE) * CELLS_PER_BYTE, dtype=np.uint8)
+    flat[: cells.size] = cells.ravel()
+    packed = np.zeros(len(flat) // CELLS_PER_BYTE, dtype=np.uint8)
+    for first, shift in enumerate(_SHIFTS):
+        packed |= flat[first::CELLS_PER_BYTE] << shift
+    return packed.tobytes()
+
+
+def unpack(packed: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Inverse of `pack` for cells of a known shape.
+
+    Raises
+    ------
+    ShapeError
+        If the bytes are too few or too many, or hold a state that is none.
+
+    Examples
+    --------
+    >>> unpack(bytes.fromhex("4902"), (5,)).tolist()
+    [1, 2, 0, 1, 2]
+    """
+    count = int(np.prod(shape))
+    if len(packed) != -(-count // CELLS_PER_BYTE):
+        message = (
+            f"{count} cells of shape {shape} take {-(-count // CELLS_PER_BYTE)} bytes, got {len(packed)}: "
+            "rows, cols or classes do not belong to this evidence"
+        )
+        raise ShapeError(message)
+    cells = _CELLS.take(np.frombuffer(packed, dtype=np.uint8), axis=0).ravel()
+    if cells.max(initial=0) >= _STATES:
+        message = "packed evidence holds a state that is neither absent, present nor unknown: the bytes are damaged"
+        raise ShapeError(message)
+    return np.asarray(cells[:count].reshape(shape), dtype=np.uint8)
+
+
+def observe(
+    layers: LayerBits,
+    grid: Grid,
+    pose: Pose,
+    *,
+    size_cells: int,
+    cell_size_m: float,
+) -> NDArray[np.uint8]:
+    """Show the map as a perfect view from a pose would: each view cell takes the map cell under its centre.
+
+    Parameters
+    ----------
+    layers : LayerBits
+        A region's layers.
+    grid : Grid
+        Their lattice.
+    pose : Pose
+        Centre, heading and residual scale of the view.
+    size_cells : int
+        Rows and columns of the view.
+    cell_size_m : float
+        Metres a side of a view cell for scale 1.
+
+    Returns
+    -------
+    ndarray of uint8, shape (C, size_cells, size_cells)
+        ABSENT, PRESENT or UNKNOWN; beyond the map everything is UNKNOWN.
+
+    Examples
+    --------
+    A house east of the centre lies at the top of a view that heads east (yaw 90):
+
+    >>> layers = np.zeros((1, 5, 5), dtype=np.uint8)
+    >>> layers[0, 2, 4] = 1
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=5.0, cell_size_m=1.0, rows=5, cols=5)
+    >>> east = Pose(easting_m=2.5, northing_m=2.5, yaw_deg=90.0)
+    >>> observe(LayerBits.of(layers), grid, east, size_cells=5, cell_size_m=1.0)[0, 0].tolist()
+    [0, 0, 1, 0, 0]
+    """
+    shape = (size_cells, size_cells)
+    # A pose is an affine map, so three points give it, and each of a view's cells is a sum of two numbers.
+    middle, right, up = grid.to_uv(pose.to_map(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
+    steps_m = (np.arange(size_cells) + 0.5 - size_cells / 2) * cell_size_m
+    across, along = np.outer(right - middle, steps_m), middle[:, None] + np.outer(up - middle, -steps_m)
+    cols, rows = np.floor(along[:, :, None] + across[:, None, :]).astype(np.int64)
+    bits = _sample(layers.bits, rows, cols, _NOT_KNOWN)
+    seen = np.empty((layers.count, *shape), dtype=np.uint8)
+    for index, layer in enumerate(seen):
+        np.bitwise_and(bits >> np.uint32(index), 1, out=layer, casting="unsafe")
+    seen[:, bits == _NOT_KNOWN] = UNKNOWN
+    return seen
+
+
+def to_map(evidence: Evidence, pose: Pose, grid: Grid) -> NDArray[np.uint8]:
+    """Lay a view onto the map: each map cell takes the view cell its centre falls into.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        The view.
+    pose : Pose
+        Where it is thought to be.
+    grid : Grid
+        The map's lattice, or a window of it.
+
+    Returns
+    -------
+    ndarray of uint8, shape (C, rows, cols)
+        ABSENT, PRESENT or UNKNOWN; UNKNOWN wherever the view does not reach.
+
+    Examples
+    --------
+    >>> seen = Evidence(classes=("water",), cells=np.ones((1, 2, 2), dtype=np.uint8), cell_size_m=1.0)
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=3.0, cell_size_m=1.0, rows=3, cols=3)
+    >>> to_map(seen, Pose(easting_m=1.0, northing_m=2.0, yaw_deg=0.0), grid)[0]
+    array([[1, 1, 2],
+           [1, 1, 2],
+           [2, 2, 2]], dtype=uint8)
+    """
+    rows, cols = np.indices(grid.shape)
+    centres = grid.to_centres_m(np.column_stack((rows.ravel(), cols.ravel())))
+    offsets = inverse(pose).to_map(centres)
+    at_row, at_col = _view_grid(evidence.shape, evidence.cell_size_m).to_cells(offsets).T
+    laid = np.stack([_sample(layer, at_row, at_col, np.uint8(UNKNOWN)) for layer in evidence.cells])
+    return laid.reshape(-1, *grid.shape)
+
+
+def cell_offsets_m(shape: tuple[int, int], cell_size_m: float) -> NDArray[np.float64]:
+    """(right, up) of every cell centre of a view from its middle, row by row, shape (rows * cols, 2), metres.
+
+    Examples
+    --------
+    >>> cell_offsets_m((2, 2), 1.0).tolist()
+    [[-0.5, 0.5], [0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]
+    """
+    view = _view_grid(shape, cell_size_m)
+    rows, cols = np.indices(shape)
+    return view.to_centres_m(np.column_stack((rows.ravel(), cols.ravel())))
+
+
+def footprint(pose: Pose, *, size_m: tuple[float, float]) -> shapely.Polygon:
+    """Outline on the map of a view of a width and height, counter-clockwise.
+
+    Examples
+    --------
+    >>> footprint(Pose(easting_m=5.0, northing_m=5.0, yaw_deg=90.0), size_m=(4.0, 2.0)).bounds
+    (4.0, 3.0, 6.0, 7.0)
+    """
+    half = np.array(size_m) / 2
+    corners = pose.to_map(np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half)
+    return shapely.Polygon(corners.round(9))
+
+
+def _view_grid(shape: tuple[int, int], cell_size_m: float) -> Grid:
+    """The view as a lattice of its own whose origin is the middle of the view."""
+    rows, cols = shape
+    west_m, north_m = -cols * cell_size_m / 2, rows * cell_size_m / 2
+    return Grid(epsg=0, west_m=west_m, north_m=north_m, cell_size_m=cell_size_m, rows=rows, cols=cols)
+
+
+def _sample(source: NDArray[Value], rows: NDArray[np.int64], cols: NDArray[np.int64], beyond: Value) -> NDArray[Value]:
+    """Values of a raster at cells of any shape; `beyond` outside of it."""
+    height, width = source.shape
+    at = rows * width + cols
+    if rows.min() >= 0 and rows.max() < height and cols.min() >= 0 and cols.max() < width:
+        return np.asarray(source.ravel()[at])
+    within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+    return np.where(within, source.ravel()[np.where(within, at, 0)], beyond)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`preview.png`: a region as a map for people, with legend, scale, north, date and attribution."""
+
+from pathlib import Path
+from textwrap import wrap
+from typing import Final
+
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon, Rectangle
+from numpy.typing import NDArray
+
+from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
+from sasgeo_bench.regions.region import Manifest
+
+# Painted in this order: land first, then what lies on it, then what runs over it.
+PAINT_ORDER: Final = (
+    *("farmland", "green", "water", "parking", "building", "field_boundary", "path_track", "waterway", "coastline"),
+    *("road_minor", "road_major", "railway", "bridge"),
+)
+_GROUND: Final = "#fbfaf5"
+_UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
+_STRIPE_CELLS: Final = 12
+_DPI: Final = 110
+_LEGEND_INCHES: Final = 2.9
+_MAP_INCHES: Final = 9.6
+_LEAST_INCHES: Final = 4.6
+_TITLE_INCHES: Final = 0.85
+_FOOT_INCHES: Final = 0.95
+_STRIP_INCHES: Final = 0.5  # under the map, for scale and north
+_ARROW_INCHES: Final = 0.3
+_EDGE: Final = "#d81b60"
+
+
+def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
+    """Draw a region.
+
+    Parameters
+    ----------
+    path : Path
+        The PNG to write.
+    manifest : Manifest
+        What the frame says.
+    overview : ndarray of uint8, shape (C, rows, cols)
+        A coarse level of the layers, bands in the order of the manifest's classes.
+    """
+    rows, cols = overview.shape[1:]
+    scale = _MAP_INCHES / max(rows, cols)
+    width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
+    total = (width + _LEGEND_INCHES + 0.6, height + _TITLE_INCHES + _FOOT_INCHES)
+    figure = PlainFigure(figsize=total, dpi=_DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    chart = figure.add_axes((0.3 / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))
+    side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))
+    chart.imshow(paint_overview(manifest, overview), extent=(0, side_m[0], 0, side_m[1]), interpolation="antialiased")
+    chart.set_xticks([])
+    chart.set_yticks([])
+    chart.set_anchor("NW")
+    _draw_edge(chart, manifest)
+    m_per_inch = max(side_m[0] / width, side_m[1] / height)
+    _draw_strip(figure, total, width_m=side_m[0], m_per_inch=m_per_inch)
+    _words(figure, manifest, total)
+    _legend(figure, manifest, overview, left=(width + 0.45) / total[0], top=1 - _TITLE_INCHES / total[1])
+    figure.savefig(
+        path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
+    )
+
+
+def _draw_edge(chart: Axes, manifest: Manifest) -> None:
+    """The outline of what is mapped, within the grid."""
+    west, south, east, north = manifest.bounds_m
+    frame = shapely.boundary(shapely.box(west, south, east, north))
+    edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))
+    for line in shapely.get_parts(edge):
+        at = shapely.get_coordinates(line) - (west, south)
+        chart.plot(*at.T, color=_EDGE, lw=1.0)
+    chart.set(xlim=(0, east - west), ylim=(0, north - south))
+
+
+def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:
+    """Scale and north under the map, in its scale, so that they hide nothing of it."""
+    width = width_m / m_per_inch
+    strip = figure.add_axes(
+        (0.3 / total[0], (_FOOT_INCHES - _STRIP_INCHES) / total[1], width / total[0], _STRIP_INCHES / total[1])
+    )
+    strip.axis("off")
+    strip.set_zorder(-1)  # its white ground must not hide the frame of the map
+    height_m = _STRIP_INCHES * m_per_inch
+    strip.set(xlim=(0, width_m), ylim=(0, height_m))
+    scale_bar(strip, width_m, height_m)
+    north_arrow(strip, width_m, height_m, size_m=_ARROW_INCHES * m_per_inch)
+
+
+def _cell_m(manifest: Manifest, overview: NDArray[np.uint8]) -> float:
+    """Size of an overview cell: overviews are coarser by a whole factor."""
+    return manifest.cell_size_m * round(manifest.cols / overview.shape[2]) if overview.shape[2] else 1.0
+
+
+def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Colours, shape (rows, cols, 3), 0..1."""
+    rows, cols = overview.shape[1:]
+    picture = np.empty((rows, cols, 3))
+    picture[:] = to_rgb(_GROUND)
+    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+    for name in PAINT_ORDER:
+        if name in manifest.classes:
+            picture[overview[manifest.classes.index(name)] == PRESENT] = colours[name]
+    outside = overview[0] == OUTSIDE
+    down, right = np.indices((rows, cols), sparse=True)
+    is_stripe = (down + right) // _STRIPE_CELLS % 2 == 0
+    picture[outside] = to_rgb(_UNMAPPED[0])
+    picture[outside & is_stripe] = to_rgb(_UNMAPPED[1])
+    return picture
+
+
+def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
+    """A bar of a round length, about a fifth of the width, in the lower left corner of a chart in metres."""
+    goal = width_m / 4
+    power = 10.0 ** np.floor(np.log10(goal))
+    length_m = float(max(step * power for step in (1, 2, 5) if step * power <= goal))
+    left, bottom, thick = 0.03 * width_m, 0.03 * height_m, 0.008 * max(width_m, height_m)
+    pad = 0.015 * max(width_m, height_m)
+    chart.add_patch(
+        Rectangle((left - pad, bottom - pad), length_m + 2 * pad, thick + 4.2 * pad, color="white", alpha=0.85, lw=0)
+    )
+    for number in range(4):
+        colour = "black" if number % 2 == 0 else "white"
+        box = Rectangle(
+            (left + number * length_m / 4, bottom), length_m / 4, thick, facecolor=colour, edgecolor="black", lw=0.6
+        )
+        chart.add_patch(box)
+    kilometre_m = 1000
+    text = f"{length_m / kilometre_m:g} km" if length_m >= kilometre_m else f"{length_m:g} m"
+    chart.text(left + length_m / 2, bottom + thick + 0.4 * pad, text, ha="center", va="bottom", fontsize=9)
+
+
+def north_arrow(chart: Axes, width_m: float, height_m: float, *, size_m: float | None = None) -> None:
+    """An arrow with an N in the upper right corner of a chart in metres."""
+    size = size_m or 0.05 * max(width_m, height_m)
+    x, y = width_m - 0.9 * size, height_m - 1.5 * size
+    chart.add_patch(
+        Rectangle((x - 0.55 * size, y - 0.25 * size), 1.1 * size, 1.6 * size, color="white", alpha=0.85, lw=0)
+    )
+    arrow = [
+        (x, y + 0.75 * size),
+        (x - 0.28 * size, y - 0.1 * size),
+        (x, y + 0.1 * size),
+        (x + 0.28 * size, y - 0.1 * size),
+    ]
+    chart.add_patch(Polygon(arrow, closed=True, color="black"))
+    chart.text(x, y + 0.8 * size, "N", ha="center", va="bottom", fontsize=10, fontweight="bold")
+
+
+def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> None:
+    """Title above, facts below it, attribution at the foot."""
+    per_inch = 9.0
+    title = wrap(f"{manifest.title} ({manifest.id})", int(per_inch * 0.9 * (total[0] - 0.6)))
+    figure.text(0.3 / total[0], 1 - 0.16 / total[1], title[0], ha="left", va="top", fontsize=14, fontweight="bold")
+    facts = (
+        f"map of {manifest.extract.date}  |  {', '.join(manifest.scenes)}  |  "
+        f"cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}  |  "
+        f"mapped: {manifest.coverage.share:.1%} ({manifest.coverage.source})"
+    )
+    figure.text(0.3 / total[0], 1 - 0.52 / total[1], facts, ha="left", va="top", fontsize=9, color="#444444")
+    figure.text(0.3 / total[0], 0.14 / total[1], manifest.attribution, ha="left", va="bottom", fontsize=9)
+
+
+def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, left: float, top: float) -> None:
+    """Classes that are there, with their number of objects, and what the hatching means."""
+    titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
+    entries: list[Patch | Line2D] = [
+        Patch(
+            facecolor=titles[name][1],
+            edgecolor="#666666",
+            lw=0.4,
+            label=f"{titles[name][0]}  ({manifest.counts[name]:,})",
+        )
+        for name in manifest.classes
+        if manifest.counts.get(name)
+    ]
+    if (overview[0] == OUTSIDE).any():
+        hatched = Patch(
+            facecolor=_UNMAPPED[0], edgecolor=_UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)"
+        )
+        entries.append(hatched)
+        entries.append(Line2D([], [], color=_EDGE, lw=1.0, label=f"edge of the map ({manifest.coverage.source})"))
+    if not entries:
+        figure.text(left, top, "no element of any class", fontsize=9, va="top")
+        return
+    legend = figure.legend(
+        handles=entries,
+        loc="upper left",
+        bbox_to_anchor=(left, top),
+        frameon=False,
+        fontsize=9,
+        title="class  (objects)",
+        borderaxespad=0,
+        handlelength=1.4,
+        handleheight=1.1,
+    )
+    legend.get_title().set_fontsize(9)

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Region: grid + layers + graph + features + coverage + provenance; immutable."""
+
+import datetime as dt
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from sasgeo_bench.config import Document
+from sasgeo_bench.files.hashes import FileRecord
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.texts import FOLDER
+
+SCHEMA_VERSION: Final = 1  # of region.json and the tables beside it
+DATA_VERSION: Final = 2  # of what a build makes of an extract: raised whenever the same input gives another region
+ATTRIBUTION: Final = "(c) OpenStreetMap contributors, ODbL"
+LICENCE: Final = "ODbL-1.0"
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class _Record(Document):
+    """JSON knows no tuples and no dates, so the records are read with ordinary conversion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class ExtractRecord(_Record):
+    """The extract a region was built from."""
+
+    file: str
+    sha256: str
+    bytes: Count
+    date: dt.date
+    osm_timestamp: dt.datetime | None
+
+
+class CoverageRecord(_Record):
+    """The mapped area: where it is known from, its share of the grid, and its outline as WKT in the region's CRS.
+
+    `unknown_m2` is ground that was taken out of it, by reason (one place may have two); `cuts` are counts of what an
+    extract cut out of a larger one lacks. Both are empty in regions of data version 1, which did not look.
+    """
+
+    source: CoverageSource
+    share: Annotated[float, Field(ge=0, le=1)]
+    wkt: str
+    unknown_m2: dict[str, Annotated[float, Field(ge=0)]] = {}
+    cuts: dict[str, Count] = {}
+
+    def to_text(self) -> str:
+        """One line for a person: how much is mapped, and what is not and why."""
+        cuts = ", ".join(f"{what} {count}" for what, count in self.cuts.items())
+        reasons = [f"{area_m2:,.0f} m2 unknown {reason}" for reason, area_m2 in self.unknown_m2.items()]
+        about = f"; cut out of a larger extract: {cuts}" if cuts else ""
+        return "; ".join((f"{self.share:.1%} of the grid ({self.source}){about}", *reasons))
+
+
+class Manifest(_Record):
+    """`region.json`: what a region is, where it comes from, and the hashes of its files.
+
+    `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by
+    reason: not visible from above, not used, mended.
+    """
+
+    schema_version: int
+    data_version: int
+    package_version: str
+    id: Annotated[str, Field(pattern=FOLDER)]
+    title: str
+    scenes: tuple[str, ...]
+    epsg: int
+    bounds_m: tuple[float, float, float, float]
+    bounds_lonlat: tuple[float, float, float, float]
+    cell_size_m: float
+    rows: int
+    cols: int
+    classes: tuple[str, ...]
+    extract: ExtractRecord
+    coverage: CoverageRecord
+    counts: dict[str, Count]
+    graph_counts: dict[str, Count]
+    hidden: dict[str, Count]
+    drops: dict[str, Count]
+    notes: dict[str, Count]
+    warnings: tuple[str, ...]
+    fingerprint: str
+    inputs_sha256: str
+    files: dict[str, FileRecord]
+    licence: str
+    attribution: str
+
+    @property
+    def grid(self) -> Grid:
+        """The region's lattice."""
+        return Grid(
+            epsg=self.epsg,
+            west_m=self.bounds_m[0],
+            north_m=self.bounds_m[3],
+            cell_size_m=self.cell_size_m,
+            rows=self.rows,
+            cols=self.cols,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapGraph:
+    """What stands where on the map, and how it relates.
+
+    Parameters
+    ----------
+    nodes : geopandas.GeoDataFrame
+        One row a node with the columns of `graph.NODE_DTYPES` and `geometry`, by kind and coordinates, so `id` does
+        not depend on the order of the features. `degree` counts the road ends that meet (and the rail ends at a level
+        crossing), 0 elsewhere. `class` and `osm_id` name the feature that carries the node: the way above at a
+        crossing, the way of highest class at a junction; -1 where several do. `level_difference` is the upper level
+        less the lower one. `bearing_deg` is the long side of a building in [0, 180), and towards the inside of a bend.
+    edges : pandas.DataFrame
+        One row an edge with the columns of `graph.EDGE_DTYPES`. Connectivity (along roads, railways and waterways) and
+        adjacency have no direction and stand once, from the smaller id; a crossing points to the junctions at the ends
+        of its roads, a membership from the building to its cluster. `distance_m` is straight, `length_m` along the way.
+    """
+
+    nodes: gpd.GeoDataFrame
+    edges: pd.DataFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Region:
+    """One mapped place.
+
+    `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
+    `coverage` is the mapped area in the region's CRS.
+    """
+
+    manifest: Manifest
+    layers: NDArray[np.uint8]
+    features: gpd.GeoDataFrame
+    graph: MapGraph
+    coverage: shapely.Geometry
+
+    @property
+    def grid(self) -> Grid:
+        """The region's lattice."""
+        return self.manifest.grid
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names in band order."""
+        return self.manifest.classes
+
+    def layer(self, class_name: str) -> NDArray[np.uint8]:
+        """The raster of one class, shape (rows, cols)."""
+        return np.asarray(self.layers[self.classes.index(class_name)])

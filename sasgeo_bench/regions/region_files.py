@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A region on disk: `region.json` and the files it names; written whole or not at all."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import geopandas as gpd
+import pandas as pd
+import pyarrow as pa
+import shapely
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from sasgeo_bench.config import check_document
+from sasgeo_bench.errors import ConfigError, GridError, StoreError
+from sasgeo_bench.files.hashes import FileRecord, file_record, sha256_of
+from sasgeo_bench.files.json import read_json
+from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
+from sasgeo_bench.osm.features import check_features
+from sasgeo_bench.regions.layer_file import read_layers
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
+from sasgeo_bench.texts import json_text
+
+Table = TypeVar("Table", bound=pd.DataFrame)
+
+MANIFEST: Final = "region.json"
+LAYERS: Final = "layers.tif"
+FEATURES: Final = "features.parquet"
+NODES: Final = "nodes.parquet"
+EDGES: Final = "edges.parquet"
+PREVIEW: Final = "preview.png"
+_SAID: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICENCE}
+_MEND: Final = "build the region again"
+
+
+def write_tables(folder: Path, features: gpd.GeoDataFrame, graph: MapGraph) -> None:
+    """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder."""
+    geographic = {**CHECKED, "schema_version": "1.1.0"}
+    _attributed(features).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
+    _attributed(graph.nodes).to_parquet(folder / NODES, **geographic)
+    write_frame(graph.edges, folder / EDGES, attrs=_SAID)
+
+
+def _attributed(table: Table) -> Table:
+    """A view of the table whose parquet file says where its data come from (`attrs` in the file's metadata)."""
+    shown = table.copy(deep=False)
+    shown.attrs = dict(_SAID)
+    return shown
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write `region.json`, the last file of a region: without it the folder is no region."""
+    text = json_text(manifest.model_dump(mode="json"))
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read `region.json`.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no region, one of another schema, or a damaged manifest.
+
+    Examples
+    --------
+    >>> read_manifest(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        message = f"{folder} holds no {MANIFEST}: build the region first"
+        raise StoreError(message)
+    content = read_json(path, mend=_MEND)
+    found = content.get("schema_version") if isinstance(content, dict) else None
+    if found != SCHEMA_VERSION:
+        message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: {_MEND}"
+        raise StoreError(message)
+    try:
+        manifest = check_document(content, Manifest, source=MANIFEST)
+        _ = manifest.grid, shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
+    except (ConfigError, GridError, CRSError, shapely.errors.ShapelyError) as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
+        raise StoreError(message) from error
+    lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
+    if lost:
+        message = f"{path} is damaged (its files lack {lost[0]}): build the region again"
+        raise StoreError(message)
+    return manifest
+
+
+def read_region(folder: Path) -> Region:
+    """Read a region whole.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing or cannot be read.
+    """
+    manifest = read_manifest(folder)
+    for name in (LAYERS, FEATURES, NODES, EDGES):
+        _check_file(folder / name, manifest.files[name])
+    return Region(
+        manifest=manifest,
+        layers=read_layers(folder / LAYERS),
+        features=check_features(_read_geometry(folder / FEATURES)),
+        graph=MapGraph(nodes=_read_geometry(folder / NODES), edges=read_frame(folder / EDGES, mend=_MEND)),
+        coverage=shapely.from_wkt(manifest.coverage.wkt),
+    )
+
+
+def read_features(folder: Path) -> gpd.GeoDataFrame:
+    """Read a region's features alone.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no region, or the file cannot be read.
+    """
+    manifest = read_manifest(folder)
+    _check_file(folder / FEATURES, manifest.files[FEATURES])
+    return check_features(_read_geometry(folder / FEATURES))
+
+
+def check_files(folder: Path) -> None:
+    """Refuse a region of which a file is missing, or not what `region.json` says.
+
+    Raises
+    ------
+    StoreError
+        Naming the first such file.
+
+    Examples
+    --------
+    >>> check_files(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
+    """
+    for name, said in read_manifest(folder).files.items():
+        _check_file(folder / name, said)
+
+
+def _check_file(path: Path, said: FileRecord) -> None:
+    """Refuse a file that is not what the manifest says: nothing else covers a raster, or the footer of a GeoParquet."""
+    if not path.is_file() or file_record(path) != said:
+        message = f"{path} is missing, or not what {MANIFEST} says: {_MEND}"
+        raise StoreError(message)
+
+
+def _read_geometry(path: Path) -> gpd.GeoDataFrame:
+    """A table of geometry, after its size was looked at."""
+    with open_table(path, mend=_MEND, most_rows=MOST_VALUES):
+        pass
+    try:
+        return gpd.read_parquet(path, **VERIFIED)
+    except (
+        *(OSError, ValueError, KeyError, TypeError, AttributeError),
+        *(pa.ArrowException, CRSError, shapely.errors.ShapelyError),
+    ) as error:
+        message = f"{path} cannot be read ({str(error)[:200]}): {_MEND}"
+        raise StoreError(message) from error
+
+
+def differing_files(folder: Path) -> list[str]:
+    """Compare every file of a region with its manifest; a line for each that is missing, changed or unknown."""
+    manifest = read_manifest(folder)
+    found = []
+    for name, record in manifest.files.items():
+        path = folder / name
+        if not path.is_file():
+            found.append(f"{name}: missing")
+        elif path.stat().st_size != record.bytes:
+            found.append(f"{name}: {path.stat().st_size} bytes, the manifest says {record.bytes}")
+        elif sha256_of(path) != record.sha256:
+            found.append(f"{name}: SHA-256 is {sha256_of(path)}, the manifest says {record.sha256}")
+    known = {MANIFEST, *manifest.files}
+    found += [f"{path.name}: not in the manifest" for path in sorted(folder.iterdir()) if path.name not in known]
+    return found

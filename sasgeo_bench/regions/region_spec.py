@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RegionFile: what a researcher writes down of a place in `regions/*.toml`."""
+
+import datetime as dt
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+import pyproj
+from pydantic import Field, StringConstraints, field_validator, model_validator
+
+from sasgeo_bench.config import Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.errors import ConfigError, GridError
+from sasgeo_bench.geometry.grid import Grid, utm_epsg
+from sasgeo_bench.osm.locate import Extract
+
+MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
+MAX_AREA_KM2: Final = 100_000.0
+MAX_CELLS: Final = 4e9
+_EDGE_POINTS: Final = 21
+
+Scene = Literal["urban", "suburban", "industrial", "riverside", "agricultural", "alpine", "coastal", "forest"]
+Corner = Annotated[tuple[float, float], Field(strict=False)]
+Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
+
+
+class RegionFile(NamedDocument):
+    """One region as written down: identity, place, cell size and dated extracts.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.config import parse_toml
+    >>> text = '''
+    ... id = "mine"
+    ... title = "My place"
+    ... scenes = ["urban"]
+    ... center_lonlat = [9.0, 47.0]
+    ... size_m = [512, 512]
+    ... cell_size_m = 2.0
+    ... [[extract]]
+    ... file = "mine.osm.pbf"
+    ... date = 2024-01-01
+    ... sha256 = ["0000000000000000000000000000000000000000000000000000000000000000"]
+    ... '''
+    >>> parse_toml(text, RegionFile, source="mine.toml").grid().shape
+    (256, 256)
+    """
+
+    id: Identifier
+    title: Line
+    scenes: Annotated[list[Scene], Field(min_length=1)]
+    center_lonlat: tuple[float, float] | None = Field(default=None, strict=False)
+    size_m: tuple[float, float] | None = Field(default=None, strict=False)
+    bounds_lonlat: tuple[float, float, float, float] | None = Field(default=None, strict=False)
+    cell_size_m: float
+    epsg: int | None = None
+    coverage_lonlat: list[Corner] | None = None
+    extract: Annotated[list[Extract], Field(min_length=1)]
+
+    @field_validator("cell_size_m")
+    @classmethod
+    def _cell_size_is_sane(cls, cell_size_m: float) -> float:
+        low, high = 0.1, 100.0
+        if not (math.isfinite(cell_size_m) and low <= cell_size_m <= high):
+            message = f"cell_size_m must lie between {low} and {high} metres, got {cell_size_m!r}"
+            raise ValueError(message)
+        return cell_size_m
+
+    @field_validator("epsg")
+    @classmethod
+    def _epsg_is_metric(cls, epsg: int | None) -> int | None:
+        if epsg is None:
+            return None
+        try:
+            crs = pyproj.CRS.from_epsg(epsg)
+        except pyproj.exceptions.CRSError as error:
+            message = f"epsg {epsg!r} is unknown: leave it out for the UTM zone of the centre"
+            raise ValueError(message) from error
+        if not crs.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
+            message = f"epsg {epsg!r} ({crs.name}) is not a projected CRS in metres: leave it out for the UTM zone"
+            raise ValueError(message)
+        return epsg
+
+    @field_validator("coverage_lonlat")
+    @classmethod
+    def _coverage_is_a_ring(cls, ring: list[Corner] | None) -> list[Corner] | None:
+        least = 3
+        if ring is not None and len(set(ring)) < least:
+            message = f"coverage_lonlat needs at least {least} different corners [lon, lat], got {len(set(ring))}"
+            raise ValueError(message)
+        return ring
+
+    @model_validator(mode="after")
+    def _is_placed_once(self) -> Self:
+        has_box = self.bounds_lonlat is not None
+        has_centre = self.center_lonlat is not None and self.size_m is not None
+        has_half = (self.center_lonlat is None) != (self.size_m is None)
+        if has_box == has_centre or has_half or (has_box and self.size_m is not None):
+            message = "say where the region lies either by center_lonlat and size_m, or by bounds_lonlat"
+            raise ValueError(message)
+        _check_lonlat(self.lonlat_box())
+        if self.size_m is not None and not all(math.isfinite(side) and side > 0 for side in self.size_m):
+            message = f"size_m must be two positive lengths, got {list(self.size_m)!r}"
+            raise ValueError(message)
+        _check_size(*self._size_estimate_m(), self.cell_size_m)
+        return self
+
+    @model_validator(mode="after")
+    def _dates_differ(self) -> Self:
+        dates = [item.date for item in self.extract]
+        twice = sorted({date.isoformat() for date in dates if dates.count(date) > 1})
+        if twice:
+            message = f"two extracts have the date {twice[0]}: keep one of them"
+            raise ValueError(message)
+        return self
+
+    def lonlat_box(self) -> tuple[float, float, float, float]:
+        """West, south, east, north as written, degrees; of a centre, that point twice."""
+        if self.bounds_lonlat is not None:
+            return self.bounds_lonlat
+        longitude_deg, latitude_deg = self.center_lonlat or (math.nan, math.nan)
+        return (longitude_deg, latitude_deg, longitude_deg, latitude_deg)
+
+    def _size_estimate_m(self) -> tuple[float, float]:
+        """Width and height, near enough to refuse what is far too large before anything is projected."""
+        if self.size_m is not None:
+            return self.size_m
+        west, south, east, north = self.lonlat_box()
+        metres_per_degree = 111_320.0
+        width = (east - west) * metres_per_degree * math.cos(math.radians((south + north) / 2))
+        return (width, (north - south) * metres_per_degree)
+
+    def grid(self) -> Grid:
+        """The region's lattice: edges on whole multiples of the cell size, so regions of one zone share their lines.
+
+        Raises
+        ------
+        ConfigError
+            If the place cannot be projected into the CRS.
+        """
+        west, south, east, north = self.lonlat_box()
+        epsg = self.epsg or utm_epsg((west + east) / 2, (south + north) / 2)
+        to_grid = pyproj.Transformer.from_crs(4326, epsg, always_xy=True)
+        try:
+            if self.size_m is not None:
+                easting_m, northing_m = to_grid.transform(west, south, errcheck=True)
+                return Grid.around(easting_m, northing_m, size_m=self.size_m, cell_size_m=self.cell_size_m, epsg=epsg)
+            bounds_m = to_grid.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS, errcheck=True)
+            return Grid.from_bounds(*bounds_m, cell_size_m=self.cell_size_m, epsg=epsg)
+        except (pyproj.exceptions.ProjError, GridError) as error:
+            message = (
+                f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or mend the place"
+            )
+            raise ConfigError(message) from error
+
+    def pick(self, date: dt.date | None) -> Extract:
+        """Return the extract of a date, or the newest.
+
+        Raises
+        ------
+        ConfigError
+            If there is no extract of that date; the line lists those there are.
+        """
+        newest = max(self.extract, key=lambda item: item.date)
+        if date is None:
+            return newest
+        found = next((item for item in self.extract if item.date == date), None)
+        if found is None:
+            known = ", ".join(sorted(item.date.isoformat() for item in self.extract))
+            message = f"{self.id} has no extract of {date.isoformat()}; there are {known}"
+            raise ConfigError(message)
+        return found
+
+
+def _check_lonlat(box: tuple[float, float, float, float]) -> None:
+    west, south, east, north = box
+    written = list(box)
+    if not all(math.isfinite(value) for value in box) or max(abs(west), abs(east)) > 180:  # noqa: PLR2004 - degrees
+        message = f"longitudes lie within -180..180 and latitudes within -90..90, got {written!r}"
+        raise ValueError(message)
+    if max(abs(south), abs(north)) > MAX_LATITUDE_DEG:
+        message = (
+            f"UTM ends at {MAX_LATITUDE_DEG:g} degrees of latitude, got {written!r}: choose a place nearer the equator"
+        )
+        raise ValueError(message)
+    if west > east:
+        message = (
+            f"bounds_lonlat is [west, south, east, north], got west {west} > east {east}: swap them; "
+            "a box over the antimeridian must be split in two"
+        )
+        raise ValueError(message)
+    if south > north:
+        message = f"bounds_lonlat is [west, south, east, north], got south {south} > north {north}: swap them"
+        raise ValueError(message)
+
+
+def _check_size(width_m: float, height_m: float, cell_size_m: float) -> None:
+    """Refuse before anything is allocated."""
+    if width_m <= 0 or height_m <= 0:
+        message = f"the region is {width_m:.0f} m by {height_m:.0f} m: give it a positive size"
+        raise ValueError(message)
+    area_km2, cells = width_m * height_m / 1e6, width_m * height_m / cell_size_m**2
+    if area_km2 > MAX_AREA_KM2 or cells > MAX_CELLS:
+        message = (
+            f"the region has {area_km2:,.0f} km2 or {cells:,.0f} cells a class, {cells / 1e9:,.1f} GB each; "
+            f"the most is {MAX_AREA_KM2:,.0f} km2 and {MAX_CELLS:,.0f} cells: make it smaller or its cells larger"
+        )
+        raise ValueError(message)
+
+
+def read_region_file(path: Path) -> RegionFile:
+    """Read one region file.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read or a value in it is wrong; all faults on one line.
+    """
+    return read_document(path, RegionFile, "regions")
+
+
+def list_region_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
+    """Region id -> file, of the given folders and those shipped.
+
+    Raises
+    ------
+    ConfigError
+        If a folder is missing, a file is wrong, or two files have one id.
+
+    Examples
+    --------
+    >>> "vaduz" in list_region_files()
+    True
+    """
+    return list_documents("regions", RegionFile, folders)
+
+
+def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
+    """Find a region file by its id, or take the path of one.
+
+    Raises
+    ------
+    ConfigError
+        If there is none; the line suggests the nearest id.
+
+    Examples
+    --------
+    >>> find_region_file("vadus")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list-regions shows all)
+    """
+    return find_document(id_or_path, "region", "list-regions shows all", lambda: list_region_files(folders=folders))

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Queries of some tasks -> rows in their run folders; a process answers all tasks that search its map."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import MatchError, StoreError
+from sasgeo_bench.matching.matcher import check_match, lacks
+from sasgeo_bench.matching.plugins import ORACLE
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.regions.region_files import check_files, read_manifest
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.oracle import Oracle
+from sasgeo_bench.running.plan import RunPart, RunPlan, by_map, reach_of
+from sasgeo_bench.running.replies import Reply
+from sasgeo_bench.running.sandbox import PROMISES, joined
+from sasgeo_bench.running.schedule import Schedule
+from sasgeo_bench.running.training import failed_by_us, guarded
+from sasgeo_bench.running.worker import Worker
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.task_rows import asked_under
+
+PART_ROWS: Final = 64
+PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
+
+
+Question = tuple["_Writer", Query, bytes]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cost:
+    """What some rows took.
+
+    Parameters
+    ----------
+    counts : dict of str to int
+        Rows by status.
+    prepare_s, index_bytes : float and int, optional
+        Of one map: seconds, and by how much the memory of the process grew; None where no map could be prepared.
+    cpu_s : float
+        Processor seconds inside of `match`, all queries together.
+    peak_bytes : int
+        Most memory that a matcher's process and all that came from it held at once, in whatever task of its map.
+    isolation : dict of str to str
+        How the matcher was shut in.
+    messages : dict of str to str
+        By status, what the first row without an answer said.
+    """
+
+    counts: dict[str, int] = field(default_factory=dict)
+    prepare_s: float | None = None
+    index_bytes: int | None = None
+    cpu_s: float = 0.0
+    peak_bytes: int = 0
+    isolation: dict[str, str] = field(default_factory=dict)
+    messages: dict[str, str] = field(default_factory=dict)
+
+
+def pool_costs(costs: Sequence[Cost]) -> Cost:
+    """Several costs as one: counts and processor seconds added, the largest of the others, every isolation there was.
+
+    Examples
+    --------
+    >>> pool_costs([Cost(counts={"ok": 2}, prepare_s=1.0), Cost(counts={"ok": 1}, prepare_s=3.0)]).counts
+    {'ok': 3}
+    """
+    counts: dict[str, int] = {}
+    messages: dict[str, str] = {}
+    for cost in costs:
+        messages = cost.messages | messages
+        for status, count in cost.counts.items():
+            counts[status] = counts.get(status, 0) + count
+    return Cost(
+        counts=counts,
+        prepare_s=max((cost.prepare_s for cost in costs if cost.prepare_s is not None), default=None),
+        index_bytes=max((cost.index_bytes for cost in costs if cost.index_bytes is not None), default=None),
+        cpu_s=sum(cost.cpu_s for cost in costs),
+        peak_bytes=max((cost.peak_bytes for cost in costs), default=0),
+        isolation=joined(cost.isolation for cost in costs),
+        messages=messages,
+    )
+
+
+class Watch:
+    """Whoever is told how tasks come along, by several threads at once; this one takes no note.
+
+    Examples
+    --------
+    >>> isinstance(Watch(), Watch)
+    True
+    """
+
+    def begin(self, part: RunPart) -> None:
+        """Take note that a task is begun."""
+
+    def advance(self, part: RunPart) -> None:
+        """Take note that one more query has a row."""
+
+    def end(self, part: RunPart, cost: Cost) -> None:
+        """Take note that all rows there will be are written, and what they took."""
+
+
+def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) -> Cost:
+    """Ask what is left of some tasks, by as many processes as are wanted, and write the rows.
+
+    Parameters
+    ----------
+    plan : RunPlan
+        From `plan_run`.
+    parts : sequence of RunPart
+        The tasks. Those that search one map share processes; no process has more than one map.
+    jobs : int
+        Processes at once.
+    watch : Watch
+        Is told of each task and each row.
+
+    Returns
+    -------
+    Cost
+        What it took.
+
+    Raises
+    ------
+    StoreError
+        If rows cannot be written; those that were stay.
+    """
+    groups = [[_Writer(part, watch=watch) for part in group] for group in by_map(plan.request.spec, parts)]
+    maps = [_Map(plan, group) for group in groups]
+    writers = [writer for group in groups for writer in group]
+    schedule = Schedule([(place.questions(), place.count) for place in maps])
+    threads = min(jobs, sum(place.count for place in maps))
+    with ExitStack() as ends:
+        for writer in writers:
+            ends.callback(writer.end)
+        with ThreadPoolExecutor(max_workers=threads + 1) as pool:
+            try:
+                writing = pool.submit(_write_in_time, writers, schedule)
+                for asking in as_completed([pool.submit(_ask_all, schedule, maps) for _ in range(threads)]):
+                    asking.result()
+            finally:
+                schedule.stop()  # before the pool waits for its threads: each ends with the query it is at
+            writing.result()
+    return pool_costs([writer.cost for writer in writers])
+
+
+def _ask_all(schedule: Schedule[Question], maps: Sequence["_Map"]) -> None:
+    """One thread: map after map, each by a process of its own."""
+    while (number := schedule.take()) is not None:
+        maps[number].ask(schedule, number)
+
+
+def _write_in_time(writers: Sequence["_Writer"], schedule: Schedule[Question]) -> None:
+    """Write rows every now and then; whoever cannot stops the run."""
+    try:
+        while not schedule.wait_for_stop(PART_S):
+            for writer in writers:
+                writer.flush()
+    finally:
+        schedule.stop()
+
+
+class _Map:
+    """A map and the tasks that search it."""
+
+    def __init__(self, plan: RunPlan, writers: Sequence["_Writer"]) -> None:
+        self.count = sum(len(writer.part.left) for writer in writers)
+        self._plan, self._writers = plan, writers
+
+    def questions(self) -> Iterator[Question]:
+        """Query after query, task after task, each with where its row goes; a row group in memory."""
+        for writer in self._writers:
+            writer.begin()
+            for query, blob, asked in task_files.read_some(writer.part.task, frozenset(writer.part.left)):
+                if writer.part.asked[query.query_id] != asked_under(asked, self._plan.key):
+                    message = f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
+                    raise StoreError(message)
+                yield writer, query, blob
+
+    def ask(self, schedule: Schedule[Question], number: int) -> None:
+        """One process: prepare with the first query, then answer one after the other."""
+        top_k, ready, is_warm = self._plan.request.top_k, self._unlearned(), False
+        with self._asked() as worker:
+            for writer, query, blob in schedule.items(number):
+                if ready is None:
+                    learned = self._plan.learned
+                    region, text = self._writers[0].part.region, None if learned is None else learned.text
+                    ready = guarded(self._plan, partial(worker.prepare, region, text))
+                    self._check_map(ready)
+                    if schedule.is_stopped:
+                        return
+                if self._unlearned() is None:
+                    writer.told_by(worker, ready)
+                reason = lacks(self._plan.card, query, is_taught=self._plan.lesson is not None)
+                if reason is not None:
+                    writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
+                    continue
+                reply = ready
+                if ready.status == "ok":
+                    ask = partial(worker.match, blob, top_k=top_k)
+                    if not is_warm:
+                        guarded(self._plan, ask)
+                        is_warm = True
+                    reply = guarded(self._plan, ask)
+                writer.add(self._row(query, reply), cpu_s=reply.cpu_s)
+
+    def _row(self, query: Query, reply: Reply) -> Prediction:
+        """A row out of a reply, checked once more on this side."""
+        try:
+            return _prediction(query, reply, self._plan.request.top_k)
+        except Exception as error:  # noqa: BLE001 - whatever is made of an answer costs its own row
+            failed = failed_by_us(self._plan, error)
+            return Prediction(query_id=query.query_id, status=failed.status, message=failed.message)
+
+    def _unlearned(self) -> Reply | None:
+        """What every query gets where nothing came of learning: no process is started for it."""
+        learned = self._plan.learned
+        if learned is None or learned.text is not None:
+            return None
+        return Reply(status=learned.status, message=learned.message)
+
+    def _check_map(self, ready: Reply) -> None:
+        """Refuse a map that another run has replaced since, or that is damaged: no failure of whoever prepared it."""
+        part = self._writers[0].part
+        if not task_files.is_of_map(part.about, read_manifest(part.region)):
+            message = f"{part.region} was built anew while it was searched: run again, answers are kept"
+            raise StoreError(message)
+        if ready.status != "ok":
+            check_files(part.region)
+
+    def _asked(self) -> Worker | Oracle:
+        """Whoever is asked: a plugin in a process of its own, or the one control that is given the truth."""
+        request, part = self._plan.request, self._writers[0].part
+        if request.spec == ORACLE:
+            return Oracle(part.truth)
+        return Worker(spec=request.spec, reach=reach_of(request, (part.region,)), limits=request.limits)
+
+
+def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
+    """A row out of a reply, held to the query."""
+    if reply.status != "ok":
+        return Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
+    if reply.match is None:
+        return Prediction(query_id=query.query_id, status="invalid", message="no answer in an answer")
+    try:
+        match = check_match(reply.match, query, top_k=top_k)
+    except MatchError as error:
+        return Prediction(query_id=query.query_id, status="invalid", message=one_line(str(error)))
+    return Prediction(
+        query_id=query.query_id,
+        candidates=tuple(zip(match.poses, match.scores, strict=True)),
+        confidence=match.confidence,
+        diagnostics=match.diagnostics,
+        latency_s=reply.seconds,
+        matcher_s=reply.own_s,
+    )
+
+
+class _Writer:
+    """Rows of one task: gathered, counted, and written a part at a time; and what they took."""
+
+    def __init__(self, part: RunPart, *, watch: Watch) -> None:
+        self.part = part
+        self._watch = watch
+        self._lock = threading.RLock()
+        self._rows: list[Prediction] = []
+        self._counts: dict[str, int] = {}
+        self._messages: dict[str, str] = {}
+        self._cpu_s = 0.0
+        self._askers: dict[int, tuple[Worker | Oracle, Reply]] = {}
+        self._is_open = False
+
+    def begin(self) -> None:
+        """Take rows from here on."""
+        self._watch.begin(self.part)
+        self._is_open = True
+
+    def told_by(self, worker: Worker | Oracle, ready: Reply) -> None:
+        """Take note of who answers, and of what came of the map there."""
+        with self._lock:
+            self._askers[id(worker)] = (worker, ready)
+
+    def add(self, prediction: Prediction, *, cpu_s: float = 0.0) -> None:
+        """Take a row; with the last one the task is at its end."""
+        with self._lock:
+            self._rows.append(prediction)
+            self._cpu_s += cpu_s
+            self._counts[prediction.status] = self._counts.get(prediction.status, 0) + 1
+            if prediction.message:
+                self._messages.setdefault(prediction.status, prediction.message)
+            if len(self._rows) >= PART_ROWS:
+                self.flush()
+            self._watch.advance(self.part)
+            if sum(self._counts.values()) == len(self.part.left):
+                self.end()
+
+    def flush(self) -> None:
+        """Write what there is."""
+        with self._lock:
+            if self._rows:
+                prediction_files.write_part(self.part.folder, self._rows, asked=self.part.asked)
+            self._rows = []
+
+    def end(self) -> None:
+        """Write what is left and say what it took; a second time, or where nothing was begun, nothing."""
+        with self._lock:
+            self.flush()
+            if self._is_open:
+                self._is_open = False
+                self._watch.end(self.part, self.cost)
+
+    @property
+    def cost(self) -> Cost:
+        """What the rows have taken so far, and the processes they come from."""
+        with self._lock:
+            own = Cost(counts=dict(self._counts), cpu_s=self._cpu_s, messages=dict(self._messages))
+            return pool_costs([own, *(_process_cost(*asker) for asker in self._askers.values())])
+
+
+def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
+    """What a process has told of its map and of itself."""
+    return Cost(
+        prepare_s=ready.own_s if ready.own_s is None or ready.seconds is None else min(ready.own_s, ready.seconds),
+        index_bytes=ready.grown_bytes,
+        peak_bytes=worker.peak_bytes,
+        isolation=dict.fromkeys(() if "truth" in worker.isolation else PROMISES, "trusted code, not shut in")
+        | worker.isolation,
+    )

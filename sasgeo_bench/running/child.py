@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process of one matcher, shut in already: the plugin is imported, and answers one query after the other."""
+
+import os
+import socket
+import sys
+from typing import Any
+
+from sasgeo_bench.running import wire
+
+
+def main() -> None:
+    """Serve the runner at the other end of the socket whose number is the only argument."""
+    channel = socket.socket(fileno=int(sys.argv[1]))
+    start, _ = wire.receive(channel)
+    os.chdir(start["scratch"])
+    sys.path[:] = dict.fromkeys((*start["paths"], *sys.path))
+    _serve(channel, start)
+
+
+def _serve(channel: socket.socket, start: dict[str, Any]) -> None:
+    """Load the plugin and answer; what is imported from here on comes from the runner's import path."""
+    from sasgeo_bench.running.serve import Server  # noqa: PLC0415
+
+    Server(channel, spec=start["spec"]).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The control that is given the truth: what nobody can beat. No plugin has this door."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
+from sasgeo_bench.matching.plugins import ORACLE
+from sasgeo_bench.running.replies import Reply
+from sasgeo_bench.tasks import task_files, task_rows
+from sasgeo_bench.tasks.query import Query, Truth
+
+CARD: Final = MatcherCard(
+    name=ORACLE,
+    version="1",
+    title="Control: the truth itself",
+    source="original",
+    ours="all of it",
+    licence="Apache-2.0",
+    tracks=("retrieval", "localization"),
+    limits="is no method: it reads the answers, so that whatever does not score it as perfect is at fault",
+)
+_ISOLATION: Final = {"truth": "given, as this control needs it"}
+
+
+class Oracle:
+    """Answers with the truth, and withholds where the place is absent; runs where a `Worker` would.
+
+    Parameters
+    ----------
+    truth_folder : Path
+        Truths of the task whose queries are asked.
+    """
+
+    def __init__(self, truth_folder: Path) -> None:
+        self.isolation = dict(_ISOLATION)
+        self.peak_bytes = 0
+        self._folder = truth_folder
+        self._truths: dict[str, Truth] = {}
+
+    def __enter__(self) -> Self:
+        """Nothing is started."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing is left."""
+
+    def prepare(self, region: Path, learned: str | None = None) -> Reply:
+        """Read the truths.
+
+        Raises
+        ------
+        StoreError
+            If they are not here.
+        """
+        del region, learned
+        if not (self._folder / task_files.TRUTH).is_file():
+            message = f"{self._folder} holds no truths, and {ORACLE} answers with them: run it where they are"
+            raise StoreError(message)
+        start = time.perf_counter()
+        self._truths = {truth.query_id: truth for truth in task_files.read_truths(self._folder)}
+        seconds = time.perf_counter() - start
+        return Reply(status="ok", seconds=seconds, own_s=seconds, grown_bytes=0)
+
+    def match(self, query: bytes, *, top_k: int) -> Reply:
+        """Answer one query."""
+        del top_k
+        start = time.perf_counter()
+        asked = task_rows.query_from(query)
+        truth = self._truths.get(asked.query_id)
+        if truth is None:
+            message = f"{self._folder} holds no truth of query {asked.query_id}: make the queries again"
+            raise StoreError(message)
+        found = right_answer(asked, truth)
+        return Reply(status="ok", seconds=time.perf_counter() - start, match=found)
+
+
+def right_answer(query: Query, truth: Truth) -> Match:
+    """The one answer that is right: the true pose, the right candidate with true heading and scale, or none."""
+    if not truth.is_present or truth.pose is None:
+        return WITHHELD
+    pose = truth.pose
+    if query.track == "retrieval":
+        right = query.candidates[truth.candidate]
+        pose = replace(pose, easting_m=right.easting_m, northing_m=right.northing_m)
+    return Match(poses=[pose], scores=[1.0], confidence=1.0)

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of `part-*.parquet`: their schema, predictions to and from it, and what is wrong with rows of others."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from sasgeo_bench.bounds import (
+    BOUNDS,
+    MOST_CANDIDATES,
+    MOST_DIAGNOSTICS,
+    MOST_MESSAGE,
+    MOST_NAME,
+    bounds_text,
+    is_line,
+)
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import STATUSES, Prediction
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, is_like, poses_of
+
+SCHEMA_VERSION: Final = 1
+_CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
+PREDICTION_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("candidates", pa.list_(_CANDIDATE)),
+        ("confidence", pa.float64()),
+        ("diagnostics", pa.map_(pa.string(), pa.float64())),
+        ("status", pa.string()),
+        ("message", pa.string()),
+        ("latency_s", pa.float64()),
+    ],
+    metadata={"schema_version": str(SCHEMA_VERSION), "attribution": ATTRIBUTION, "licence": LICENCE},
+)
+RUN_SCHEMA: Final = PREDICTION_SCHEMA.append(pa.field(ASKED, pa.string()))  # of a submission
+MATCHER_S: Final = "matcher_s"
+PART_SCHEMA: Final = RUN_SCHEMA.append(pa.field(MATCHER_S, pa.float64()))  # of a run's own parts
+
+
+def prediction_row(prediction: Prediction) -> dict[str, Any]:
+    """One prediction as a row of `PREDICTION_SCHEMA`."""
+    return {
+        "query_id": prediction.query_id,
+        "candidates": [
+            {
+                "easting_m": pose.easting_m,
+                "northing_m": pose.northing_m,
+                "yaw_deg": pose.yaw_deg,
+                "scale": pose.scale,
+                "score": score,
+            }
+            for pose, score in prediction.candidates
+        ],
+        "confidence": prediction.confidence,
+        "diagnostics": list(prediction.diagnostics.items()),
+        "status": prediction.status,
+        "message": prediction.message,
+        "latency_s": prediction.latency_s,
+        MATCHER_S: prediction.matcher_s,
+    }
+
+
+def prediction_of(row: Mapping[str, Any]) -> Prediction:
+    """Inverse of `prediction_row`; whatever else a candidate holds is passed over."""
+    poses = tuple(
+        (Pose(**{name: item[name] for name in POSE_FIELDS}), item["score"]) for item in row["candidates"] or ()
+    )
+    return _with_candidates(row, poses)
+
+
+def predictions_of(table: pa.Table) -> list[Prediction]:
+    """Predictions of a table in which `row_faults` finds nothing, last first; by columns, which is faster."""
+    column = table["candidates"].combine_chunks()
+    if not len(table):
+        return []
+    poses, scores, ends = poses_of(column), column.values.field("score").to_pylist(), column.offsets.to_pylist()
+    rows = table.drop_columns(["candidates"]).to_pylist()
+    return [
+        _with_candidates(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
+        for at in reversed(range(len(rows)))
+    ]
+
+
+def _with_candidates(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ...]) -> Prediction:
+    """Make a prediction of a row whose candidates were read by columns."""
+    return Prediction(
+        query_id=row["query_id"],
+        candidates=candidates,
+        confidence=row["confidence"],
+        diagnostics=dict(row["diagnostics"] or ()),
+        status=row["status"],
+        message=row["message"] or "",
+        latency_s=row["latency_s"],
+        matcher_s=row.get(MATCHER_S),
+    )
+
+
+def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
+    """Columns that a table of predictions must hold and this one does not: their names, what is found, and expected.
+
+    More columns, in any order, do no harm.
+
+    Examples
+    --------
+    >>> differing_columns(PREDICTION_SCHEMA.empty_table().drop_columns(["message"]))
+    [('message', 'nothing', 'string')]
+    """
+    found = {field.name: field.type for field in table.schema}
+    counts = {field: table.schema.names.count(field.name) for field in PREDICTION_SCHEMA}
+    twice = [(field.name, f"{count} columns", str(field.type)) for field, count in counts.items() if count > 1]
+    return twice or [
+        (field.name, str(found.get(field.name, "nothing")), str(field.type))
+        for field in PREDICTION_SCHEMA
+        if field.name not in found or not is_like(found[field.name], field.type)
+    ]
+
+
+# --- rows that anybody may have written -------------------------------------------------------------------------------
+
+Mask = NDArray[np.bool_]
+_PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowFault:
+    """What is wrong in one row: its number, the column, what stands there and what was expected."""
+
+    row: int
+    column: str
+    found: str
+    expected: str
+
+
+def row_faults(table: pa.Table) -> Iterator[RowFault]:
+    """Hold every number, name and text of some rows to the bounds of an answer (`bounds`).
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        With all columns of predictions (`differing_columns` finds nothing).
+
+    Yields
+    ------
+    RowFault
+        By column, then by row.
+
+    Examples
+    --------
+    >>> list(row_faults(PREDICTION_SCHEMA.empty_table()))
+    []
+    """
+    if not len(table):
+        return
+    yield from _of_texts(table)
+    for name in (name for name in ("confidence", "latency_s", MATCHER_S) if name in table.column_names):
+        values, is_null = _numbers(table[name]), np.asarray(table[name].is_null())
+        is_wrong = ~is_null & ~_is_within(name, values)
+        shown = [f"{name} is {value:g}" for value in values] if is_wrong.any() else []
+        yield from _faults(name, is_wrong, shown, f"{bounds_text(name)} or null")
+    yield from _of_candidates(table["candidates"])
+    yield from _of_diagnostics(table["diagnostics"])
+
+
+def _faults(column: str, is_wrong: Mask, shown: Sequence[object], expected: str) -> Iterator[RowFault]:
+    for row in np.flatnonzero(is_wrong).tolist():
+        yield RowFault(row=row, column=column, found=str(shown[row])[: 2 * MOST_NAME], expected=expected)
+
+
+def _numbers(column: pa.ChunkedArray | pa.Array) -> NDArray[np.float64]:
+    """Values of a column; NaN for null."""
+    return np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
+
+
+def _is_within(name: str, values: NDArray[np.float64]) -> Mask:
+    least, most = BOUNDS[name]
+    return np.asarray((values >= least) & (values <= most))
+
+
+def _of_texts(table: pa.Table) -> Iterator[RowFault]:
+    """Names and statuses that are there and known; messages that are lines."""
+    for name, is_sound, expected in (
+        ("query_id", bool, "the id of a query"),
+        ("status", STATUSES.__contains__, ", ".join(STATUSES)),
+        ("message", lambda text: is_line(text, MOST_MESSAGE), f"a line of at most {MOST_MESSAGE} printable characters"),
+    ):
+        texts, code = _texts(table[name])
+        is_odd = np.array([not is_sound(text) for text in texts] + [name != "message"])[code]  # the last is of nulls
+        shown = [repr([*texts, None][at]) for at in code] if is_odd.any() else []
+        yield from _faults(name, is_odd, shown, expected)
+
+
+def _texts(column: pa.ChunkedArray | pa.Array) -> tuple[list[str], NDArray[np.int64]]:
+    """Each text once, and which of them stands in each row; -1 for null."""
+    whole = column.cast(pa.string())
+    coded = (whole.combine_chunks() if isinstance(whole, pa.ChunkedArray) else whole).dictionary_encode()
+    return coded.dictionary.to_pylist(), coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+
+
+def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
+    """A list in every row, of at most so many, each with all its numbers."""
+    whole = column.combine_chunks()
+    is_null = np.asarray(whole.is_null())
+    yield from _faults("candidates", is_null, ["null"] * len(whole), "a list, empty where there is no pose")
+    if is_null.all():
+        return
+    rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
+    counts = np.bincount(rows, minlength=len(whole))
+    shown = [f"{number} poses" for number in counts.tolist()]
+    yield from _faults("candidates", counts > MOST_CANDIDATES, shown, f"at most {MOST_CANDIDATES}")
+    is_null = np.asarray(items.is_null())
+    yield from _firsts("candidates", rows[is_null], ["a null"] * len(rows), "poses with scores")
+    rows, items = rows[~is_null], items.filter(pa.array(~is_null))
+    for name in (*POSE_FIELDS, "score"):
+        values = _numbers(items.field(name))
+        is_wrong = ~_is_within(name, values)
+        shown = [f"{name} is {value:g}" for value in values[is_wrong]]
+        yield from _firsts("candidates", rows[is_wrong], shown, bounds_text(name))
+
+
+def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
+    """At most so many in a row, each name a line and there once, each number within its bounds."""
+    whole = column.cast(_PAIRS).combine_chunks()
+    rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
+    counts = np.bincount(rows, minlength=len(whole))
+    shown = [f"{number} numbers" for number in counts.tolist()]
+    yield from _faults("diagnostics", counts > MOST_DIAGNOSTICS, shown, f"at most {MOST_DIAGNOSTICS}")
+    names, code = _texts(items.field("key"))
+    is_odd = np.array([not name or not is_line(name, MOST_NAME) for name in names] + [True])[code]
+    shown = [f"the name {[*names, None][at]!r}" for at in code[is_odd]]
+    yield from _firsts("diagnostics", rows[is_odd], shown, f"names of 1..{MOST_NAME} printable characters")
+    place = rows * (len(names) + 1) + code
+    order = np.argsort(place, kind="stable")
+    again = order[1:][np.diff(place[order]) == 0]
+    yield from _firsts(
+        "diagnostics", rows[again], [f"{[*names, None][at]!r} twice" for at in code[again]], "each name once"
+    )
+    values = _numbers(items.field("value"))
+    is_wrong = ~_is_within("diagnostics", values)
+    pairs = zip(code[is_wrong], values[is_wrong], strict=True)
+    shown = [f"diagnostics[{[*names, None][at]!r}] is {value:g}" for at, value in pairs]
+    yield from _firsts("diagnostics", rows[is_wrong], shown, bounds_text("diagnostics"))
+
+
+def _firsts(column: str, rows: NDArray[np.int64], shown: Sequence[str], expected: str) -> Iterator[RowFault]:
+    """The first fault of each row among those of its items."""
+    for row, at in zip(*np.unique(rows, return_index=True), strict=True):
+        yield RowFault(row=int(row), column=column, found=shown[at][: 2 * MOST_NAME], expected=expected)

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers of a matcher's process, held to one schema before anything is made of them: the process is not trusted."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
+
+from sasgeo_bench.bounds import (
+    BOUNDS,
+    MOST_CANDIDATES,
+    MOST_DIAGNOSTICS,
+    MOST_MESSAGE,
+    MOST_NAME,
+    MOST_S,
+    is_line,
+    one_line,
+)
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import MOST_SAID, Match, MatcherCard, Need, check_learned
+from sasgeo_bench.matching.results import Status
+from sasgeo_bench.tasks.query import Track
+
+_MOST_BYTES: Final = 2**50  # of memory
+_MOST_PLACES: Final = 1000
+_SHOWN: Final = 60  # characters of where a fault is
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reply:
+    """What came of a question: a status, a line that says why, seconds by the runner's clock, the answer.
+
+    Of the process itself: seconds by its own clock, and of its processors. Of a plugin that was loaded: its card, a
+    hash of its code, and whether it has a `learn`; of a map: by how much memory grew; of a lesson: what was learnt.
+    """
+
+    status: Status
+    message: str = ""
+    seconds: float | None = None
+    own_s: float | None = None
+    cpu_s: float = 0.0
+    match: Match | None = None
+    card: MatcherCard | None = None
+    code: str = ""
+    learns: bool = False
+    grown_bytes: int | None = None
+    learned: str | None = None
+
+
+def _line(text: str) -> str:
+    if not is_line(text, MOST_SAID):
+        message = f"must be one line of at most {MOST_SAID} printable characters"
+        raise ValueError(message)
+    return text
+
+
+def _bounded(name: str) -> Any:  # noqa: ANN401 - what pydantic knows a number by
+    least, most = BOUNDS[name]
+    return Field(ge=least, le=most)
+
+
+Line = Annotated[str, AfterValidator(_line)]
+Metres = Annotated[float, _bounded("easting_m")]
+Candidate = Annotated[  # JSON has no tuples: a list of just as many is one
+    tuple[
+        Metres,
+        Metres,
+        Annotated[float, _bounded("yaw_deg")],
+        Annotated[float, _bounded("scale")],
+        Annotated[float, _bounded("score")],
+    ],
+    Strict(strict=False),
+]
+Diagnostic = Annotated[
+    tuple[Annotated[Line, Field(min_length=1, max_length=MOST_NAME)], Annotated[float, _bounded("diagnostics")]],
+    Strict(strict=False),
+]
+Seconds = Annotated[float, Field(ge=0, le=MOST_S)]
+
+
+def _once(pairs: list[tuple[str, float]]) -> list[tuple[str, float]]:
+    if len(dict(pairs)) != len(pairs):
+        message = "a name is there twice"
+        raise ValueError(message)
+    return pairs
+
+
+class _Strict(BaseModel):
+    """No silent conversion, nothing that is not known, no number that is none."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class _Failed(_Strict):
+    status: Literal["crash", "invalid", "refused"]
+    message: Annotated[Line, Field(max_length=MOST_MESSAGE)]
+
+
+class _Card(_Strict):
+    name: Line
+    version: Line
+    title: Line
+    source: Line
+    ours: Line
+    licence: Line
+    tracks: list[Track]
+    needs: list[Need]
+    limits: Line
+    trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
+
+
+class _Loaded(_Strict):
+    status: Literal["ok"]
+    card: _Card
+    code: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    learns: bool
+
+    def reply(self) -> Reply:
+        """As a runner takes it."""
+        said: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
+        return Reply(status="ok", card=MatcherCard(**said), code=self.code, learns=self.learns)
+
+
+class _Learnt(_Strict):
+    status: Literal["ok"]
+    seconds: Seconds
+    learned: str
+
+    def reply(self) -> Reply:
+        """As a runner takes it."""
+        return Reply(status="ok", own_s=self.seconds, learned=check_learned(self.learned))
+
+
+class _Prepared(_Strict):
+    status: Literal["ok"]
+    seconds: Seconds
+    grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)]
+
+    def reply(self) -> Reply:
+        """As a runner takes it."""
+        return Reply(status="ok", own_s=self.seconds, grown_bytes=self.grown_bytes)
+
+
+class _Row(_Strict):
+    candidates: Annotated[list[Candidate], Field(max_length=MOST_CANDIDATES)]
+    confidence: Annotated[float, _bounded("confidence")] | None
+    diagnostics: Annotated[list[Diagnostic], Field(max_length=MOST_DIAGNOSTICS), AfterValidator(_once)]
+
+
+class _Matched(_Strict):
+    status: Literal["ok"]
+    seconds: Seconds
+    cpu_s: Annotated[float, Field(ge=0)]
+    match: _Row
+
+    def reply(self) -> Reply:
+        """As a runner takes it."""
+        row = self.match
+        match = Match(
+            poses=[Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in row.candidates],
+            scores=[candidate[-1] for candidate in row.candidates],
+            confidence=row.confidence,
+            diagnostics=dict(row.diagnostics),
+        )
+        return Reply(status="ok", own_s=self.seconds, cpu_s=self.cpu_s, match=match)
+
+
+_KINDS: Final[Mapping[str, type[_Loaded | _Learnt | _Prepared | _Matched]]] = {
+    "load": _Loaded,
+    "learn": _Learnt,
+    "prepare": _Prepared,
+    "match": _Matched,
+}
+
+
+def read_reply(kind: str, said: Mapping[str, Any], *, nonce: str) -> Reply:
+    """What a message says, as the reply to a question.
+
+    Parameters
+    ----------
+    kind : {"load", "learn", "prepare", "match"}
+        Of the question.
+    said : mapping
+        The message, out of JSON.
+    nonce : str
+        Of the question: only an answer that was made after it can have it.
+
+    Raises
+    ------
+    MatchError
+        If it is no answer to the question; in one line.
+
+    Examples
+    --------
+    >>> said = {"nonce": "7", "status": "crash", "message": "ValueError: no index today"}
+    >>> read_reply("match", said, nonce="7").message
+    'ValueError: no index today'
+    >>> read_reply("match", said, nonce="8")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: it was not made for this question
+    """
+    content = dict(said)
+    if content.pop("nonce", None) != nonce:
+        message = "it was not made for this question"
+        raise MatchError(message)
+    try:
+        if content.get("status") != "ok":
+            failed = _Failed.model_validate(content)
+            return Reply(status=failed.status, message=failed.message)
+        return _KINDS[kind].model_validate(content).reply()
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        where = ".".join(map(str, first["loc"]))[:_SHOWN]
+        message = one_line(f"{where}: {first['msg']}" if where else first["msg"])
+        raise MatchError(message) from error

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A matcher over tasks: whatever happens, a row for every query, and a run that goes on where it was cut off."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import StoreError, counted
+from sasgeo_bench.files.folders import locked
+from sasgeo_bench.progress import Lines, Progress, Tell
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.running.answers import Cost, Watch, answer, pool_costs
+from sasgeo_bench.running.cluster import answer_on, connected
+from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map
+from sasgeo_bench.running.training import taught
+from sasgeo_bench.tasks import task_files
+
+MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
+_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earlier runs took, as run.json says it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunReport:
+    """How many rows of which status a run has added, and what the first of each without an answer said."""
+
+    counts: dict[str, int]
+    messages: dict[str, str]
+    folders: tuple[Path, ...]
+
+
+def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunReport:
+    """Ask everything that is left.
+
+    Parameters
+    ----------
+    plan : RunPlan
+        From `plan_run`.
+    tell : callable
+        Gets a line now and then.
+    progress : Progress, optional
+        Is told of every row; lines by `tell` unless given.
+
+    Returns
+    -------
+    RunReport
+        What was added.
+
+    Raises
+    ------
+    StoreError
+        If rows cannot be written; those that were stay, and a second run goes on there.
+    ConfigError
+        If a cluster was named that is not there.
+    """
+    progress = progress or Lines(tell)
+    for line in plan.lesson_lines() if plan.lesson is None else ():
+        tell(f"{plan.card.name}: {line}")
+    plan = taught(plan, tell=tell)
+    _tell_state(plan, tell)
+    for part in plan.parts:
+        if not part.left and part.done and prediction_files.read_key(part.folder) != plan.key:
+            with locked(part.folder, tell=tell):
+                _begin(plan, part)  # answers under what was learnt before count again: `run.json` says which
+    parts = [part for part in plan.parts if part.left]
+    if parts:
+        progress.begin(plan.card.name, sum(len(part.left) for part in parts))
+    costs: list[Cost] = []
+    if plan.request.dask is not None and parts:
+        costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
+    else:
+        costs += _run_here(plan, parts, tell, progress)
+    pooled = pool_costs(costs)
+    folders = tuple(part.folder for part in plan.parts)
+    return RunReport(counts=pooled.counts, messages=pooled.messages, folders=folders)
+
+
+def _tell_state(plan: RunPlan, tell: Tell) -> None:
+    """Say what is done already: of a few tasks which, of many how many; and what of the rows is not asked for."""
+    whole = [part for part in plan.parts if not part.left]
+    if len(whole) > MOST_LINES:
+        tell(f"{plan.card.name}: nothing left in {len(whole)} of {len(plan.parts)} tasks")
+    else:
+        for part in whole:
+            tell(f"{part.folder}: nothing left, {part.done} done")
+    aside = sum(part.aside for part in plan.parts)
+    if aside:
+        others = "" if plan.lesson is None else ", or of other learning"
+        said = f"{counted(aside, 'answer')} to queries that these tasks do not hold now{others}, set aside"
+        tell(f"{plan.card.name}: {said}")
+
+
+def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
+    """Ask the queries of all tasks on this machine."""
+    costs = []
+    for batch in _batches(by_map(plan.request.spec, parts)):
+        with ExitStack() as locks:
+            _lock(locks, batch, tell)
+            left = _still_left(plan, batch)
+            if left:
+                costs.append(answer(plan, left, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
+    return costs
+
+
+def _batches(groups: Sequence[Sequence[RunPart]]) -> Iterator[list[RunPart]]:
+    """Tasks that are locked together: those of some maps, never of half a one."""
+    batch: list[RunPart] = []
+    for group in groups:
+        if batch and len(batch) + len(group) > MOST_LOCKED:
+            yield batch
+            batch = []
+        batch += group
+    if batch:
+        yield batch
+
+
+def _lock(locks: ExitStack, parts: Sequence[RunPart], tell: Tell) -> None:
+    """Hold the folders of some tasks; all runs lock them in one order, so that no two wait for each other."""
+    for folder in sorted({part.folder for part in parts}):
+        locks.enter_context(locked(folder, tell=tell))
+
+
+def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
+    """What nobody has answered while the locks were waited for; tasks of which nothing is left are gone."""
+    found = []
+    for part in parts:
+        done = prediction_files.ids_done(part.folder, part.asked, again=plan.request.again)
+        left = tuple(name for name in part.left if name not in done)
+        if left:
+            found.append(replace(part, left=left))
+    return found
+
+
+class _Notes(Watch):
+    """Keeps `run.json` of each task, and tells of each row; progress is told by one thread at a time."""
+
+    def __init__(self, plan: RunPlan, progress: Progress) -> None:
+        self._plan, self._progress = plan, progress
+        self._lock = threading.Lock()
+        self._before: dict[Path, Cost] = {}
+
+    def begin(self, part: RunPart) -> None:
+        """Say that a task begins."""
+        with self._lock:
+            self._before[part.folder] = _begin(self._plan, part)
+
+    def advance(self, part: RunPart) -> None:
+        """Tell of a row."""
+        del part  # progress is told of the whole matcher: a task may be too short for a pace
+        with self._lock:
+            self._progress.advance(self._plan.card.name, 1)
+
+    def end(self, part: RunPart, cost: Cost) -> None:
+        """Write what it took."""
+        _say(self._plan, part, cost, self._before[part.folder])
+
+
+def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
+    """Ask the queries of all tasks on a cluster at once."""
+    costs: list[list[Cost]] = []
+    with ExitStack() as locks:
+        client = locks.enter_context(connected(address))
+        _lock(locks, parts, tell)
+        parts = _still_left(plan, parts)
+        costs, left = [[] for _ in parts], [len(part.left) for part in parts]
+        before = [_begin(plan, part) for part in parts]
+        for number, count, cost in answer_on(client, plan, parts):
+            costs[number].append(cost)
+            left[number] -= count
+            progress.advance(plan.card.name, count)
+            if not left[number]:
+                _say(plan, parts[number], pool_costs(costs[number]), before[number])
+    return [pool_costs(items) for items in costs]
+
+
+def _begin(plan: RunPlan, part: RunPart) -> Cost:
+    """Say that a task begins; what earlier runs of it took."""
+    said = prediction_files.read_run(part.folder) or {}
+    wrong = next((name for name in _COSTS if not isinstance(said.get(name), int | float | None)), None)
+    if wrong is not None:
+        path = part.folder / prediction_files.RUN
+        message = f"{path} is damaged ({wrong} is no number): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
+    before = Cost(
+        prepare_s=said.get("prepare_s"),
+        index_bytes=said.get("index_bytes"),
+        cpu_s=said.get("cpu_s", 0.0),
+        peak_bytes=said.get("peak_bytes", 0),
+        isolation=said.get("isolation", {}),
+    )
+    _say(plan, part, before, Cost())
+    return before
+
+
+def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
+    """Write `run.json`: what the run is, and what it and the runs before it have taken."""
+    about = part.about
+    told: dict[str, Any] = asdict(pool_costs([before, cost]))
+    del told["counts"], told["messages"]
+    prediction_files.write_run(
+        part.folder,
+        {
+            "schema_version": prediction_rows.SCHEMA_VERSION,
+            "matcher": asdict(plan.card),
+            "spec": plan.request.spec,
+            "hash": plan.hash,
+            "suite": about["suite"],
+            "region": about["region"],
+            "task_version": about["task_version"],
+            "queries_sha256": about["files"][task_files.QUERIES]["sha256"],
+            "map_fingerprint": about["map_fingerprint"],
+            "top_k": plan.request.top_k,
+            "limits": asdict(plan.request.limits),
+            "warm_up": "one query of each process is asked twice and timed the second time",
+            "learned": None if plan.said is None else asdict(plan.said),
+            "map_bytes": sum(path.stat().st_size for path in part.region.iterdir() if path.is_file()),
+            **told,
+            "licence": LICENCE,
+            "attribution": ATTRIBUTION,
+        },
+    )

@@ -1,0 +1,389 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shut a matcher's process in: namespaces, Landlock and seccomp where the system has them; what it lacks is said.
+
+Only the standard library, and no thread, may be loaded before `enter`: a namespace of users cannot be entered with more
+than one thread. Whoever enters then starts a program anew, for the old one still holds files of the system's root.
+"""
+
+import os
+import resource
+import signal
+import struct
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from types import FrameType
+from typing import Final, NoReturn
+
+from sasgeo_bench.running import kernel, landlock, seccomp
+from sasgeo_bench.running.landlock import READ_RIGHTS, WRITE_RIGHT, around, landlock_version, outermost, restrict
+from sasgeo_bench.running.root import DEVICES, SHARED_MEMORY, SYSTEM, enter_root, has_own_proc
+
+CLONE_NEWNS: Final = 0x00020000
+CLONE_NEWIPC: Final = 0x08000000
+CLONE_NEWUSER: Final = 0x10000000
+CLONE_NEWPID: Final = 0x20000000
+CLONE_NEWNET: Final = 0x40000000
+MS_REC_PRIVATE: Final = 0x4000 | 0x40000
+_BY_SIGNAL: Final = 128  # an exit status beyond this says which signal, as shells have it
+_NO_TRUTH: Final = "not in its root"
+_REFUSED: Final = "refused by Landlock"
+_AND: Final = " | "  # between ways in which processes of one run were shut in
+_CAPABILITIES: Final = 0x20080522  # version of the structures that say which powers a process has
+
+# What Python, psutil and libraries of linear algebra read of a /proc that shows other processes, too.
+OWN_PROC: Final = (
+    *("/proc/self", "/proc/sys", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/filesystems"),
+    *("/proc/version", "/proc/uptime", "/proc/loadavg"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Policy:
+    """What a process may do.
+
+    Parameters
+    ----------
+    readable : sequence of str
+        Folders and files besides the system's that it may read.
+    scratch : str
+        An empty folder, resolved, the only one it may write.
+    hidden : sequence of str
+        Folders and files it must not see, wherever they lie.
+    memory_bytes, file_bytes, scratch_bytes : int
+        Address space of each of its processes, the largest file it may write, and all files together.
+    unsearched : str
+        Where nobody looked for what is to be hidden, in words.
+    """
+
+    readable: Sequence[str]
+    scratch: str
+    hidden: Sequence[str]
+    memory_bytes: int
+    file_bytes: int
+    scratch_bytes: int
+    unsearched: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Isolation:
+    """What was done, a promise each, in words for people; what the system offers no way for is said too."""
+
+    files_read: str
+    files_changed: str
+    truth: str
+    network: str
+    processes: str
+    scratch: str
+
+    def to_dict(self) -> dict[str, str]:
+        """For `run.json`."""
+        return asdict(self)
+
+
+PROMISES: Final = (*Isolation.__dataclass_fields__, "memory")  # the last one is kept from outside
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Walls:
+    """Which walls stand around a process: flags of namespaces, version of Landlock, the others yes or no."""
+
+    spaces: int
+    has_root: bool
+    has_proc: bool
+    landlock: int
+    has_filter: bool
+
+
+def enter(policy: Policy) -> Isolation:
+    """Shut the process in; it returns in a child, in a process namespace of its own where that is possible.
+
+    Parameters
+    ----------
+    policy : Policy
+        What may be reached.
+
+    Returns
+    -------
+    Isolation
+        What the system offered.
+    """
+    if os.path.realpath(policy.scratch) != policy.scratch:  # mounts are known by their resolved paths
+        message = f"{policy.scratch} leads elsewhere, expected a resolved folder"
+        raise OSError(message)
+    hidden = outermost(policy.hidden)
+    spaces = _enter_namespaces()
+    is_apart = bool(spaces & CLONE_NEWPID)
+    _fork(_Keeper(is_apart=is_apart, can_die=True))
+    has_root = bool(spaces & CLONE_NEWNS) and enter_root(
+        policy.scratch, shown=policy.readable, hidden=hidden, scratch_bytes=policy.scratch_bytes
+    )
+    has_proc = is_apart and has_root and has_own_proc()
+    if is_apart:  # not as the first in it: what that one sends to itself does not reach it, and orphans are its own
+        _fork(_Keeper(is_apart=True, can_die=False))
+    if has_root:  # what came along from the system's root could be changed through its descriptor
+        nothing = os.open("/dev/null", os.O_RDONLY)
+        os.dup2(nothing, 0)
+        os.close(nothing)
+    _limit(policy)
+    version = landlock_version()
+    if version > 0:
+        unseen = hidden if has_proc else [*hidden, "/proc"]
+        rules = [rule for item in (*SYSTEM, *policy.readable) for rule in around(item, unseen)]
+        rules += [] if has_proc else [(path, READ_RIGHTS) for path in OWN_PROC]
+        rules += [(path, READ_RIGHTS | WRITE_RIGHT) for path in DEVICES]
+        restrict(rules, [policy.scratch, *([SHARED_MEMORY] if has_root else [])], version)
+    _drop_powers()
+    walls = _Walls(
+        spaces=spaces,
+        has_root=has_root,
+        has_proc=has_proc,
+        landlock=version,
+        has_filter=seccomp.refuse(metadata=not has_root),
+    )
+    return _said(walls, policy)
+
+
+def _said(walls: _Walls, policy: Policy) -> Isolation:
+    return Isolation(
+        files_read=_joined(
+            "a root of its own with what is needed" if walls.has_root else "",
+            f"only what is needed (Landlock {walls.landlock})" if walls.landlock > 0 else "",
+            otherwise="not limited",
+        ),
+        files_changed=_changed_words(walls),
+        truth=_truth_words(walls, policy.unsearched),
+        network=_network_words(walls),
+        processes=_process_words(walls),
+        scratch=f"{policy.scratch_bytes / 1e6:.0f} MB in memory at most"
+        if walls.has_root
+        else f"files of {policy.file_bytes / 1e6:.0f} MB at most, as many as the disc holds",
+    )
+
+
+def _joined(*ways: str, otherwise: str) -> str:
+    return ", ".join(filter(None, ways)) or otherwise
+
+
+def _changed_words(walls: _Walls) -> str:
+    if walls.has_root:
+        return "only its scratch folder, all else is mounted read only"
+    if walls.landlock == 0:
+        no_metadata = "not limited, but no modes, owners, times and attributes (seccomp)"
+        return no_metadata if walls.has_filter else "not limited"
+    kept = f"only its scratch folder (Landlock {walls.landlock})"
+    emptied = "" if walls.landlock >= landlock.TRUNCATE_SINCE else "; others can be emptied"
+    metadata = "can be changed everywhere" if not walls.has_filter else "cannot be changed anywhere (seccomp)"
+    return f"{kept}{emptied}; modes, owners, times and attributes {metadata}"
+
+
+def joined(said: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Isolation of several processes as one: each way in which one of them was shut in, once.
+
+    Examples
+    --------
+    >>> joined([{"truth": "not in its root"}, {"truth": "not protected"}, {"truth": "not protected"}])
+    {'truth': 'not in its root | not protected'}
+    """
+    words: dict[str, list[str]] = {}
+    for one in said:
+        for name, text in one.items():
+            words.setdefault(name, []).extend(text.split(_AND))
+    return {name: _AND.join(dict.fromkeys(texts)) for name, texts in words.items()}
+
+
+def keeps_truth(isolation: Mapping[str, str]) -> bool:
+    """Whether truths were kept from all processes of a run, as far as it says.
+
+    Examples
+    --------
+    >>> [keeps_truth({"truth": words}) for words in ("not in its root, refused by Landlock", "not protected")]
+    [True, False]
+    """
+    return all(part.startswith((_NO_TRUTH, _REFUSED)) for part in isolation.get("truth", "").split(_AND))
+
+
+def _truth_words(walls: _Walls, unsearched: str) -> str:
+    ways = _joined(
+        _NO_TRUTH if walls.has_root else "",
+        _REFUSED if walls.landlock > 0 else "",
+        otherwise="",
+    )
+    return "; ".join(filter(None, (ways, unsearched))) if ways else "not protected"
+
+
+def _network_words(walls: _Walls) -> str:
+    """Say what of the network is cut, local sockets among it."""
+    if walls.has_filter:
+        return "none, no socket can be made (seccomp)" + (
+            ", a namespace of its own" if walls.spaces & CLONE_NEWNET else ""
+        )
+    if walls.spaces & CLONE_NEWNET:
+        where = "in folders that it may read" if walls.has_root else "anywhere"
+        return f"no way out (a namespace of its own); local sockets with a path {where} can be reached"
+    if walls.landlock >= landlock.NET_SINCE:
+        return "no TCP (Landlock); all else can be reached, local sockets too"
+    return "not cut"
+
+
+def _process_words(walls: _Walls) -> str:
+    apart = "not apart, all end together while the one that keeps them lives"
+    if walls.spaces & CLONE_NEWPID:
+        apart = "a namespace of their own, all end together"
+    elif walls.landlock >= landlock.SCOPE_SINCE:
+        apart = "not apart, others cannot be signalled (Landlock), all end together"
+    if walls.has_proc:
+        return f"{apart}; /proc shows no others"
+    is_refused = walls.landlock > 0
+    return f"{apart}; /proc of others {'is refused by Landlock' if is_refused else 'can be read, command lines too'}"
+
+
+def _enter_namespaces() -> int:
+    """Enter as many new namespaces as the system allows; the flags of those entered."""
+    if sys.platform != "linux":
+        return 0
+    user, group = os.getuid(), os.getgid()
+    wanted = CLONE_NEWNS | CLONE_NEWNET | CLONE_NEWIPC | CLONE_NEWPID
+    if kernel.libc().unshare(CLONE_NEWUSER | wanted) != 0:
+        return 0
+    for name, text in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
+        if not _write(f"/proc/self/{name}", text):
+            break
+    try:
+        kernel.mount("none", "/", None, MS_REC_PRIVATE)
+    except OSError:
+        return wanted & ~CLONE_NEWNS
+    return wanted
+
+
+def _write(path: str, text: str) -> bool:
+    try:
+        descriptor = os.open(path, os.O_WRONLY)
+    except OSError:
+        return False
+    try:
+        os.write(descriptor, text.encode())
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def _drop_powers() -> None:
+    """Give back what root or a namespace of users brought: whoever may mount could take covers off again."""
+    if not kernel.prctl(kernel.PR_SET_NO_NEW_PRIVS, 1):
+        return  # no Linux
+    header, none = struct.pack("Ii", _CAPABILITIES, 0), bytes(24)
+    if kernel.libc().capset(header, none) != 0:
+        raise kernel.last_error()
+
+
+def _fork(keeper: "_Keeper") -> None:
+    """Go on in a child; this process keeps it, and ends as it does."""
+    keeper.prepare()
+    parent = os.getpid()
+    child = os.fork()
+    if child:
+        keeper.keep(child)
+    kernel.prctl(kernel.PR_SET_CHILD_SUBREAPER, 0)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() not in {parent, 0}:  # it ended before we asked to end with it; 0 is a parent out of our namespace
+        os._exit(1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Keeper:
+    """A process that waits for its child, buries orphans meanwhile, and leaves nothing behind when either ends.
+
+    `is_apart` says that the child has a process namespace: then all in it end with its first process. Otherwise whoever
+    leaves its parents becomes a child of the keeper.
+    """
+
+    is_apart: bool
+    can_die: bool
+
+    def prepare(self) -> None:
+        """Have orphans come here, and end the child before the keeper itself is ended."""
+        if not self.is_apart:
+            kernel.prctl(kernel.PR_SET_CHILD_SUBREAPER, 1)
+
+    def keep(self, child: int) -> NoReturn:
+        """Wait for a child and end as it did; by its signal, or by its signal's number and 128."""
+
+        def end(number: int, frame: FrameType | None) -> NoReturn:
+            """Kill first, then end as a shell says it."""
+            del frame
+            self._kill(child)
+            os._exit(_BY_SIGNAL + number)
+
+        if self.can_die:
+            signal.signal(signal.SIGTERM, end)
+            kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGTERM)
+        kernel.prctl(kernel.PR_SET_DUMPABLE, 0)  # nobody looks into it: it still has the system's root
+        _drop_powers()
+        status = None
+        while status is None:
+            found, said = os.wait()
+            status = said if found == child else None
+        code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else _BY_SIGNAL + os.WTERMSIG(status)
+        self._kill(0)
+        if self.can_die and code > _BY_SIGNAL:
+            number = code - _BY_SIGNAL
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            if number not in {signal.SIGKILL, signal.SIGSTOP}:
+                signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        os._exit(code)
+
+    def _kill(self, child: int) -> None:
+        """Kill a child, if there is one, and in no namespace all that came from it; wait until they are gone."""
+        while True:
+            for number in [child] if self.is_apart else _below(os.getpid()):
+                if number:
+                    _kill(number)
+            if self.is_apart and not child:
+                return
+            try:
+                os.wait()
+            except ChildProcessError:
+                return
+
+
+def _kill(number: int) -> None:
+    try:
+        os.kill(number, signal.SIGKILL)
+    except OSError:
+        return
+
+
+def _below(root: int) -> list[int]:
+    """Numbers of the processes that came from one, as /proc shows them."""
+    parents: dict[int, int] = {}
+    names = os.listdir("/proc") if os.path.isdir("/proc") else []  # noqa: PTH112, PTH208 - no pathlib yet
+    for name in names:
+        try:
+            with open(f"/proc/{name}/stat", "rb") as file:  # noqa: PTH123
+                parents[int(name)] = int(file.read().rpartition(b")")[2].split()[1])
+        except (OSError, ValueError):
+            continue
+    found: list[int] = []
+    last = {root}
+    while last:
+        last = {number for number, parent in parents.items() if parent in last}
+        found += last
+    return found
+
+
+def _limit(policy: Policy) -> None:
+    limits = {
+        resource.RLIMIT_AS: policy.memory_bytes,
+        resource.RLIMIT_FSIZE: policy.file_bytes,
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_NOFILE: 1024,
+    }
+    for kind, value in limits.items():
+        _, most = resource.getrlimit(kind)
+        least = value if most == resource.RLIM_INFINITY else min(value, most)
+        resource.setrlimit(kind, (least, least))

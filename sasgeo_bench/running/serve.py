@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a matcher's process does once it is shut in: load, learn, prepare, match; every failure becomes a message."""
+
+import errno
+import hashlib
+import os
+import socket
+import sys
+import time
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+
+from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.matcher import Learner, Match, Matcher, Training, check_learned, check_match
+from sasgeo_bench.matching.plugins import load_matcher
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.running import wire
+from sasgeo_bench.tasks.task_rows import pairs_from, query_from
+
+MOST_MAPS: Final = 2  # in memory while a matcher learns, as long as it keeps none itself
+# What of this package answers are made with: a change there may change them, so they are asked for anew.
+TOOLS: Final = ("regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
+_REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
+
+
+class Server:
+    """Answers messages until the runner has gone."""
+
+    def __init__(self, channel: socket.socket, *, spec: str) -> None:
+        self.channel = channel
+        self.spec = spec
+        self.matcher: Matcher | None = None
+
+    def run(self) -> None:
+        """Serve until the other side closes."""
+        while True:
+            try:
+                message, blob = wire.receive(self.channel)
+            except wire.Closed:
+                return
+            said = {"nonce": message["nonce"]}
+            try:
+                answer = wire.packed(said | self._answer(message, blob))
+            except MatchError as error:
+                answer = wire.packed(said | {"status": "invalid", "message": one_line(str(error))})
+            except MemoryError:
+                answer = wire.packed(said | {"status": "crash", "message": "out of memory"})
+            except OSError as error:
+                status = "refused" if error.errno in _REFUSED else "crash"
+                answer = wire.packed(said | {"status": status, "message": told(error)})
+            except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
+                answer = wire.packed(said | {"status": "crash", "message": told(error)})
+            wire.put(self.channel, answer)
+
+    def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+        if message["kind"] == "load":
+            self.matcher = load_matcher(self.spec)
+            learns = isinstance(self.matcher, Learner)
+            return {
+                "status": "ok",
+                "card": asdict(self.matcher.card),
+                "code": code_hash(self.matcher),
+                "learns": learns,
+            }
+        if self.matcher is None:
+            self.matcher = load_matcher(self.spec)
+        if message["kind"] == "learn":
+            return _learn(self.matcher, message, blob)
+        if message["kind"] == "prepare":
+            region = read_region(Path(message["region"]))
+            before, start = _resident_bytes(), time.perf_counter()
+            self.matcher.prepare(region, message["learned"])
+            seconds = time.perf_counter() - start
+            return {"status": "ok", "seconds": seconds, "grown_bytes": max(0, _resident_bytes() - before)}
+        query = query_from(blob)
+        start, start_cpu = time.perf_counter(), time.process_time()
+        found = self.matcher.match(query, top_k=message["top_k"])
+        seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
+        return {
+            "status": "ok",
+            "seconds": seconds,
+            "cpu_s": cpu_s,
+            "match": match_row(check_match(found, query, top_k=message["top_k"])),
+        }
+
+
+def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+    if not isinstance(matcher, Learner):
+        fault = f"{matcher.card.name} has no learn()"
+        raise MatchError(fault)
+    pairs = tuple(pairs_from(message["query_bytes"], blob))
+    regions = Maps({name: Path(folder) for name, folder in message["regions"].items()})
+    start = time.perf_counter()
+    learned = check_learned(matcher.learn(Training(regions=regions, pairs=pairs)))
+    return {"status": "ok", "seconds": time.perf_counter() - start, "learned": learned}
+
+
+class Maps(Mapping[str, Region]):
+    """Regions that are read when they are asked for: all those of a split at once would not fit into memory.
+
+    Examples
+    --------
+    >>> list(Maps({"vaduz": Path("out/regions/vaduz")}))
+    ['vaduz']
+    """
+
+    def __init__(self, folders: Mapping[str, Path]) -> None:
+        self._folders = dict(folders)
+        self._kept: OrderedDict[str, Region] = OrderedDict()
+
+    def __getitem__(self, name: str) -> Region:
+        """Read a map, or give the one that was asked for a moment ago."""
+        folder = self._folders[name]
+        if name not in self._kept:
+            while len(self._kept) >= MOST_MAPS:
+                self._kept.popitem(last=False)
+            self._kept[name] = read_region(folder)
+        self._kept.move_to_end(name)
+        return self._kept[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a map of that name, without reading it."""
+        return name in self._folders
+
+    def __iter__(self) -> Iterator[str]:
+        """Names, without reading anything."""
+        return iter(self._folders)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._folders)
+
+
+def code_hash(matcher: Matcher) -> str:
+    """SHA-256 of the code answers come from: a plugin's own, and what it has loaded of `TOOLS`.
+
+    Its own is the file its class is in or, in a package, all Python files beside and below it, by their names.
+
+    Examples
+    --------
+    >>> class Mine: ...
+    >>> len(code_hash(Mine()))
+    64
+    """
+    module = sys.modules.get(type(matcher).__module__)
+    name = getattr(module, "__file__", None)
+    digest = hashlib.sha256()
+    if name is None:
+        return digest.hexdigest()
+    own = Path(name)
+    is_package = "." in type(matcher).__module__ or own.name == "__init__.py"
+    files = sorted(own.parent.rglob("*.py")) if is_package else [own]
+    named = {path.relative_to(own.parent).as_posix(): path for path in files}
+    loaded = [sys.modules.get(f"sasgeo_bench.{tool}") for tool in TOOLS]
+    for path in (Path(tool.__file__) for tool in loaded if tool is not None and tool.__file__):
+        for part in sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]:
+            named[f"sasgeo_bench:{part.relative_to(path.parent.parent).as_posix()}"] = part
+    for shown, path in named.items():
+        digest.update(shown.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _resident_bytes() -> int:
+    """Of this process, under the number that /proc knows it by: in a namespace it may have another for itself."""
+    try:
+        number = int(os.readlink("/proc/self"))  # noqa: PTH115 - no file, a number
+    except OSError:
+        number = os.getpid()
+    return int(psutil.Process(number).memory_info().rss)
+
+
+def match_row(match: Match) -> dict[str, Any]:
+    """A checked answer as plain numbers."""
+    return {
+        "candidates": [
+            [pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale, score]
+            for pose, score in zip(match.poses, match.scores, strict=True)
+        ],
+        "confidence": match.confidence,
+        "diagnostics": [[name, value] for name, value in match.diagnostics.items()],
+    }

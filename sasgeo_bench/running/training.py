@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a matcher learns before it is asked: once for a lesson, in a process of its own, kept as a text."""
+
+from collections.abc import Callable
+from functools import partial
+
+from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.files.folders import locked
+from sasgeo_bench.matching.learned_file import read_learned, write_learned
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.running.failures import LOG, stops_all, write_log
+from sasgeo_bench.running.plan import Learned, RunPlan, reach_of, with_learned
+from sasgeo_bench.running.replies import Reply
+from sasgeo_bench.running.training_tasks import Lesson, read_pairs
+from sasgeo_bench.running.worker import Worker
+
+
+def taught(plan: RunPlan, *, tell: Tell) -> RunPlan:
+    """Have a matcher learn, if there is anything to learn and to ask, and nothing was learnt from it before.
+
+    Parameters
+    ----------
+    plan : RunPlan
+        From `plan_run`.
+    tell : callable
+        Gets a line.
+
+    Returns
+    -------
+    RunPlan
+        With what was learnt, or why nothing was; then every query gets that for an answer.
+
+    Raises
+    ------
+    StoreError
+        If a task was made anew meanwhile, or what was learnt cannot be kept.
+    """
+    lesson, path = plan.lesson, plan.learned_file
+    if lesson is None or path is None or plan.learned is not None or not any(part.left for part in plan.parts):
+        return plan
+    with locked(path, tell=tell):
+        text = read_learned(path)
+        if text is None:
+            reply = _learn(plan, lesson)
+            if reply.status != "ok" or reply.learned is None:
+                failed = _failed(reply)
+                tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {lesson.to_text()}")
+                return with_learned(plan, failed)
+            write_learned(path, reply.learned)
+            text = reply.learned
+            tell(f"{plan.card.name}: learnt from {lesson.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
+    return with_learned(plan, Learned(text=text))
+
+
+def _learn(plan: RunPlan, lesson: Lesson) -> Reply:
+    """Ask a process of its own, which may read the maps and is sent the truths."""
+    request, regions = plan.request, lesson.regions
+    pairs = read_pairs(lesson)
+    reach = reach_of(request, tuple(regions.values()))
+    with Worker(spec=request.spec, reach=reach, limits=request.limits) as worker:
+        return guarded(plan, partial(worker.learn, regions, pairs))
+
+
+def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
+    """The reply to a question; whatever is raised about it is one, too, unless our own disk or folders are at fault."""
+    try:
+        return ask()
+    except StoreError:
+        raise
+    except Exception as error:
+        if stops_all(error):
+            message = f"no process of a matcher can be started ({told(error)}): free some space and run again"
+            raise StoreError(message) from error
+        return failed_by_us(plan, error)
+
+
+def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
+    """What a query gets about which our own code raised something; the log beside the run says where."""
+    write_log(plan.run_folder / LOG, plan.card.name, error)
+    return Reply(status="crash", message=one_line(f"not its own process failed, but ours: {told(error)} (see {LOG})"))
+
+
+def _failed(reply: Reply) -> Learned:
+    """What all rows say of a lesson from which nothing was learnt."""
+    if reply.status == "ok":
+        return Learned(status="invalid", message="while learning: no text in an answer")
+    return Learned(status=reply.status, message=one_line(f"while learning: {reply.message}"))

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a matcher is to learn from: tasks that are far from all that is asked, and which of their queries are taken."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from sasgeo_bench.errors import ConfigError, StoreError, counted, named
+from sasgeo_bench.regions.region_files import read_manifest
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import Truth, base_of
+from sasgeo_bench.tasks.split import Block, Split, nearest_blocks
+from sasgeo_bench.tasks.task_rows import truth_sha256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Taken:
+    """A task that is learnt from: its folder, its truths, its map, and the ids of the queries that are taken."""
+
+    task: Path
+    truth: Path
+    region: Path
+    ids: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lesson:
+    """All that a matcher is to learn from at once; `sha256` is that of its queries, maps and truths."""
+
+    taken: tuple[Taken, ...]
+    places: tuple[str, ...]
+    sha256: str
+
+    @property
+    def count(self) -> int:
+        """Pairs of a query and its truth."""
+        return sum(len(item.ids) for item in self.taken)
+
+    @property
+    def regions(self) -> dict[str, Path]:
+        """Maps by the name that queries have for them."""
+        return {item.region.name: item.region for item in self.taken}
+
+    def to_text(self) -> str:
+        """As in "24 queries of 3 places (monaco, porto, prague)"."""
+        return f"{counted(self.count, 'query', 'queries')} of {named(self.places, 'place')}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Pair:
+    """A query that could be taken, and all that decides whether it is."""
+
+    place: str
+    suite: str
+    site: str
+    query_id: str
+    task: Path
+    said: tuple[str, str]
+
+
+def plan_lesson(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> Lesson:
+    """Choose what is learnt from; nothing is read twice and nothing written.
+
+    Parameters
+    ----------
+    train, asked : sequence of Path
+        Task folders to learn from, and those that will be asked.
+    split : Split, optional
+        Says what is one place, and how far apart places must lie; without one, regions are places.
+    most : int
+        Pairs at most: evenly over places, then suites, then sites, by a hash of their names.
+
+    Raises
+    ------
+    ConfigError
+        If there is nothing to learn from, a place is asked too or comes too near to one that is, or two different maps
+        have one name.
+    StoreError
+        If a task, its map or its truths are missing, damaged or do not belong together.
+
+    Examples
+    --------
+    >>> plan_lesson([Path("nowhere")], asked=[], split=None, most=200)
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no task.json: make the queries first
+    """
+    tasks = {folder.resolve(): folder for folder in train}
+    abouts = {folder: task_files.read_task(folder) for folder in tasks.values()}
+    regions = {base_of(about["region"]): folder for folder, about in abouts.items()}
+    others = {base_of(task_files.read_task(folder)["region"]): folder for folder in asked}
+    check_apart(regions, others, split)
+    maps = {folder: _map_of(folder, about) for folder, about in abouts.items()}
+    _check_names(maps)
+    pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split)]
+    if not pairs:
+        message = f"--train {next(iter(tasks.values()))} holds no queries: there is nothing to learn from"
+        raise ConfigError(message)
+    chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
+    order = sorted(
+        {pair.task for pair in chosen}, key=lambda folder: (abouts[folder]["region"], abouts[folder]["suite"])
+    )
+    ids = {folder: tuple(sorted(pair.query_id for pair in chosen if pair.task == folder)) for folder in order}
+    said = {pair.query_id: pair.said for pair in chosen}
+    return Lesson(
+        taken=tuple(
+            Taken(task=folder, truth=_truth_of(folder, abouts[folder]), region=maps[folder], ids=ids[folder])
+            for folder in order
+        ),
+        places=tuple(sorted({pair.place for pair in chosen})),
+        sha256=_hash_of([said[name] for folder in order for name in ids[folder]]),
+    )
+
+
+def _hash_of(said: Sequence[tuple[str, str]]) -> str:
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+
+
+def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Split | None) -> None:
+    """Refuse to learn from what is asked, or from what lies beside it.
+
+    Parameters
+    ----------
+    train, asked : mapping of str to Path
+        Regions, each with a task on it that an error can name.
+    split : Split, optional
+        Says what is one place, and how far apart places must lie.
+
+    Raises
+    ------
+    ConfigError
+        If both hold a region or place, or blocks that come nearer than the buffer of the split.
+    """
+    both = next((name for name in train if name in asked), None)
+    if both is not None:
+        message = f"--train {train[both]} is of region {both!r}, and so is {asked[both]}, which is asked: leave one out"
+        raise ConfigError(message)
+    if split is None:
+        return
+    places = {place: name for name in train for place in split.places_in(name)}
+    shared = next(((place, name) for name in asked for place in split.places_in(name) if place in places), None)
+    if shared is not None:
+        place, name = shared
+        folders = f"--train {train[places[place]]} is of place {place!r}, and so is {asked[name]}"
+        message = f"{folders}, which is asked: leave one out"
+        raise ConfigError(message)
+    parts = {part: _blocks_of(names, split) for part, names in (("train", train), ("asked", asked))}
+    least_m = split.spec.buffer_m + 2 * split.spec.reach_m
+    near = nearest_blocks(parts, within_m=least_m)
+    if near is not None and near.gap_m < least_m:
+        message = (
+            f"--train: blocks {near.first} and {near.second}, of which one is learnt from and one is asked, are "
+            f"{near.gap_m:.0f} m apart, split {split.spec.id!r} wants {least_m:.0f} m: leave one of the regions out"
+        )
+        raise ConfigError(message)
+
+
+def _blocks_of(regions: Mapping[str, Path], split: Split) -> list[Block]:
+    return [block for name in regions for block in split.blocks_in(name)]
+
+
+def _root_of(task: Path) -> Path:
+    return task.resolve().parent.parent.parent
+
+
+def _truth_of(task: Path, about: Mapping[str, Any]) -> Path:
+    return _root_of(task) / "truth" / str(about["suite"]) / str(about["region"])
+
+
+def _map_of(task: Path, about: Mapping[str, Any]) -> Path:
+    """The map of a task, after a look whether it is the one that the task was made on."""
+    region: Path = _root_of(task) / "regions" / str(about["region"])
+    if not task_files.is_of_map(about, read_manifest(region)):
+        message = f"{region} was built anew since the queries of {task} were made: make them again"
+        raise StoreError(message)
+    return region
+
+
+def _check_names(maps: Mapping[Path, Path]) -> None:
+    """Refuse two maps of one name: queries say the name alone."""
+    seen: dict[str, Path] = {}
+    for task, region in maps.items():
+        if seen.setdefault(region.name, region) != region:
+            message = (
+                f"--train {task} is searched in {region}, another task in {seen[region.name]}: leave one of them out"
+            )
+            raise ConfigError(message)
+
+
+def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None) -> Iterator[_Pair]:
+    """Every query of a task with its truth, by what decides whether it is taken."""
+    truth = _truth_of(task, about)
+    if not (truth / task_files.TRUTH).is_file():
+        message = f"{truth} holds no truths of {task}, and they are learnt from: make the queries here, or leave it out"
+        raise StoreError(message)
+    task_files.check_queries(task)
+    task_files.check_truths(task, truth)
+    asked, place_of = task_files.read_asked(task), {} if split is None else split.place_of
+    for item in task_files.read_truths(truth):
+        yield _Pair(
+            place=place_of.get(item.block, base_of(about["region"])),
+            suite=str(about["suite"]),
+            site=item.pair_id,
+            query_id=item.query_id,
+            task=task,
+            said=(asked[item.query_id], truth_sha256(item)),
+        )
+
+
+def spread(pairs: Sequence[_Pair], by: Sequence[Callable[[_Pair], str]]) -> list[_Pair]:
+    """Put pairs in an order of which every beginning is spread evenly, first by the first of some keys.
+
+    What comes first among equals is decided by a hash of its name, never by where it stood.
+    """
+    if not by:
+        return sorted(pairs, key=lambda pair: _rank(pair.query_id))
+    groups: dict[str, list[_Pair]] = {}
+    for pair in pairs:
+        groups.setdefault(by[0](pair), []).append(pair)
+    lines = [spread(groups[name], by[1:]) for name in sorted(groups, key=_rank)]
+    return [pair for row in zip_longest(*lines) for pair in row if pair is not None]
+
+
+def _rank(name: str) -> bytes:
+    return hashlib.sha256(name.encode()).digest()
+
+
+def read_pairs(lesson: Lesson) -> list[tuple[bytes, Truth]]:
+    """Queries as they travel, with their truths, in the order of maps, suites and ids.
+
+    Raises
+    ------
+    StoreError
+        If a task was made anew since the lesson was planned.
+    """
+    found: list[tuple[bytes, Truth]] = []
+    said: list[tuple[str, str]] = []
+    for item in lesson.taken:
+        truths = {truth.query_id: truth for truth in task_files.read_truths(item.truth)}
+        for query, blob, asked in task_files.read_some(item.task, frozenset(item.ids)):
+            if query.query_id in truths:
+                found.append((blob, truths[query.query_id]))
+                said.append((asked, truth_sha256(truths[query.query_id])))
+    if _hash_of(said) != lesson.sha256:
+        message = f"{lesson.taken[0].task} or another task of --train was made anew meanwhile: run again"
+        raise StoreError(message)
+    return found

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages between a runner and a matcher's process: a length, JSON, and bytes; nothing that is executed when read."""
+
+import json
+import select
+import socket
+import struct
+import time
+from typing import Any, Final
+
+MOST_BYTES: Final = 2**20  # of a message from a matcher's process; what it sends is not trusted
+MOST_LEARNT_BYTES: Final = 8 * 2**20  # of one with what was learnt: JSON may write a byte of it as six
+_HEAD: Final = struct.Struct("!II")
+_LEAST_S: Final = 1e-3  # no time at all would be taken for a socket that never waits
+
+
+class Closed(Exception):  # noqa: N818 - it is no error: the other side has gone
+    """The other side has gone, or sent what is no message."""
+
+
+class TooLong(Closed):
+    """The other side is there, and sends more than is read."""
+
+
+class Late(Exception):  # noqa: N818
+    """Nothing came in time, or nobody read what was sent."""
+
+
+class Garbled(Exception):  # noqa: N818
+    """What came is whole, and no message."""
+
+
+def send(channel: socket.socket, message: dict[str, Any], blob: bytes = b"", *, deadline: float | None = None) -> None:
+    """Send a message; `Closed` if the other side has gone, `Late` if it does not read until a deadline."""
+    put(channel, packed(message, blob), deadline=deadline)
+
+
+def packed(message: dict[str, Any], blob: bytes = b"") -> bytes:
+    """A message as it is sent."""
+    text = json.dumps(message).encode()
+    return _HEAD.pack(len(text), len(blob)) + text + blob
+
+
+def put(channel: socket.socket, data: bytes, *, deadline: float | None = None) -> None:
+    """Send a packed message, as `send` does."""
+    try:
+        channel.settimeout(None if deadline is None else max(deadline - time.monotonic(), _LEAST_S))
+        channel.sendall(data)
+        channel.settimeout(None)
+    except TimeoutError as error:
+        raise Late from error
+    except OSError as error:
+        raise Closed(str(error)) from error
+
+
+def receive(
+    channel: socket.socket, *, deadline: float | None = None, most_bytes: int | None = None
+) -> tuple[dict[str, Any], bytes]:
+    """Wait for a message.
+
+    Parameters
+    ----------
+    channel : socket
+        Its end of a pair.
+    deadline : float, optional
+        Of `time.monotonic`; `Late` when it has passed.
+    most_bytes : int, optional
+        A longer message is not read.
+
+    Raises
+    ------
+    Closed
+        If the other side has gone; `TooLong` if the message is.
+    Garbled
+        If it is no JSON object; one that has a name twice, or a number that is none, is none.
+    Late
+        If it did not come in time.
+    """
+    text_bytes, blob_bytes = _HEAD.unpack(_exactly(channel, _HEAD.size, deadline))
+    if most_bytes is not None and text_bytes + blob_bytes > most_bytes:
+        message = f"an answer of {text_bytes + blob_bytes} bytes, at most {most_bytes} are read"
+        raise TooLong(message)
+    text = _exactly(channel, text_bytes, deadline)
+    blob = _exactly(channel, blob_bytes, deadline)
+    try:
+        found = json.loads(text, object_pairs_hook=_once, parse_constant=_refused)
+    except (ValueError, RecursionError) as error:
+        message = f"no JSON ({error})"
+        raise Garbled(message) from error
+    if not isinstance(found, dict):
+        message = "no JSON object"
+        raise Garbled(message)
+    return found, blob
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, each name in it once: of two readers one might take the first value and one the last."""
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        message = "a name is there twice"
+        raise ValueError(message)
+    return found
+
+
+def _refused(name: str) -> float:
+    """Refuse NaN and Infinity, which Python reads and JSON does not know."""
+    message = f"{name} is no number"
+    raise ValueError(message)
+
+
+def _exactly(channel: socket.socket, count: int, deadline: float | None) -> bytes:
+    parts = []
+    while count:
+        if deadline is not None:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0 or not select.select([channel], [], [], left_s)[0]:
+                raise Late
+        try:
+            part = channel.recv(min(count, 2**20))
+        except OSError as error:
+            raise Closed(str(error)) from error
+        if not part:
+            message = "closed its connection to the runner without an answer"
+            raise Closed(message)
+        parts.append(part)
+        count -= len(part)
+    return b"".join(parts)

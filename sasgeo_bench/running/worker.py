@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One matcher in one process, seen from outside: started, asked, watched, and ended when it must be."""
+
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Final, Self
+
+import psutil
+
+import sasgeo_bench.running.child
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.removal import remove_tree
+from sasgeo_bench.running import wire
+from sasgeo_bench.running.cgroup import Group
+from sasgeo_bench.running.launch import PROGRAM
+from sasgeo_bench.running.leak_scan import walk_code
+from sasgeo_bench.running.memory import WATCH_S, MemoryWatch
+from sasgeo_bench.running.replies import Reply, read_reply
+from sasgeo_bench.tasks.query import Truth
+from sasgeo_bench.tasks.task_rows import pairs_bytes
+
+_KEEPER_S: Final = 5.0  # for the process that keeps a matcher's to end all that came from it
+_ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
+_KEPT_BYTES: Final = 4000  # of what a matcher prints
+_START_S: Final = 120.0
+_SLACK_S: Final = 0.1  # of processor seconds beyond those of all processors: clocks tick
+_PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a matcher may take.
+
+    Parameters
+    ----------
+    match_s, prepare_s, learn_s : float
+        Seconds by the clock for one query, for one map, and for whatever is learnt at once.
+    memory_bytes : int
+        Of all its processes together, resident; and of the address space of each.
+    file_bytes, scratch_bytes : int
+        Of one file in its scratch folder, and of all together where the system has a way.
+    processes : int
+        Processes and threads of it at once, where the system has a way.
+    """
+
+    match_s: float = 30.0
+    prepare_s: float = 600.0
+    learn_s: float = 900.0
+    memory_bytes: int = 4 * 10**9
+    file_bytes: int = 2**30
+    scratch_bytes: int = 10**9
+    processes: int = 1024
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reach:
+    """What a matcher may read, what is hidden from it, and whether it is shut in at all."""
+
+    readable: Sequence[Path]
+    hidden: Sequence[Path]
+    is_shut_in: bool = True
+
+
+@dataclass(kw_only=True)
+class Worker:
+    """A matcher's process; a new one is started whenever the last one has ended.
+
+    Use it in a `with` block: at its end nothing of it is left, neither processes nor files.
+
+    Examples
+    --------
+    >>> Limits().match_s
+    30.0
+    """
+
+    spec: str
+    reach: Reach
+    limits: Limits
+    isolation: dict[str, str] = field(default_factory=dict)
+    starts: int = 0
+    _peak_bytes: int = 0
+    _memory: MemoryWatch | None = None
+    _group: Group | None = None
+    _process: subprocess.Popen[bytes] | None = None
+    _channel: socket.socket | None = None
+    _printed: deque[bytes] = field(default_factory=deque)
+    _scratch: Path | None = None
+    _region: Path | None = None
+    _learned: str | None = None
+
+    def __enter__(self) -> Self:
+        """Start nothing yet."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the process."""
+        self.end()
+
+    def load(self) -> Reply:
+        """Import the plugin."""
+        return self._ask({"kind": "load"}, timeout_s=self.limits.prepare_s)
+
+    def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
+        """Learn from queries, each a row in Arrow's stream format, and their truths, on maps by their names."""
+        sizes, blob = pairs_bytes(pairs)
+        maps = {name: str(path.resolve()) for name, path in regions.items()}
+        message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
+        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARNT_BYTES)
+
+    def prepare(self, region: Path, learned: str | None = None) -> Reply:
+        """Index a map, with what was learnt before."""
+        self._region, self._learned = region, learned
+        message = {"kind": "prepare", "region": str(region.resolve()), "learned": learned}
+        reply = self._ask(message, timeout_s=self.limits.prepare_s)
+        if reply.status != "ok":
+            self.end()
+        return reply
+
+    def match(self, query: bytes, *, top_k: int) -> Reply:
+        """Ask one query, a row in Arrow's stream format, on the map prepared last."""
+        if self._process is None and self._region is not None:
+            again = self.prepare(self._region, self._learned)
+            if again.status != "ok":
+                return again
+        reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
+        if reply.status in {"timeout", "crash"} and self._is_gone():
+            self.end()
+        return reply
+
+    def _is_gone(self) -> bool:
+        return self._process is None or self._process.poll() is not None
+
+    def _ask(
+        self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float, most_bytes: int = wire.MOST_BYTES
+    ) -> Reply:
+        nonce = secrets.token_hex(16)  # nobody can have answered before it was asked
+        try:
+            channel = self._started()
+            asked = time.perf_counter()
+            deadline = time.monotonic() + timeout_s
+            wire.send(channel, {**message, "nonce": nonce}, blob, deadline=deadline)
+            answer, _ = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
+            came = time.perf_counter()
+            reply = read_reply(message["kind"], answer, nonce=nonce)
+        except wire.Late:
+            self.end()
+            return Reply(status="timeout", message=f"no answer within {timeout_s:g} s")
+        except wire.TooLong as error:
+            self.end()
+            return Reply(status="crash", message=one_line(str(error)))
+        except wire.Closed as closed:
+            reply = Reply(status="crash", message=self._last_words(str(closed)))
+            self.end()
+            return reply
+        except (MatchError, wire.Garbled) as error:
+            self.end()
+            return Reply(status="invalid", message=one_line(f"an answer that is none: {error}"))
+        if reply.status != "ok":
+            return reply
+        seconds = came - asked
+        most_cpu_s = seconds * (os.cpu_count() or 1) + _SLACK_S
+        return replace(reply, seconds=seconds, cpu_s=min(reply.cpu_s, most_cpu_s))
+
+    def _started(self) -> socket.socket:
+        if self._channel is not None and not self._is_gone():
+            return self._channel
+        self.end()
+        ours, theirs = socket.socketpair()
+        self._scratch = Path(tempfile.mkdtemp(prefix="sasgeo-matcher-")).resolve()
+        command = _command(theirs.fileno(), is_shut_in=self.reach.is_shut_in)
+        self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
+            command,
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=_environment(self._scratch),
+            start_new_session=True,
+        )
+        theirs.close()
+        self._begin_watch(self._process, self._scratch)
+        self._printed = deque()
+        threading.Thread(target=_drain, args=(self._process.stdout, self._printed), daemon=True).start()
+        self._channel = ours
+        self.starts += 1
+        if self.reach.is_shut_in:
+            wire.send(ours, self._policy(str(self._scratch)))
+            said, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
+            self.isolation = {str(name): one_line(str(words)) for name, words in dict(said["isolation"]).items()}
+        self.isolation["memory"] = _memory_words(self.limits, self._group)
+        paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
+        wire.send(ours, {"spec": self.spec, "scratch": str(self._scratch), "paths": paths})
+        return ours
+
+    def _begin_watch(self, process: subprocess.Popen[bytes], scratch: Path) -> None:
+        """Have the kernel count its memory where it does, and look at it ourselves in any case."""
+        memory_bytes, processes = self.limits.memory_bytes, self.limits.processes
+        self._group = Group.make(memory_bytes=memory_bytes, processes=processes)
+        try:
+            if self._group is not None:
+                self._group.add(process.pid)
+        except OSError:
+            self._end_watch()
+        kill = partial(_kill_family, process)
+        self._memory = MemoryWatch(
+            process=process, most_bytes=memory_bytes, kill=kill, scratch=scratch, group=self._group
+        )
+        self._memory.start()
+
+    def _end_watch(self) -> None:
+        """Stop looking, and remove what the kernel counted in with all that is left in it."""
+        if self._memory is not None:
+            self._memory.stop()
+            self._peak_bytes = max(self._peak_bytes, self._memory.peak_bytes)
+        if self._group is not None:
+            self._group.remove()
+        self._memory, self._group = None, None
+
+    @property
+    def peak_bytes(self) -> int:
+        """Most memory that a process of this matcher and all that came from it have held at once."""
+        return max(self._peak_bytes, self._memory.peak_bytes if self._memory else 0)
+
+    def _policy(self, scratch: str) -> dict[str, Any]:
+        """Arguments of `sandbox.Policy`."""
+        code = _code()
+        beside = walk_code(code)
+        hidden = [*map(str, self.reach.hidden), *beside.hidden([*code, *self.reach.readable])]
+        return {
+            "readable": [str(path) for path in (*code, *self.reach.readable)],
+            "scratch": scratch,
+            "hidden": list(dict.fromkeys(hidden)),
+            "unsearched": beside.unsearched,
+            "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
+            "file_bytes": self.limits.file_bytes,
+            "scratch_bytes": self.limits.scratch_bytes,
+        }
+
+    def _last_words(self, closed: str) -> str:
+        """How a process ended, and the last line it printed."""
+        code = None
+        if self._process is not None:
+            try:
+                code = self._process.wait(timeout=10)  # on a busy machine an end takes its time
+            except subprocess.TimeoutExpired:
+                code = None
+        if self._memory is not None and self._memory.look():
+            return self._memory.why
+        how = closed
+        if code is not None:
+            how = f"died by {_signal_name(-code)}" if code < 0 else f"ended with exit status {code}"
+        lines = b"".join(self._printed).decode(errors="replace").split("\n")
+        last = next((line for line in reversed(lines) if line.strip()), "")
+        return one_line(f"{how}: {last}" if last else how)
+
+    def end(self) -> None:
+        """End the process and all that came from it, and remove its scratch folder."""
+        if self._channel is not None:
+            self._channel.close()
+        if self._process is not None:
+            _kill_family(self._process)
+        self._end_watch()
+        if self._scratch is not None:
+            remove_tree(self._scratch)
+        self._process, self._channel, self._scratch = None, None, None
+
+
+def _signal_name(number: int) -> str:
+    """Name of a signal; those of real time have a number alone."""
+    known = {item.value: item.name for item in signal.Signals}
+    return known.get(number, f"signal {number}")
+
+
+def _environment(scratch: Path) -> dict[str, str]:
+    """Next to nothing: no folder of ours, no key, no proxy; one thread, so that latencies can be compared."""
+    kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+    own = {"PATH": "/usr/bin:/bin", "HOME": str(scratch), "TMPDIR": str(scratch), "PYTHONHASHSEED": "0"}
+    return {**kept, **threads, **own, "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def _command(channel: int, *, is_shut_in: bool) -> list[str]:
+    """Start the program that answers, at once or by way of the one that shuts it in."""
+    if not is_shut_in:
+        return [sys.executable, *_ANSWERS, str(channel)]
+    package = str(Path(sasgeo_bench.running.child.__file__).parents[2])
+    return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]
+
+
+def _code() -> list[Path]:
+    """Where the interpreter and everything importable lies."""
+    found = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.executable), Path(os.getcwd())]  # noqa: PTH109
+    found += [Path(entry) for entry in sys.path if entry]
+    found.append(Path(sasgeo_bench.running.child.__file__).parents[2] / "sasgeo_bench")
+    return [path for path in dict.fromkeys(found) if path.exists()]
+
+
+def _drain(stream: IO[bytes] | None, printed: deque[bytes]) -> None:
+    """Read what a process prints, so that it never waits for us, and keep the end of it."""
+    if stream is None:
+        return
+    while part := stream.read1(65536):  # type: ignore[attr-defined]
+        printed.append(part[-_KEPT_BYTES:])
+        while sum(map(len, printed)) > 2 * _KEPT_BYTES and len(printed) > 1:
+            printed.popleft()
+
+
+def _memory_words(limits: Limits, group: Group | None) -> str:
+    """Say how memory and processes are counted."""
+    most = f"{limits.memory_bytes / 1e6:.0f} MB at most"
+    if group is not None:
+        return f"{most}, and {limits.processes} processes and threads, held by the kernel (cgroup v{group.version})"
+    return f"{most}, looked at every {WATCH_S * 1000:.0f} ms; processes are not counted"
+
+
+def _kill_family(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process, its session, and whatever it started elsewhere."""
+    try:
+        family = psutil.Process(process.pid).children(recursive=True)
+    except psutil.Error:
+        family = []
+    process.terminate()  # the one that keeps the others kills them first
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=_KEEPER_S)
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except (ProcessLookupError, PermissionError):
+        process.kill()
+    for member in family:
+        with contextlib.suppress(psutil.Error):
+            member.kill()
+    process.wait()

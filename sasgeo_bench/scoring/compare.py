@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which difference is real: paired tests, and ranks that say how sure they are."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.multitest import multipletests
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.scoring.base import Bools, Floats, block_codes, check_column
+from sasgeo_bench.scoring.intervals import LEVEL, percentile_interval
+
+# Fewer blocks rank nobody and decide nothing: an exact test of their signs cannot reach 5 %, 2 / 2^5 being more.
+LEAST_BLOCKS: Final = 6
+_NOTHING: Final = 1e-12  # a difference of means this small is one of rounding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairedTest:
+    """Two methods on the same queries.
+
+    Parameters
+    ----------
+    first_only, second_only : int
+        Discordant queries: those that only the first, or only the second, got right.
+    p_value : float
+        Two-sided; 1 where nothing is discordant.
+    """
+
+    first_only: int
+    second_only: int
+    p_value: float
+
+
+def _pairs(first: ArrayLike, second: ArrayLike) -> tuple[Bools, Bools]:
+    ours, theirs = check_column(first, "first"), check_column(second, "second", np.size(first))
+    if not (np.isin(ours, (0, 1)).all() and np.isin(theirs, (0, 1)).all()):
+        message = (
+            "McNemar's test takes hits that are 0 or 1: decide ties first, as by `hits == 1`, or use the bootstrap"
+        )
+        raise MetricError(message)
+    return ours > 0, theirs > 0
+
+
+def mcnemar_exact(first: ArrayLike, second: ArrayLike) -> PairedTest:
+    """McNemar's exact test that two methods are right equally often.
+
+    Parameters
+    ----------
+    first, second : array_like of bool, shape (N,)
+        Which queries each method got right, in the same order.
+
+    Returns
+    -------
+    PairedTest
+        The p-value is that of a fair coin thrown once for each discordant query.
+
+    Raises
+    ------
+    MetricError
+        If a value is neither 0 nor 1, or the numbers differ.
+
+    Notes
+    -----
+    By statsmodels. It takes queries for independent, which those of one block are not: read it beside
+    `mcnemar_clustered` and the bootstrap.
+
+    Examples
+    --------
+    Six discordant queries, all for the first: 2 / 2^6.
+
+    >>> mcnemar_exact([1, 1, 1, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0, 0])
+    PairedTest(first_only=6, second_only=0, p_value=0.03125)
+    """
+    ours, theirs = _pairs(first, second)
+    gained, lost = int((ours & ~theirs).sum()), int((~ours & theirs).sum())
+    table = [[int((ours & theirs).sum()), gained], [lost, int((~ours & ~theirs).sum())]]
+    p_value = float(mcnemar(table, exact=True).pvalue) if gained + lost else 1.0
+    return PairedTest(first_only=gained, second_only=lost, p_value=min(p_value, 1.0))
+
+
+def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]) -> PairedTest:
+    """McNemar's test for queries that come in blocks.
+
+    Parameters
+    ----------
+    first, second : array_like of bool, shape (N,)
+        Which queries each method got right, in the same order.
+    blocks : sequence of str, length N
+        Block of each query.
+
+    Returns
+    -------
+    PairedTest
+        The p-value is NaN for fewer than two blocks.
+
+    Raises
+    ------
+    MetricError
+        If a value is neither 0 nor 1, or the numbers differ.
+
+    Notes
+    -----
+    Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K,
+    (K - 1) / K (sum d_k)^2 / sum d_k^2 is chi-squared with one degree of freedom. It tests the difference of the means
+    over all queries, the one we print; Durkalski et al. (2003) weigh every block alike instead. With one query in each
+    block it is McNemar's test without correction, times (K - 1) / K.
+
+    Examples
+    --------
+    Blocks differ by 2, 2 and 2: (2/3) 6^2 / 12 = 2.
+
+    >>> found = mcnemar_clustered([1] * 6, [0] * 6, ["a", "a", "b", "b", "c", "c"])
+    >>> round(found.p_value, 4)
+    0.1573
+    """
+    ours, theirs = _pairs(first, second)
+    _, code = block_codes(blocks, len(ours))
+    each = np.bincount(code, weights=ours.astype(float) - theirs, minlength=1)
+    count = len(each)
+    gained, lost = int((ours & ~theirs).sum()), int((~ours & theirs).sum())
+    squared = float((each**2).sum())
+    if count < 2:  # noqa: PLR2004 - one block cannot differ from itself
+        p_value = math.nan
+    else:
+        statistic = (count - 1) / count * float(each.sum()) ** 2 / squared if squared > 0 else 0.0
+        p_value = float(chi2.sf(statistic, 1))
+    return PairedTest(first_only=gained, second_only=lost, p_value=p_value)
+
+
+def holm(p_values: Mapping[str, float]) -> dict[str, float]:
+    """p-values adjusted for how many registered contrasts there are, by Holm's steps down.
+
+    Parameters
+    ----------
+    p_values : mapping of str to float
+        One for each registered contrast, and no others.
+
+    Returns
+    -------
+    dict of str to float
+        In the same order; a contrast holds at level a if its adjusted value is at most a.
+
+    Raises
+    ------
+    MetricError
+        If a value lies outside [0, 1] or is NaN: a contrast that could not be tested has p = 1.
+
+    Notes
+    -----
+    Holm, Scandinavian Journal of Statistics 1979; by statsmodels.
+
+    Examples
+    --------
+    >>> {name: round(value, 3) for name, value in holm({"graph": 0.01, "stability": 0.04, "unknown": 0.03}).items()}
+    {'graph': 0.03, 'stability': 0.06, 'unknown': 0.06}
+    """
+    wrong = next((name for name, value in p_values.items() if not 0 <= value <= 1), None)
+    if wrong is not None:
+        message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; a contrast that was not tested has 1"
+        raise MetricError(message)
+    if not p_values:
+        return {}
+    adjusted = multipletests(list(p_values.values()), method="holm")[1]
+    return dict(zip(p_values, map(float, adjusted), strict=True))
+
+
+def distinguishable(
+    values: ArrayLike,
+    draws: ArrayLike,
+    *,
+    better: Literal["higher", "lower"],
+    level: float = LEVEL,
+    is_simultaneous: bool = True,
+) -> NDArray[np.bool_]:
+    """Which method is better than which, by paired draws.
+
+    Parameters
+    ----------
+    values : array_like, shape (M,)
+        The figure of each of M methods.
+    draws : array_like, shape (D, M)
+        Their figures in the same draws, as from `bootstrap_means`.
+    better : {"higher", "lower"}
+        Which way is good.
+    level : float
+        In (0, 1).
+    is_simultaneous : bool
+        True keeps the level for all pairs at once; False for each pair alone, by percentiles, so that of many pairs
+        some will seem different by chance.
+
+    Returns
+    -------
+    ndarray of bool, shape (M, M)
+        True where the method of the row is better than that of the column, and their difference is not chance.
+
+    Raises
+    ------
+    MetricError
+        If shapes do not fit, or a figure is not finite.
+
+    Notes
+    -----
+    For all pairs at once a difference counts where it exceeds c standard deviations of its draws, with c the quantile
+    at `level`, over draws, of the largest |draw - difference| / deviation of any pair (Romano and Wolf, Econometrica
+    2005; for ranks Mogstad et al., Review of Economic Studies 2024).
+
+    Examples
+    --------
+    >>> chance = np.random.default_rng(1).normal(0.0, 0.01, (1000, 2))
+    >>> distinguishable([0.5, 0.9], chance + [0.5, 0.9], better="higher").tolist()
+    [[False, False], [True, False]]
+    """
+    figures, table = np.asarray(values, dtype=np.float64), np.asarray(draws, dtype=np.float64)
+    if figures.ndim != 1 or table.ndim != 2 or table.shape[1:] != figures.shape or not len(table):  # noqa: PLR2004
+        message = f"values have shape {figures.shape} and draws {table.shape}, expected (M,) and (D, M)"
+        raise MetricError(message)
+    table = table[~np.isnan(table).any(axis=1)]
+    if not (np.isfinite(figures).all() and np.isfinite(table).all() and len(table)):
+        message = "a figure or a draw is not finite: ranks are for figures that every method has"
+        raise MetricError(message)
+    sign = 1.0 if better == "higher" else -1.0
+    found = np.zeros((len(figures), len(figures)), dtype=bool)
+    rows, cols = np.triu_indices(len(figures), 1)
+    if not len(rows):
+        return found
+    apart = sign * (figures[rows] - figures[cols])
+    lo, hi = _bounds(sign * (table[:, rows] - table[:, cols]), apart, level, is_simultaneous=is_simultaneous)
+    found[rows, cols], found[cols, rows] = lo > _NOTHING, hi < -_NOTHING
+    return found
+
+
+def _bounds(draws: Floats, apart: Floats, level: float, *, is_simultaneous: bool) -> tuple[Floats, Floats]:
+    """Intervals of P differences, shape (P,) each, from draws of shape (D, P)."""
+    if not is_simultaneous:
+        ends = [percentile_interval(0.0, column, level=level) for column in draws.T]
+        return np.array([end.lo for end in ends]), np.array([end.hi for end in ends])
+    spread = draws.std(axis=0)
+    varies = spread > _NOTHING
+    if not varies.any():
+        return apart, apart
+    largest = (np.abs(draws[:, varies] - apart[varies]) / spread[varies]).max(axis=1)
+    reach = float(np.quantile(largest, level, method="inverted_cdf")) * np.where(varies, spread, 0.0)
+    return apart - reach, apart + reach
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankInterval:
+    """Best and worst rank a method can have; 1 is best."""
+
+    best: int
+    worst: int
+
+    @property
+    def text(self) -> str:
+        """As a table prints it: "2" or "2-4".
+
+        Examples
+        --------
+        >>> RankInterval(best=2, worst=4).text
+        '2-4'
+        """
+        return str(self.best) if self.best == self.worst else f"{self.best}-{self.worst}"
+
+
+def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
+    """Ranks that methods can have, given which differences are real.
+
+    Parameters
+    ----------
+    is_better : array_like of bool, shape (M, M)
+        From `distinguishable`.
+
+    Returns
+    -------
+    tuple of RankInterval
+        Of each method: one more than there are methods known to be better, up to all but those known to be worse.
+        Methods that cannot be told apart from the same others share a rank.
+
+    Raises
+    ------
+    MetricError
+        If the table is not square, or two methods are better than each other.
+
+    Examples
+    --------
+    The first beats the third, nothing else is sure:
+
+    >>> [rank.text for rank in rank_intervals([[0, 0, 1], [0, 0, 0], [0, 0, 0]])]
+    ['1-2', '1-3', '2-3']
+    """
+    table = np.asarray(is_better, dtype=bool)
+    if table.ndim != 2 or table.shape[0] != table.shape[1] or (table & table.T).any():  # noqa: PLR2004 - a table
+        message = f"is_better has shape {table.shape}, expected (M, M) with no two methods better than each other"
+        raise MetricError(message)
+    above, below = table.sum(axis=0), table.sum(axis=1)
+    return tuple(
+        RankInterval(best=1 + int(up), worst=len(table) - int(down)) for up, down in zip(above, below, strict=True)
+    )

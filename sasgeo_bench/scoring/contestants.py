@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who was asked what, and what they answered: the entries of a board with their answers to its tasks."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.scoring.controls import hold_controls
+from sasgeo_bench.scoring.entries import Entry
+from sasgeo_bench.scoring.rows import AS_SUBMITTED
+from sasgeo_bench.scoring.score import score_task, settle_not_applicable
+from sasgeo_bench.scoring.scored_tasks import AskedTask, ScoredTask, held_tasks
+from sasgeo_bench.scoring.validate import submission_faults, validate
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.split import Split
+
+MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """One contestant and its answers to the tasks of a board.
+
+    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
+    file is asked all tasks, and brings those that it holds an answer to; a submission is asked those that it names.
+    `entry` has only the runs that count.
+    """
+
+    entry: Entry
+    predictions: dict[str, Prediction]
+    held: frozenset[Path]
+    asked: frozenset[Path]
+
+
+def read_told(
+    entries: Sequence[Entry],
+    folders: Sequence[Path],
+    *,
+    root: Path,
+    named: Sequence[Path],
+    tell: Callable[[str], None],
+    failures: Failures,
+) -> list[Told]:
+    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Who.
+    folders : sequence of Path
+        Of tasks; without any, those that runs were made on, and that files hold answers to.
+    root : Path
+        Where tasks/ is.
+    named : sequence of Path
+        Folders and files that the user named.
+    tell : callable
+        Gets a line for what is left out.
+    failures : Failures
+        Takes note of those whose answers cannot be read, who are then left out.
+
+    Raises
+    ------
+    StoreError
+        If a run that is named by itself answers none of the queries.
+    ConfigError
+        If nobody answers any task.
+    """
+    files: dict[str, dict[str, Prediction]] = {}
+    for entry in entries:
+        with failures.of(entry.name):
+            if not entry.runs:
+                files[entry.name] = _rows_of_file(entry)
+    is_chosen = bool(folders)
+    found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
+    tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
+    told: list[Told] = []
+    stale: list[Path] = []
+    for entry in (entry for entry in entries if entry.name not in failures.found):
+        with failures.of(entry.name):
+            item, others = _told(entry, tasks, files.get(entry.name))
+            stale += others
+            told += [item] if item.asked else []
+    if not told and failures.first is not None:
+        raise failures.first
+    refused = next((source for source in stale if source in named), None)
+    if refused is not None or (stale and not told):
+        holder = "these tasks do" if is_chosen else "its task does"
+        message = (
+            f"{refused or stale[0]} holds answers to other queries than {holder} now: "
+            "run again (what is answered already is kept), or make the old queries again"
+        )
+        raise StoreError(message)
+    if not told:
+        message = (
+            f"there is nothing to score: no task in {root / 'tasks'} is answered "
+            "(--out names another root, --tasks the tasks themselves)"
+        )
+        raise ConfigError(message)
+    if stale:
+        listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
+        tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
+    return told
+
+
+def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None) -> tuple[Told, list[Path]]:
+    """A contestant with its answers; the folders of those of its runs that answer none of the tasks."""
+    if rows is None:
+        return _read_runs(entry, tasks)
+    held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
+    return Told(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
+
+
+def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
+    """Folders of the tasks that a file or a submission is asked."""
+    if entry.submission is None:
+        return frozenset(task.folder for task in tasks)
+    named = {(item.suite, item.region) for item in entry.submission.tasks}
+    return frozenset(task.folder for task in tasks if (task.about["suite"], task.about["region"]) in named)
+
+
+def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
+    return {item.query_id: item for source in entry.sources for item in prediction_files.read_predictions(source)}
+
+
+def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Path]]:
+    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
+    by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
+    rows: dict[str, Prediction] = {}
+    runs: list[tuple[Path, Mapping[str, Any]]] = []
+    asked: set[Path] = set()
+    stale: list[Path] = []
+    for source, about in zip(entry.sources, entry.runs, strict=True):
+        task = by_name.get((about["suite"], about["region"]))
+        is_same = task is not None and about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
+        found = (
+            prediction_files.Answers({}, 0)
+            if task is None
+            else prediction_files.read_answers(source, task.asked, is_tied=is_same)
+        )
+        if task is None or not (found.found or is_same):
+            stale.append(source)
+            continue
+        rows |= found.found
+        asked.add(task.folder)
+        runs.append((source, _share_of(about, found)))
+    mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
+    return Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
+
+
+def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Mapping[str, Any]:
+    """What a run took, of its processor seconds the share of the answers that count."""
+    if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
+        return about
+    return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
+
+
+def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
+    """Task folders that runs were made on."""
+    names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
+    folders = [root / "tasks" / suite / region for suite, region in names]
+    return [folder for folder in folders if (folder / task_files.TASK).is_file()]
+
+
+def score_told(
+    told: Sequence[Told],
+    tasks: Sequence[ScoredTask],
+    *,
+    split: Split | None,
+    by_region: Collection[str],
+    failures: Failures,
+) -> dict[str, pd.DataFrame]:
+    """Scored rows by contestant, of those whose answers can be scored.
+
+    Parameters
+    ----------
+    told : sequence of Told
+        Contestants with their answers.
+    tasks : sequence of ScoredTask
+        What was asked, with truths.
+    split : Split, optional
+        Says which blocks are one place.
+    by_region : collection of str
+        Suites whose regions are resampled, not their blocks.
+    failures : Failures
+        Takes note of the others.
+
+    Raises
+    ------
+    StoreError, ConfigError
+        The first fault, if nobody is left.
+    """
+    folders, found = [task.folder for task in tasks], {}
+    for item in told:
+        with failures.of(item.entry.name):
+            if item.entry.how == AS_SUBMITTED:
+                check_submitted(item.entry, folders, split)
+            scored = _scored(item, tasks, split, by_region)
+            hold_controls({item.entry.name: scored})  # so that whoever it fails with is known
+            found[item.entry.name] = scored
+    if not found and failures.first is not None:
+        raise failures.first
+    return found
+
+
+def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
+    """Refuse a file or submission that is not what the tasks ask for; queries without a row are misses.
+
+    Raises
+    ------
+    ConfigError
+        With the first fault, and how many there are.
+    StoreError
+        If it cannot be read.
+    """
+    path = entry.sources[0]
+    if entry.submission is None:
+        found = validate(path, folders)
+    else:
+        path = path.parents[1]
+        found = submission_faults(path, entry.submission, folders, places=() if split is None else tuple(split.blocks))
+    faults = [fault for fault in found if not fault.is_missing_row]
+    if faults:
+        message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
+        raise ConfigError(message)
+
+
+def _scored(told: Told, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]) -> pd.DataFrame:
+    """All tasks that one contestant was asked, one row for each query."""
+    place_of = {} if split is None else split.place_of
+    frames = []
+    for task in tasks:
+        if task.folder not in told.asked:
+            continue
+        names = [head.query_id for head in task.heads]
+        mine = {name: told.predictions[name] for name in names if name in told.predictions}
+        frame = score_task(task.heads, task.truths, mine, place_of=place_of)
+        frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in by_region else frame)
+    return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Controls of a board: queries whose right score is known beforehand, held against what was scored."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.measures import is_present, primary_of
+from sasgeo_bench.scoring.rows import name_alone
+from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
+from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
+
+ORACLE: Final = "oracle_pose"
+REFERENCE: Final = "fft_vote"  # the plainest search there is: a view without error it must find
+ALPHA: Final = 1e-4  # of each test against chance: a board holds dozens of them
+NEARLY_ALL: Final = 0.9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What came of one control.
+
+    Parameters
+    ----------
+    control : str
+        As in "shuffled map at chance".
+    matcher : str
+        Whose answers.
+    n : int
+        Queries.
+    found : float
+        Of them right (a tie counts by its chance), or answered where none must be.
+    expected : float
+        What it should be: by chance, at least, or at most, as `control` says.
+    p : float
+        Chance of as many or more, if nothing but chance is at work; NaN where nothing is tested.
+    holds : bool
+        Whether the board can be trusted in this.
+    """
+
+    control: str
+    matcher: str
+    n: int
+    found: float
+    expected: float
+    p: float
+    holds: bool
+
+    def to_text(self) -> str:
+        """One line.
+
+        Examples
+        --------
+        >>> Verdict(control="blind views withheld", matcher="m", n=4, found=4.0, expected=0.0, p=math.nan, holds=False
+        ... ).to_text()
+        'blind views withheld: FAILED by m, 4 of 4 where 0 are expected'
+        """
+        word = "held" if self.holds else "FAILED"
+        chance = "" if math.isnan(self.p) else f" (p {self.p:.2g})"
+        figures = f"{self.found:g} of {self.n} where {self.expected:.3g} are expected{chance}"
+        return f"{self.control}: {word} by {self.matcher}, {figures}"
+
+
+def is_control(scores: pd.DataFrame) -> Bools:
+    """Which scored rows are of the suite of controls."""
+    return (scores["suite"] == CONTROLS).to_numpy(bool)
+
+
+def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
+    """Hold all that was scored against what must come of it.
+
+    Parameters
+    ----------
+    scored : mapping of str to pandas.DataFrame
+        By matcher, from `score.score_task`: every row, those of the suite `controls` among them.
+
+    Returns
+    -------
+    tuple of Verdict
+        Of every control and matcher that answered it; none for a matcher without a row, or that cannot.
+
+    Examples
+    --------
+    >>> hold_controls({})
+    ()
+    """
+    verdicts: list[Verdict] = []
+    for matcher, frame in scored.items():
+        asked = frame[~frame["status"].isin((MISSING, NOT_APPLICABLE))]
+        name = name_alone(matcher)
+        if name == ORACLE:
+            verdicts += _perfect(matcher, asked)
+            continue
+        controls = asked[is_control(asked)]
+        verdicts += _by_chance(matcher, controls)
+        verdicts += _withheld(matcher, controls)
+        if name == REFERENCE:
+            verdicts += _nearly_all(matcher, controls)
+    return tuple(sorted(verdicts, key=lambda item: (item.holds, item.control, item.matcher)))
+
+
+def verdict_frame(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """Verdicts as a table with the columns of `Verdict`."""
+    columns = [field.name for field in fields(Verdict)]
+    return pd.DataFrame([{name: getattr(item, name) for name in columns} for item in verdicts], columns=columns)
+
+
+def hits(scores: pd.DataFrame) -> Floats:
+    """The primary figure of each row, shape (N,): 1 where it is right, of a tie its chance."""
+    parts = [
+        pd.Series(primary_of(str(track)).values(part), index=part.index) for track, part in scores.groupby("track")
+    ]
+    joined = pd.concat(parts).reindex(scores.index) if parts else pd.Series(dtype=float)
+    return np.asarray(joined, dtype=np.float64)
+
+
+def chances(scores: pd.DataFrame) -> Floats:
+    """What a blind guess is worth in each row, shape (N,): of candidates, or of a prior's disc."""
+    radii_m = [PriorGroup.parse(name).radius_m or math.inf for name in scores["prior_group"]]
+    discs = np.minimum(1.0, (FIX_M / np.array(radii_m, dtype=float)) ** 2)
+    pools = scores["pool"].to_numpy(float)
+    is_retrieval = (scores["track"] == "retrieval").to_numpy(bool)
+    return np.asarray(np.where(is_retrieval, 1 / np.maximum(pools, 1), discs), dtype=np.float64)
+
+
+def at_least(count: float, each: Floats) -> float:
+    """Chance of at least `count` hits in independent trials, each with its own (Poisson's binomial).
+
+    Examples
+    --------
+    >>> at_least(2, np.array([0.5, 0.5]))
+    0.25
+    """
+    ways = np.ones(1)
+    for chance in each:
+        ways = np.convolve(ways, (1 - chance, chance))
+    return float(min(1.0, ways[math.ceil(count - 1e-9) :].sum()))
+
+
+def _by_chance(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
+    """Whoever knows more than chance where there is nothing to know has it from somewhere else."""
+    for kind, name in (
+        (SHUFFLED, "shuffled map at chance"),
+        (TURNED, "turned map at chance"),
+        (TWINS, "identical twins tie"),
+    ):
+        mine = controls[controls["kind"] == kind]
+        if not len(mine):
+            continue
+        found = float(hits(mine).sum())
+        each = np.full(len(mine), 0.5) if kind == TWINS else chances(mine)
+        p = at_least(found, each)
+        yield Verdict(
+            control=name,
+            matcher=matcher,
+            n=len(mine),
+            found=found,
+            expected=float(each.sum()),
+            p=p,
+            holds=p >= ALPHA,
+        )
+
+
+def _withheld(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
+    """Who sees nothing must say nothing."""
+    blind = controls[controls["kind"] == BLIND]
+    if len(blind):
+        answered = float(blind["is_answered"].sum())
+        yield _exact("blind views withheld", matcher, len(blind), found=answered, expected=0.0)
+
+
+def _nearly_all(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
+    """A view without error is found, or the search, the map or the truth is at fault."""
+    clear = controls[controls["kind"] == NOISE_FREE]
+    if len(clear):
+        found, least = float(hits(clear).sum()), NEARLY_ALL * len(clear)
+        yield Verdict(
+            control="views without error found, at least",
+            matcher=matcher,
+            n=len(clear),
+            found=found,
+            expected=least,
+            p=math.nan,
+            holds=found >= least,
+        )
+
+
+def _perfect(matcher: str, asked: pd.DataFrame) -> Iterator[Verdict]:
+    """Who is given the truth is always right, and withholds where there is none; else scorer or truth is at fault."""
+    present, absent = asked[is_present(asked)], asked[~is_present(asked)]
+    if len(present):
+        found = float(hits(present).sum())
+        yield _exact("oracle always right", matcher, len(present), found=found, expected=float(len(present)))
+    if len(absent):
+        found = float(absent["is_answered"].sum())
+        yield _exact("oracle withholds absent places", matcher, len(absent), found=found, expected=0.0)
+
+
+def _exact(control: str, matcher: str, n: int, *, found: float, expected: float) -> Verdict:
+    return Verdict(
+        control=control, matcher=matcher, n=n, found=found, expected=expected, p=math.nan, holds=found == expected
+    )

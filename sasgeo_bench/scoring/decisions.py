@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers that may be withheld: who accepts them, what comes of it, and what it costs.
+
+Every query counts. One without an answer (withheld, crash, time-out) can never be accepted. An answer without a
+confidence is trusted less than all answers with one; if no answer has one, all are trusted alike.
+"""
+
+import math
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, Metric, check_column, check_weights, weighted_mean
+
+COST_RATIOS: Final = (5.0, 20.0, 100.0)
+PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answers:
+    """N queries as the integrity track sees them, present and absent places mixed; each column has shape (N,).
+
+    Parameters
+    ----------
+    confidence : ndarray of float
+        Probability that the fix is right, or any other number that grows with trust; NaN where none is given. It is
+        not looked at where there is no answer.
+    is_answered : ndarray of bool
+        Whether there is a fix that could be accepted.
+    is_right : ndarray of bool
+        Whether the fix is within tolerance of a place that is present.
+    is_present : ndarray of bool
+        Whether the place is on the map that is searched.
+
+    Raises
+    ------
+    MetricError
+        If shapes differ, a confidence is infinite, or a fix is right without an answer or without a place.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.9, np.nan], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 0, 0])
+    >>> some.tie.tolist()
+    [0, 0, 1]
+    """
+
+    confidence: Floats
+    is_answered: Bools
+    is_right: Bools
+    is_present: Bools
+    tie: Ints = field(init=False)  # group of equal confidence, 0 the most confident; the unanswered are the last group
+    steps: Floats = field(init=False)  # confidence of each group; -inf for answers without one
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be; group equal confidences, once for all figures and draws."""
+        count = np.size(self.is_answered)
+        for name in ("is_answered", "is_right", "is_present"):
+            object.__setattr__(self, name, check_column(getattr(self, name), name, count) > 0)
+        given = np.asarray(self.confidence, dtype=np.float64)
+        if given.shape != (count,) or np.isinf(given[self.is_answered]).any():
+            message = f"confidence has shape {given.shape}, expected ({count},), each a finite number or NaN"
+            raise MetricError(message)
+        if (self.is_right & ~(self.is_answered & self.is_present)).any():
+            message = "a fix is right only where there is an answer and the place is present: mend is_right"
+            raise MetricError(message)
+        key = np.where(self.is_answered, np.nan_to_num(given, nan=-np.inf), -np.inf)
+        values, group = np.unique(-key[self.is_answered], return_inverse=True)
+        tie = np.full(count, len(values), dtype=np.int64)
+        tie[self.is_answered] = group
+        object.__setattr__(self, "confidence", np.where(self.is_answered, given, np.nan))
+        object.__setattr__(self, "tie", tie)
+        object.__setattr__(self, "steps", -values)
+
+    def __len__(self) -> int:
+        """Give the number of queries."""
+        return len(self.tie)
+
+
+def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | None = None) -> Floats:
+    """Weights under which places are present in a given share of the queries, as 0.9, 0.7 or 0.5.
+
+    Parameters
+    ----------
+    is_present : array_like of bool, shape (N,)
+        Whether each place is on the map.
+    share : float
+        In [0, 1].
+    weights : array_like, shape (N,), optional
+        What is to be reweighted; 1 each where not given.
+
+    Returns
+    -------
+    ndarray of float, shape (N,)
+        They sum to what `weights` sum to.
+
+    Raises
+    ------
+    MetricError
+        If a side that is to count has no query.
+
+    Examples
+    --------
+    >>> presence_weights([True, True, True, False], 0.5).round(3).tolist()
+    [0.667, 0.667, 0.667, 2.0]
+    """
+    present = check_column(is_present, "is_present") > 0
+    mass = check_weights(weights, len(present))
+    if not 0 <= share <= 1:
+        message = f"share must lie in [0, 1], got {share!r}"
+        raise MetricError(message)
+    wanted = np.where(present, share, 1.0 - share)
+    there = np.where(present, mass[present].sum(), mass[~present].sum()) / max(float(mass.sum()), np.finfo(float).tiny)
+    for side, part in (("present", share), ("absent", 1.0 - share)):
+        if part > 0 and len(present) and not (mass[present == (side == "present")] > 0).any():
+            message = f"no query has its place {side}, so none can count {part:g}: draw some, or ask for another share"
+            raise MetricError(message)
+    return np.asarray(mass * np.divide(wanted, there, out=np.zeros(len(mass)), where=there > 0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcomes:
+    """What a decision led to, each of shape (N,); every query has exactly one.
+
+    A withheld fix is wrongly withheld if it would have been right. All else that is not accepted is correctly withheld:
+    a false fix, an absent place, and a query without an answer, for there nothing right was withheld (Eq. (13)).
+    """
+
+    false_fix: Bools
+    right_fix: Bools
+    correctly_withheld: Bools
+    wrongly_withheld: Bools
+
+    def shares(self, weights: ArrayLike | None = None) -> dict[str, float]:
+        """Share of all queries with each outcome; NaN for no queries."""
+        names = ("false_fix", "right_fix", "correctly_withheld", "wrongly_withheld")
+        return {name: weighted_mean(getattr(self, name), weights) for name in names}
+
+
+def accept(answers: Answers, threshold: float) -> Bools:
+    """Which fixes are accepted: those with `confidence >= threshold`.
+
+    Parameters
+    ----------
+    answers : Answers
+        Of N queries.
+    threshold : float
+        `-inf` accepts every answer, even one without a confidence; `inf` none.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        Never True without an answer.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.5, 0.4], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 1, 1])
+    >>> accept(some, 0.5).tolist(), accept(some, -np.inf).tolist()
+    ([True, True, False], [True, True, False])
+    """
+    return np.append(answers.steps >= threshold, False)[answers.tie]  # the last group has no answer
+
+
+def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
+    """Which fixes Eq. (14) accepts: those whose chance to be false is below 1 / (1 + cost ratio).
+
+    Parameters
+    ----------
+    answers : Answers
+        With confidences that are probabilities.
+    cost_ratio : float
+        Cost of a false fix over that of withholding a right one: 5, 20 or 100.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        False without an answer or without a confidence: nothing is known of its risk.
+
+    Raises
+    ------
+    MetricError
+        If the ratio is not positive, or a confidence is no probability.
+
+    Notes
+    -----
+    The SASGeo paper, Eqs. (12)-(14), with P(F=1|E) = 1 - confidence; strict, as printed there.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.8, np.nan], is_answered=[1, 1, 1], is_right=[1, 0, 0], is_present=[1, 1, 1])
+    >>> accept_by_cost(some, 5.0).tolist()
+    [True, False, False]
+    """
+    _check_ratio(cost_ratio)
+    check_probabilities(answers)
+    return np.asarray(1.0 - answers.confidence < 1.0 / (1.0 + cost_ratio))  # NaN compares as False
+
+
+def _check_ratio(cost_ratio: float) -> None:
+    if not 0 < cost_ratio < math.inf:
+        message = f"cost_ratio must be positive and finite, got {cost_ratio!r}"
+        raise MetricError(message)
+
+
+def check_probabilities(answers: Answers) -> None:
+    """Refuse confidences outside [0, 1].
+
+    Raises
+    ------
+    MetricError
+        With what they reach.
+    """
+    given = answers.confidence[~np.isnan(answers.confidence)]
+    if ((given < 0) | (given > 1)).any():
+        message = f"confidences reach from {given.min():g} to {given.max():g}, expected probabilities in [0, 1]"
+        raise MetricError(message)
+
+
+def outcomes(answers: Answers, accepted: ArrayLike) -> Outcomes:
+    """What a decision leads to.
+
+    Parameters
+    ----------
+    answers : Answers
+        Of N queries.
+    accepted : array_like of bool, shape (N,)
+        From `accept` or `accept_by_cost`.
+
+    Returns
+    -------
+    Outcomes
+        One for each query.
+
+    Raises
+    ------
+    MetricError
+        If a query without an answer is accepted.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[0, 1], is_present=[1, 1])
+    >>> outcomes(some, [True, False]).shares()
+    {'false_fix': 0.5, 'right_fix': 0.0, 'correctly_withheld': 0.0, 'wrongly_withheld': 0.5}
+    """
+    taken = check_column(accepted, "accepted", len(answers)) > 0
+    if (taken & ~answers.is_answered).any():
+        message = "a query without an answer is accepted: decide with accept() or accept_by_cost()"
+        raise MetricError(message)
+    return Outcomes(
+        false_fix=taken & ~answers.is_right,
+        right_fix=taken & answers.is_right,
+        correctly_withheld=~taken & ~answers.is_right,
+        wrongly_withheld=~taken & answers.is_right,
+    )
+
+
+def cost_values(
+    answers: Answers, accepted: ArrayLike, cost_ratio: float, *, charged: Literal["right fix", "place"] = "right fix"
+) -> Floats:
+    """Cost of each query's decision, in units of a wrongly withheld fix.
+
+    Parameters
+    ----------
+    answers : Answers
+        Of N queries.
+    accepted : array_like of bool, shape (N,)
+        The decision.
+    cost_ratio : float
+        Cost of a false fix.
+    charged : {"right fix", "place"}
+        What costs 1 when withheld: a right fix (Eq. (13); it judges the decision, whatever the answers are worth), or
+        every place that is present (it judges the whole method: false answers withheld, and none, are still no fixes).
+        By the first alone a matcher that is never right and withholds all would have cost 0.
+
+    Returns
+    -------
+    ndarray of float, shape (N,)
+        0, 1 or `cost_ratio`.
+
+    Raises
+    ------
+    MetricError
+        If the ratio is not positive.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.2], is_answered=[1, 1], is_right=[0, 0], is_present=[1, 1])
+    >>> cost_values(some, [True, False], 20.0).tolist()
+    [20.0, 0.0]
+    >>> cost_values(some, [True, False], 20.0, charged="place").tolist()
+    [20.0, 1.0]
+    """
+    _check_ratio(cost_ratio)
+    found = outcomes(answers, accepted)
+    withheld = found.correctly_withheld | found.wrongly_withheld
+    missed = found.wrongly_withheld if charged == "right fix" else withheld & answers.is_present
+    return np.asarray(cost_ratio * found.false_fix + missed)
+
+
+def decision_cost(
+    answers: Answers,
+    cost_ratio: float,
+    weights: ArrayLike | None = None,
+    *,
+    charged: Literal["right fix", "place"] = "right fix",
+) -> float:
+    """Mean cost of a query when fixes are accepted by Eq. (14), in units of a wrongly withheld fix.
+
+    Parameters
+    ----------
+    answers : Answers
+        With confidences that are probabilities.
+    cost_ratio : float
+        Cost of a false fix: 5, 20 or 100.
+    weights : array_like, shape (N,), optional
+        Not negative.
+    charged : {"right fix", "place"}
+        As in `cost_values`.
+
+    Returns
+    -------
+    float
+        Not negative; NaN for no queries.
+
+    Examples
+    --------
+    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1])
+    >>> decision_cost(some, 5.0)
+    0.5
+    """
+    return weighted_mean(
+        cost_values(answers, accept_by_cost(answers, cost_ratio), cost_ratio, charged=charged), weights
+    )
+
+
+METRICS: Final = tuple(
+    Metric(
+        name=f"cost_{ratio:g}",
+        unit="1",
+        better="lower",
+        bounds=(0.0, ratio),
+        compute=partial(decision_cost, cost_ratio=ratio),
+        source="the SASGeo paper, Eqs. (12)-(14)",
+    )
+    for ratio in COST_RATIOS
+)

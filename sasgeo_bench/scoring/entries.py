@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who is to be scored: matchers as they were run, and files of predictions."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from itertools import compress
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
+from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.matcher import check_identity
+from sasgeo_bench.matching.plugins import ORACLE
+from sasgeo_bench.matching.submission import Submission
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.scoring.cost import run_cost
+from sasgeo_bench.scoring.rows import AS_SUBMITTED, RUN_HERE, is_unranked
+from sasgeo_bench.scoring.submission_files import predictions_name, read_submission
+from sasgeo_bench.tasks.query import base_of
+
+FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One contestant: a matcher as it was run, a file of predictions, or a submission.
+
+    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them. Of a submission
+    `submission` is what its `submission.json` says.
+    """
+
+    name: str
+    version: str
+    hash: str
+    how: str
+    sources: tuple[Path, ...]
+    runs: tuple[Mapping[str, Any], ...] = ()
+    submission: Submission | None = None
+
+    @property
+    def card(self) -> dict[str, Any] | None:
+        """What a contestant says of itself; None for a file of predictions."""
+        if self.submission is not None:
+            return self.submission.card.model_dump(mode="json")
+        return dict(self.runs[0]["matcher"]) if self.runs else None
+
+    @property
+    def declared(self) -> list[str] | None:
+        """Places that it says have taught it, before any runner did; None where it says nothing."""
+        if self.submission is not None:
+            return list(self.submission.card.places)
+        said = self.runs[0]["matcher"].get("trained_on") if self.runs else None
+        return [str(place) for place in said] if isinstance(said, list) else None
+
+    @property
+    def is_taught(self) -> bool:
+        """Whether the halves of a split were answered after other training."""
+        return bool(self.learned()) or (self.submission is not None and self.submission.card.is_by_half)
+
+    def learned(self) -> list[dict[str, Any]]:
+        """What the runner has taught it: each text once, where it comes from, and the tasks asked under it."""
+        found: dict[str, dict[str, Any]] = {}
+        for about in self.runs:
+            said = LearnedSaid.of(about)
+            if said is not None:
+                one = found.setdefault(said.key, {**asdict(said), "trained_on": list(said.trained_on), "asked": []})
+                one["asked"].append(f"{about['suite']}/{about['region']}")
+        return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
+
+
+def find_entries(
+    paths: Sequence[Path], submissions: Sequence[Path] = (), *, failures: Failures | None = None
+) -> tuple[Entry, ...]:
+    """Who is to be scored.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Folders with runs somewhere in them, and files of predictions.
+    submissions : sequence of Path
+        Folders of submissions.
+    failures : Failures, optional
+        Takes note of runs and submissions that cannot be read, which are then left out.
+
+    Returns
+    -------
+    tuple of Entry
+        By name; two versions of one matcher are two entries, with the version in their names, and with the hash where
+        that is the same.
+
+    Raises
+    ------
+    StoreError
+        If a path holds no predictions, a `run.json` does not say whose answers lie beside it, or a submission is not
+        what it says.
+    ConfigError
+        If two contestants have one name, or a file or submission that of a control.
+    """
+    runs: list[Path] = []
+    files: list[Entry] = []
+    seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
+    for path in paths:
+        if path.is_file():
+            if _is_new(path, seen):
+                files.append(_file_entry(path))
+            continue
+        found = sorted(path.rglob(prediction_files.RUN))
+        if not found:
+            message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
+            raise StoreError(message)
+        runs += [run for run in found if _is_new(run, seen)]
+    by_run = _by_run(runs, failures)
+    names = [name for name, _, _ in by_run]
+    versions = [(name, number) for name, number, _ in by_run]
+
+    def shown(name: str, number: str, digest: str) -> str:
+        """As short as it can be and still be one contestant's alone."""
+        if names.count(name) == 1:
+            return name
+        return f"{name} {number}" if versions.count((name, number)) == 1 else f"{name} {number} ({digest[:6]})"
+
+    entries = [
+        Entry(
+            name=shown(name, number, digest),
+            version=number,
+            hash=digest,
+            how=RUN_HERE,
+            sources=tuple(folder for folder, _ in found),
+            runs=tuple(about for _, about in found),
+        )
+        for (name, number, digest), found in by_run.items()
+    ]
+    entries += files
+    entries += _all_submitted(submissions, failures)
+    listed = [entry.name for entry in entries]
+    # No submission passes for a version of what is there: "mine" beside "mine 1" would be told apart by no reader.
+    twice = next(
+        (
+            one.name
+            for one in entries
+            if listed.count(one.name) > 1 or (one.submission is not None and one.name in names)
+        ),
+        None,
+    )
+    if twice is not None:
+        message = f"two contestants are named {twice!r}: rename the file or the submission of one"
+        raise ConfigError(message)
+    return tuple(sorted(entries, key=lambda entry: entry.name))
+
+
+def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Entry, ...]:
+    """Leave out what was run on some regions, on each of their maps; who is left without a run is left out.
+
+    Raises
+    ------
+    ConfigError
+        If no run is on one of them, or all are, or an entry is a file, which does not say where its queries are.
+
+    Examples
+    --------
+    >>> leave_out((), ())
+    ()
+    """
+    if not regions:
+        return entries
+    file = next((entry for entry in entries if not entry.runs), None)
+    if file is not None:
+        message = f"{file.sources[0]} is a file of predictions, of which no region can be left out: name runs alone"
+        raise ConfigError(message)
+    known = {base_of(about["region"]) for entry in entries for about in entry.runs}
+    unknown = sorted(set(regions) - known)
+    if unknown:
+        message = f"no run is on {unknown[0]!r}: regions that can be left out are {', '.join(sorted(known))}"
+        raise ConfigError(message)
+    if known <= set(regions):
+        message = "there is nothing to score: every run is on a region that is left out, leave fewer out (--without)"
+        raise ConfigError(message)
+    kept = [[base_of(about["region"]) not in regions for about in entry.runs] for entry in entries]
+    return tuple(
+        replace(entry, sources=tuple(compress(entry.sources, keep)), runs=tuple(compress(entry.runs, keep)))
+        for entry, keep in zip(entries, kept, strict=True)
+        if any(keep)
+    )
+
+
+def _by_run(
+    paths: Sequence[Path], failures: Failures | None
+) -> dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]]:
+    """Runs by name, version and hash; who has one that cannot be read has none, for a part would be ranked as all."""
+    read: dict[Path, dict[str, Any]] = {}
+    for path in paths:
+        with _noted(failures, str(path.parent)):
+            read[path] = _read_run(path)
+    lost = {_root_of(path) for path in paths if path not in read}
+    found: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
+    for path, about in read.items():
+        if _root_of(path) not in lost:
+            card = about["matcher"]
+            found.setdefault((card["name"], card["version"], about["hash"]), []).append((path.parent, about))
+    return found
+
+
+def _root_of(run: Path) -> Path:
+    """Folder of all runs of a matcher with one hash, above suite and region."""
+    return list(run.resolve().parents)[:3][-1]
+
+
+def _noted(failures: Failures | None, name: str) -> AbstractContextManager[None]:
+    return nullcontext() if failures is None else failures.of(name)
+
+
+def _all_submitted(folders: Sequence[Path], failures: Failures | None) -> list[Entry]:
+    found = []
+    for folder in folders:
+        with _noted(failures, folder.name):
+            found.append(_submitted(folder))
+    return found
+
+
+def _is_new(path: Path, seen: set[Path]) -> bool:
+    place = path.parent.resolve() / path.name
+    is_new = place not in seen
+    seen.add(place)
+    return is_new
+
+
+def _file_entry(path: Path) -> Entry:
+    if not FILE_NAME.fullmatch(path.stem):
+        message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
+        raise ConfigError(message)
+    _check_free(path.stem, path)
+    return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
+
+
+def _check_free(name: str, path: Path) -> None:
+    """Refuse the name of a control: its row would stand beside the ranks."""
+    if is_unranked(name):
+        message = f"{path.name!r}: {name!r} is the name of a control of every board: choose another name"
+        raise ConfigError(message)
+
+
+def _submitted(folder: Path) -> Entry:
+    said = read_submission(folder)
+    _check_free(said.card.name, folder)
+    return Entry(
+        name=said.card.name,
+        version=said.card.version,
+        hash="",
+        how=AS_SUBMITTED,
+        sources=(folder / predictions_name(said.card.name),),
+        submission=said,
+    )
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """What a `run.json` says, after a look at whatever a board takes from it: it may be anyone's."""
+    about = prediction_files.read_run(path.parent) or {}
+    card = about.get("matcher")
+    said = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
+    if isinstance(card, dict):
+        said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
+    fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
+    try:
+        check_identity(str(said["matcher.name"]), str(said["matcher.version"]))
+        run_cost(about)
+        LearnedSaid.of(about)
+    except (MatchError, MetricError) as error:
+        fault = fault or str(error)
+    if said["matcher.name"] == ORACLE != about.get("spec", ORACLE):
+        fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
+    if fault is not None:
+        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
+        raise StoreError(message)
+    return about

@@ -1,0 +1,346 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far the first pose is from the truth: errors, success within metres and degrees, every query counted."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.base import Bools, Floats, Metric, check_column, weighted_mean, weighted_quantile
+from sasgeo_bench.scoring.ranking import MISS, Rank, rank_of
+from sasgeo_bench.tasks.query import Truth
+
+SUCCESS_M: Final = (5.0, 10.0, 25.0)
+SUCCESS_DEG: Final = 5.0
+AUC_M: Final = 50.0
+QUANTILES: Final = (0.5, 0.9, 0.99)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseErrors:
+    """Errors of N answers, each of shape (N,) and not negative; infinite where there is no answer.
+
+    Parameters
+    ----------
+    position_m : ndarray of float
+        Distance on the map's plane.
+    yaw_deg : ndarray of float
+        Unsigned, in [0, 180].
+    log_scale : ndarray of float
+        |ln(scale / true scale)|: twice too large and half as large are equally wrong, and 0.1 is about 10 %.
+    """
+
+    position_m: Floats
+    yaw_deg: Floats
+    log_scale: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not belong together."""
+        count = np.size(self.position_m)
+        for name in ("position_m", "yaw_deg", "log_scale"):
+            column = check_column(getattr(self, name), name, count)
+            if (column < 0).any():
+                message = f"{name} holds {column.min():g}, errors are not negative"
+                raise MetricError(message)
+            object.__setattr__(self, name, column)
+
+
+def first_pose(prediction: Prediction | None) -> Pose | None:
+    """The fix of an answer: its first pose; None for no row, no answer, a crash or a time-out.
+
+    Of poses with equal scores the one that is listed first counts: it is what would be flown by.
+
+    Examples
+    --------
+    >>> first_pose(Prediction(query_id="a", status="timeout")) is None
+    True
+    """
+    if prediction is None or prediction.status != "ok" or not prediction.candidates:
+        return None
+    return prediction.candidates[0][0]
+
+
+def pose_errors(answers: Sequence[Pose | None], truths: Sequence[Pose]) -> PoseErrors:
+    """Errors of some fixes.
+
+    Parameters
+    ----------
+    answers : sequence of Pose or None, length N
+        None where there is no answer: its errors are infinite.
+    truths : sequence of Pose, length N
+        Where each view was taken.
+
+    Returns
+    -------
+    PoseErrors
+        Of every query, none left out and none clipped.
+
+    Raises
+    ------
+    MetricError
+        If there are not as many answers as truths.
+
+    Examples
+    --------
+    >>> truth = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=350.0)
+    >>> errors = pose_errors([Pose(easting_m=3.0, northing_m=4.0, yaw_deg=10.0), None], [truth, truth])
+    >>> errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist()
+    ([5.0, inf], [20.0, inf], [0.0, inf])
+    """
+    if len(answers) != len(truths):
+        message = f"{len(answers)} answers for {len(truths)} truths: give None where there is no answer"
+        raise MetricError(message)
+    nothing = (math.inf,) * 4
+    given = np.array([nothing if pose is None else _numbers(pose) for pose in answers]).reshape(-1, 4)
+    true = np.array([_numbers(pose) for pose in truths]).reshape(-1, 4)
+    is_given = np.array([pose is not None for pose in answers], dtype=bool)
+    gap = np.where(is_given[:, None], given, true) - true
+    ratio = np.where(is_given, given[:, 3], true[:, 3]) / true[:, 3]
+    return PoseErrors(
+        position_m=np.where(is_given, np.hypot(gap[:, 0], gap[:, 1]), np.inf),
+        yaw_deg=np.where(is_given, np.abs(wrap_deg(gap[:, 2])), np.inf),
+        log_scale=np.where(is_given, np.abs(np.log(ratio)), np.inf),
+    )
+
+
+def _numbers(pose: Pose) -> tuple[float, float, float, float]:
+    return (pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale)
+
+
+def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_DEG) -> Bools:
+    """Which fixes are right: `position_m <= within_m` and `yaw_deg <= within_deg`.
+
+    Parameters
+    ----------
+    errors : PoseErrors
+        Of N queries.
+    within_m : float
+        Finite, metres.
+    within_deg : float
+        Degrees; 180 where the heading does not count.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        False without an answer.
+
+    Raises
+    ------
+    MetricError
+        If a tolerance is negative or `within_m` is not finite.
+
+    Notes
+    -----
+    An error that equals the tolerance is within it, here and everywhere in this room. Metres are those of the region's
+    UTM zone, which differ from metres on the ground by at most 0.1 %.
+
+    Examples
+    --------
+    >>> errors = PoseErrors(position_m=[5.0, 5.1, 0.0], yaw_deg=[5.0, 0.0, 5.1], log_scale=[0.0, 0.0, 0.0])
+    >>> successes(errors, 5.0).tolist()
+    [True, False, False]
+    """
+    if not 0 <= within_m < math.inf or not within_deg >= 0:
+        message = f"tolerances must be finite and not negative, got {within_m!r} m and {within_deg!r} deg"
+        raise MetricError(message)
+    return (errors.position_m <= within_m) & (errors.yaw_deg <= within_deg)
+
+
+def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, within_deg: float = SUCCESS_DEG) -> Rank:
+    """Rank of the best pose within tolerance in an answer to a localization query.
+
+    Parameters
+    ----------
+    prediction : Prediction, optional
+        None where the query has no row at all.
+    truth : Truth
+        Of a place that is present.
+    within_m, within_deg : float
+        Tolerance, as in `successes`.
+
+    Returns
+    -------
+    Rank
+        `MISS` for no answer or none within tolerance.
+
+    Raises
+    ------
+    MetricError
+        If the place is absent: recall is a share of the queries whose place is present.
+    """
+    if not truth.is_present or truth.pose is None:
+        message = (
+            f"query {truth.query_id} has no right pose: "
+            "leave absent places out of recall, the integrity track counts them"
+        )
+        raise MetricError(message)
+    if first_pose(prediction) is None or prediction is None:
+        return MISS
+    poses = [pose for pose, _ in prediction.candidates]
+    errors = pose_errors(poses, [truth.pose] * len(poses))
+    return rank_of([score for _, score in prediction.candidates], successes(errors, within_m, within_deg))
+
+
+def success_rate(
+    errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_DEG, weights: ArrayLike | None = None
+) -> float:
+    """Share of all queries whose fix is within metres and degrees.
+
+    Parameters
+    ----------
+    errors : PoseErrors
+        Of every query whose place is present.
+    within_m, within_deg : float
+        Tolerance, as in `successes`.
+    weights : array_like, shape (N,), optional
+        Not negative.
+
+    Returns
+    -------
+    float
+        In [0, 1]; NaN for no queries.
+
+    Examples
+    --------
+    >>> errors = PoseErrors(position_m=[5.0, np.inf], yaw_deg=[5.0, np.inf], log_scale=[0.0, np.inf])
+    >>> success_rate(errors, 5.0)
+    0.5
+    """
+    return weighted_mean(successes(errors, within_m, within_deg), weights)
+
+
+def error_quantile(errors: ArrayLike, share: float, weights: ArrayLike | None = None) -> float:
+    """Least error that at least a share of all queries does not exceed; infinite where too few were answered.
+
+    Parameters
+    ----------
+    errors : array_like, shape (N,)
+        One column of `PoseErrors`.
+    share : float
+        In (0, 1]: 0.5, 0.9, 0.99.
+    weights : array_like, shape (N,), optional
+        Not negative.
+
+    Returns
+    -------
+    float
+        In the unit of the errors; NaN for no queries.
+
+    Examples
+    --------
+    >>> error_quantile([1.0, 2.0, 3.0, np.inf], 0.5), error_quantile([1.0, 2.0, 3.0, np.inf], 0.9)
+    (2.0, inf)
+    """
+    return weighted_quantile(errors, share, weights)
+
+
+def area_values(errors: PoseErrors, up_to_m: float = AUC_M, within_deg: float = SUCCESS_DEG) -> Floats:
+    """What each query adds to the success AUC: max(0, 1 - error / up_to), 0 where the heading is out of tolerance.
+
+    Parameters
+    ----------
+    errors : PoseErrors
+        Of N queries.
+    up_to_m : float
+        Positive, metres.
+    within_deg : float
+        Degrees; 180 where the heading does not count.
+
+    Returns
+    -------
+    ndarray of float, shape (N,)
+        In [0, 1].
+
+    Raises
+    ------
+    MetricError
+        If `up_to_m` is not positive and finite.
+
+    Examples
+    --------
+    >>> area_values(PoseErrors(position_m=[10.0, 60.0, 0.0], yaw_deg=[0.0, 0.0, 90.0], log_scale=[0.0] * 3)).tolist()
+    [0.8, 0.0, 0.0]
+    """
+    if not 0 < up_to_m < math.inf:
+        message = f"up_to_m must be positive and finite, got {up_to_m!r}"
+        raise MetricError(message)
+    near = np.maximum(0.0, 1.0 - errors.position_m / up_to_m)
+    return np.where(errors.yaw_deg <= within_deg, near, 0.0)
+
+
+def success_auc(
+    errors: PoseErrors,
+    up_to_m: float = AUC_M,
+    within_deg: float = SUCCESS_DEG,
+    weights: ArrayLike | None = None,
+) -> float:
+    """Area under the success rate over its tolerance from 0 to `up_to_m`, divided by `up_to_m`.
+
+    Parameters
+    ----------
+    errors : PoseErrors
+        Of every query whose place is present.
+    up_to_m : float
+        Positive, metres.
+    within_deg : float
+        Tolerance of the heading, the same all along; 180 where it does not count.
+    weights : array_like, shape (N,), optional
+        Not negative.
+
+    Returns
+    -------
+    float
+        In [0, 1]; NaN for no queries.
+
+    Notes
+    -----
+    Exact: the success rate steps up by 1/N at each error e, so that the area is the mean of max(0, 1 - e / up_to).
+
+    Examples
+    --------
+    >>> success_auc(PoseErrors(position_m=[0.0, 25.0, np.inf], yaw_deg=[0.0, 0.0, np.inf], log_scale=[0.0] * 3))
+    0.5
+    """
+    return weighted_mean(area_values(errors, up_to_m, within_deg), weights)
+
+
+METRICS: Final = (
+    *(
+        Metric(
+            name=f"success_{within_m:g}m",
+            unit="1",
+            better="higher",
+            bounds=(0.0, 1.0),
+            compute=partial(success_rate, within_m=within_m),
+            source="share of all queries within metres and 5 deg",
+        )
+        for within_m in SUCCESS_M
+    ),
+    *(
+        Metric(
+            name=f"position_error_p{100 * share:g}_m",
+            unit="m",
+            better="lower",
+            bounds=(0.0, math.inf),
+            compute=partial(error_quantile, share=share),
+            source="Hyndman and Fan, American Statistician 1996, type 1",
+        )
+        for share in QUANTILES
+    ),
+    Metric(
+        name="success_auc_50m",
+        unit="1",
+        better="higher",
+        bounds=(0.0, 1.0),
+        compute=success_auc,
+        source="area under the success rate over its tolerance, exact",
+    ),
+)

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a suite can tell: how alike queries of a block are, and the least difference that would be found."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import norm
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.scoring.base import Ints, block_codes, check_column
+
+ALPHA: Final = 0.05
+POWER: Final = 0.8
+_NOTHING: Final = 1e-12  # a spread this small is one of rounding
+
+
+def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> float:
+    """How much more alike queries of one block are than queries of different blocks.
+
+    Parameters
+    ----------
+    values : array_like, shape (N,)
+        Finite; for two methods, the difference of their hits on each query.
+    blocks : sequence of str or ndarray of int, length N
+        Block of each query.
+
+    Returns
+    -------
+    float
+        At most 1; below 0 where queries of a block are less alike than chance. NaN for fewer than two blocks, with no
+        block of two queries, or where nothing varies.
+
+    Raises
+    ------
+    MetricError
+        If a value is not finite.
+
+    Notes
+    -----
+    The analysis-of-variance estimator for blocks of unequal size (Donner, International Statistical Review 1986):
+    (B - W) / (B + (n0 - 1) W), with B and W the mean squares between and within K blocks and
+    n0 = (N - sum n_k^2 / N) / (K - 1).
+
+    Examples
+    --------
+    >>> intraclass_correlation([1.0, 1.0, 0.0, 0.0], ["a", "a", "b", "b"])
+    1.0
+    """
+    column = check_column(values, "values")
+    if not np.isfinite(column).all():
+        message = "values holds infinity: correlate hits or differences of hits"
+        raise MetricError(message)
+    sizes, code = block_codes(blocks, len(column))
+    count, total = len(sizes), len(column)
+    if count < 2 or total == count:  # noqa: PLR2004 - nothing within or nothing between
+        return math.nan
+    means = np.bincount(code, weights=column) / sizes
+    between = float((sizes * (means - column.mean()) ** 2).sum()) / (count - 1)
+    within = float(((column - means[code]) ** 2).sum()) / (total - count)
+    size = (total - float((sizes**2).sum()) / total) / (count - 1)
+    spread = between + (size - 1) * within
+    return (between - within) / spread if spread > _NOTHING else math.nan
+
+
+def design_effect(sizes: ArrayLike, correlation: float) -> float:
+    """How many times more queries blocks need than independent ones would.
+
+    Parameters
+    ----------
+    sizes : array_like, shape (K,)
+        Queries in each block.
+    correlation : float
+        Within blocks, as from `intraclass_correlation`; below 0 it counts as 0.
+
+    Returns
+    -------
+    float
+        At least 1.
+
+    Raises
+    ------
+    MetricError
+        If there is no block, a block is empty, or the correlation exceeds 1.
+
+    Notes
+    -----
+    Kish 1965: 1 + (m - 1) rho, with m = sum n_k^2 / sum n_k the size of the block of a query picked at random, which
+    for equal blocks is their size.
+
+    Examples
+    --------
+    >>> round(design_effect([50] * 36, 0.05), 2)
+    3.45
+    """
+    column = check_column(sizes, "sizes")
+    if not len(column) or not (column >= 1).all() or not correlation <= 1:
+        message = f"expected blocks with queries in them and a correlation of at most 1, got {correlation!r}"
+        raise MetricError(message)
+    size = float((column**2).sum() / column.sum())
+    return 1.0 + (size - 1.0) * max(correlation, 0.0)
+
+
+def pairs_needed(difference: float, discordant_share: float, *, alpha: float = ALPHA, power: float = POWER) -> int:
+    """Independent pairs that McNemar's test needs to find a difference.
+
+    Parameters
+    ----------
+    difference : float
+        Between two shares, in (0, discordant_share].
+    discordant_share : float
+        Share of queries that just one of the two methods gets right, in (0, 1].
+    alpha : float
+        Two-sided level.
+    power : float
+        Chance to find it, in [0.5, 1).
+
+    Returns
+    -------
+    int
+        How many queries.
+
+    Raises
+    ------
+    MetricError
+        If a number is out of range.
+
+    Notes
+    -----
+    Connor, Biometrics 1987: n = (z_a sqrt(p) + z_b sqrt(p - d^2))^2 / d^2.
+
+    Examples
+    --------
+    Three points with 6 % discordant pairs; as 36 blocks of 50 with a correlation of 0.05 they are just enough:
+
+    >>> pairs_needed(0.03, 0.06)
+    521
+    >>> round(pairs_needed(0.03, 0.06) * design_effect([50] * 36, 0.05)) <= 36 * 50
+    True
+    """
+    low, high = _deviates(alpha, power)
+    if not 0 < difference <= discordant_share <= 1:
+        message = f"expected 0 < difference <= discordant_share <= 1, got {difference!r} and {discordant_share!r}"
+        raise MetricError(message)
+    root = low * math.sqrt(discordant_share) + high * math.sqrt(discordant_share - difference**2)
+    return math.ceil((root / difference) ** 2)
+
+
+@cache
+def _deviates(alpha: float, power: float) -> tuple[float, float]:
+    if not (0 < alpha < 1 and 0.5 <= power < 1):  # noqa: PLR2004 - below, the quadratic's other root would hold
+        message = f"alpha must lie in (0, 1) and power in [0.5, 1), got {alpha!r} and {power!r}"
+        raise MetricError(message)
+    return float(norm.isf(alpha / 2)), float(norm.ppf(power))
+
+
+def detectable_difference(
+    pairs: float, discordant_share: float, *, alpha: float = ALPHA, power: float = POWER
+) -> float:
+    """Least difference of two shares that McNemar's test finds with some independent pairs.
+
+    Parameters
+    ----------
+    pairs : float
+        Independent ones: queries divided by the design effect.
+    discordant_share : float
+        In [0, 1].
+    alpha, power : float
+        As in `pairs_needed`.
+
+    Returns
+    -------
+    float
+        In (0, discordant_share]; infinite where even a difference as large as that would be missed.
+
+    Raises
+    ------
+    MetricError
+        If a number is out of range.
+
+    Notes
+    -----
+    Connor's equation solved for the difference d, a quadratic one:
+    d = sqrt(p) (z_a sqrt(n) + z_b sqrt(n + z_b^2 - z_a^2)) / (n + z_b^2).
+
+    Examples
+    --------
+    >>> round(detectable_difference(521, 0.06), 4)
+    0.03
+    """
+    low, high = _deviates(alpha, power)
+    if not pairs >= 0 or not 0 <= discordant_share <= 1:
+        message = f"expected pairs >= 0 and a discordant share in [0, 1], got {pairs!r} and {discordant_share!r}"
+        raise MetricError(message)
+    # Even if all discordant pairs point one way, d = p: n p^2 must reach (z_a sqrt(p) + z_b sqrt(p - p^2))^2.
+    least = low + high * math.sqrt(1.0 - discordant_share)
+    if pairs * discordant_share < least**2:
+        return math.inf
+    root = low * math.sqrt(pairs) + high * math.sqrt(pairs + high**2 - low**2)
+    return math.sqrt(discordant_share) * root / (pairs + high**2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensitivity:
+    """What a suite can tell of two methods.
+
+    Parameters
+    ----------
+    queries, blocks : int
+        How many there are.
+    discordant_share : float
+        Share of queries on which just one method is right.
+    correlation : float
+        Of the methods' differences within blocks.
+    design_effect : float
+        By how much blocks lessen the queries.
+    detectable : float
+        Least difference of shares that would be found; infinite where none would.
+    """
+
+    queries: int
+    blocks: int
+    discordant_share: float
+    correlation: float
+    design_effect: float
+    detectable: float
+
+
+def sensitivity(
+    first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints, *, alpha: float = ALPHA, power: float = POWER
+) -> Sensitivity:
+    """Minimum detectable difference of two methods on a suite.
+
+    Parameters
+    ----------
+    first, second : array_like, shape (N,)
+        Hits of two methods for the same queries, in [0, 1]; shared hits of tied poses count in proportion.
+    blocks : sequence of str or ndarray of int, length N
+        Block of each query.
+    alpha, power : float
+        As in `pairs_needed`.
+
+    Returns
+    -------
+    Sensitivity
+        Where the correlation cannot be estimated it counts as 0, and its field says NaN.
+
+    Raises
+    ------
+    MetricError
+        If there is no query, or numbers differ.
+
+    Examples
+    --------
+    >>> blocks = [str(at // 50) for at in range(1800)]
+    >>> found = sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks)
+    >>> round(found.discordant_share, 4), round(found.detectable, 4)
+    (0.0633, 0.0166)
+    """
+    ours = check_column(first, "first")
+    apart = ours - check_column(second, "second", len(ours))
+    sizes, _ = block_codes(blocks, len(ours))
+    if not len(sizes):
+        message = "no queries, so no difference can be detected: draw some first"
+        raise MetricError(message)
+    correlation = intraclass_correlation(apart, blocks)
+    effect = design_effect(sizes, 0.0 if math.isnan(correlation) else correlation)
+    share = float(np.abs(apart).mean())
+    return Sensitivity(
+        queries=len(ours),
+        blocks=len(sizes),
+        discordant_share=share,
+        correlation=correlation,
+        design_effect=effect,
+        detectable=detectable_difference(len(ours) / effect, share, alpha=alpha, power=power),
+    )

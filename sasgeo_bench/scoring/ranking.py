@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the right answer stands in a list: recall and reciprocal rank, ties decided, every query counted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import candidates_at
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.base import Floats, Ints, Metric, check_column, weighted_mean
+from sasgeo_bench.tasks.query import Truth
+
+RECALL_AT: Final = (1, 5, 10, 20, 50, 100, 200)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rank:
+    """Where the first right pose of one answer stands.
+
+    Parameters
+    ----------
+    above : int
+        Poses with a higher score.
+    tied : int
+        Poses with the same score, itself among them.
+    right : int
+        How many of the tied ones are right; 0 where no pose of the answer is right or there is no answer.
+
+    Raises
+    ------
+    MetricError
+        If more are right than tied, or a number is negative.
+
+    Examples
+    --------
+    >>> Rank(above=2, tied=1, right=1) == rank_of([9.0, 7.0, 4.0], [False, False, True])
+    True
+    """
+
+    above: int
+    tied: int
+    right: int
+
+    def __post_init__(self) -> None:
+        """Refuse what no list can give."""
+        if not (self.above >= 0 and 0 <= self.right <= self.tied):
+            message = f"a rank has above >= 0 and 0 <= right <= tied, got {self!r}"
+            raise MetricError(message)
+
+
+MISS: Final = Rank(above=0, tied=0, right=0)
+
+
+def rank_of(scores: ArrayLike, is_right: ArrayLike) -> Rank:
+    """Rank of the best right pose of one answer.
+
+    Parameters
+    ----------
+    scores : array_like, shape (K,)
+        Larger is better; in any order.
+    is_right : array_like of bool, shape (K,)
+        Which poses are right.
+
+    Returns
+    -------
+    Rank
+        `MISS` where none is.
+
+    Examples
+    --------
+    >>> rank_of([9.0, 7.0, 7.0, 1.0], [False, False, True, True])
+    Rank(above=1, tied=2, right=1)
+    """
+    score = check_column(scores, "scores")
+    right = check_column(is_right, "is_right", len(score)) > 0
+    if not right.any():
+        return MISS
+    best = score[right].max()
+    ties = score == best
+    return Rank(above=int((score > best).sum()), tied=int(ties.sum()), right=int((ties & right).sum()))
+
+
+def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
+    """Rank of the right candidate in an answer to a retrieval query.
+
+    Parameters
+    ----------
+    prediction : Prediction, optional
+        None where the query has no row at all.
+    truth : Truth
+        With the number of the right candidate.
+    candidates : sequence of Pose
+        Of the query; a pose of the answer is the candidate it lies on.
+
+    Returns
+    -------
+    Rank
+        `MISS` for no answer, a crash, a time-out or an answer that leaves the right candidate out.
+
+    Raises
+    ------
+    MetricError
+        If no candidate is right: recall is a share of the queries whose place is present.
+    """
+    if not 0 <= truth.candidate < len(candidates):
+        message = (
+            f"query {truth.query_id} has no right candidate ({truth.candidate} of {len(candidates)}): "
+            "leave absent places out of recall, the integrity track counts them"
+        )
+        raise MetricError(message)
+    if prediction is None or prediction.status != "ok":
+        return MISS
+    given: set[int] = set()
+    right = []
+    for pose, _ in prediction.candidates:
+        # As in `matcher.check_match`: of two candidates on one spot, the first not given yet.
+        at = next((index for index in candidates_at(pose, candidates) if index not in given), -1)
+        given.add(at)
+        right.append(at == truth.candidate)
+    return rank_of([score for _, score in prediction.candidates], right)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ranks:
+    """Ranks of N queries as columns, each of shape (N,); see `Rank`."""
+
+    above: Ints
+    tied: Ints
+    right: Ints
+
+    @classmethod
+    def of(cls, ranks: Sequence[Rank]) -> Self:
+        """Columns of some ranks.
+
+        Examples
+        --------
+        >>> Ranks.of([Rank(above=1, tied=2, right=1), MISS]).tied.tolist()
+        [2, 0]
+        """
+        table = np.array([(rank.above, rank.tied, rank.right) for rank in ranks], dtype=np.int64).reshape(-1, 3)
+        return cls(above=table[:, 0], tied=table[:, 1], right=table[:, 2])
+
+
+def hits(ranks: Ranks, k: int) -> Floats:
+    """Chance of each query that a right pose is among the first k, if tied poses are put in random order.
+
+    Parameters
+    ----------
+    ranks : Ranks
+        Of N queries.
+    k : int
+        At least 1.
+
+    Returns
+    -------
+    ndarray of float, shape (N,)
+        In [0, 1]; 0 or 1 where nothing is tied. Its mean is Recall@k.
+
+    Raises
+    ------
+    MetricError
+        If k is less than 1.
+
+    Notes
+    -----
+    With m places left for t tied poses of which r are right, all r are left out with chance C(t - r, m) / C(t, m),
+    which is the product of (t - m - j) / (t - j) over j < r. With one right pose the chance to be in is m / t.
+
+    Examples
+    --------
+    >>> ranks = Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=0, tied=4, right=1), MISS])
+    >>> hits(ranks, 1).tolist(), hits(ranks, 5).tolist()
+    ([1.0, 0.25, 0.0], [1.0, 1.0, 0.0])
+    """
+    _check_k(k)
+    places = np.clip(k - ranks.above, 0, ranks.tied)
+    left_out = np.ones(len(places))
+    for step in range(int(ranks.right.max(initial=0))):
+        share = np.maximum(ranks.tied - places - step, 0) / np.maximum(ranks.tied - step, 1)
+        left_out *= np.where(step < ranks.right, share, 1.0)
+    return np.where(ranks.right > 0, 1.0 - left_out, 0.0)
+
+
+def _check_k(k: int) -> None:
+    if k < 1:
+        message = f"k must be at least 1, got {k!r}"
+        raise MetricError(message)
+
+
+def reciprocal_ranks(ranks: Ranks, k: int | None = None) -> Floats:
+    """Expected 1 / rank of the first right pose of each query, if tied poses are put in random order.
+
+    Parameters
+    ----------
+    ranks : Ranks
+        Of N queries.
+    k : int, optional
+        Ranks beyond count 0 (MRR@k).
+
+    Returns
+    -------
+    ndarray of float, shape (N,)
+        In [0, 1]; its mean is the MRR.
+
+    Raises
+    ------
+    MetricError
+        If k is less than 1.
+
+    Examples
+    --------
+    One of two tied poses behind a better one: (1/2 + 1/3) / 2.
+
+    >>> reciprocal_ranks(Ranks.of([Rank(above=1, tied=2, right=1)])).round(4).tolist()
+    [0.4167]
+    """
+    last = int((ranks.above + ranks.tied).max(initial=1))
+    if k is not None:
+        _check_k(k)
+        last = min(k, last)
+    before = np.zeros(len(ranks.above))
+    total = np.zeros(len(ranks.above))
+    for place in range(1, last + 1):
+        now = hits(ranks, place)
+        total += (now - before) / place
+        before = now
+    return total
+
+
+def recall(ranks: Ranks, k: int, weights: ArrayLike | None = None) -> float:
+    """Recall@k: share of queries with a right pose among the first k, ties in random order.
+
+    Parameters
+    ----------
+    ranks : Ranks
+        Of every query whose place is present; a miss is a row like any other, so the denominator is fixed.
+    k : int
+        At least 1.
+    weights : array_like, shape (N,), optional
+        Not negative.
+
+    Returns
+    -------
+    float
+        In [0, 1]; NaN for no queries.
+
+    Examples
+    --------
+    >>> recall(Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=3, tied=1, right=1), MISS, MISS]), 5)
+    0.5
+    """
+    return weighted_mean(hits(ranks, k), weights)
+
+
+def mean_reciprocal_rank(ranks: Ranks, k: int | None = None, weights: ArrayLike | None = None) -> float:
+    """MRR, or MRR@k: mean of 1 / rank of the first right pose, ties in random order; 0 for a miss.
+
+    Parameters
+    ----------
+    ranks : Ranks
+        Of every query whose place is present.
+    k : int, optional
+        Ranks beyond count 0; MRR@1 is Recall@1.
+    weights : array_like, shape (N,), optional
+        Not negative.
+
+    Returns
+    -------
+    float
+        In [0, 1]; NaN for no queries.
+
+    Examples
+    --------
+    >>> mean_reciprocal_rank(Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=3, tied=1, right=1)]))
+    0.625
+    """
+    return weighted_mean(reciprocal_ranks(ranks, k), weights)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoolRecall:
+    """Recall among queries with the same number of candidates."""
+
+    pool: int
+    queries: int
+    recall: float
+
+
+def recall_by_pool(
+    ranks: Ranks, pools: ArrayLike, k: int = 1, weights: ArrayLike | None = None
+) -> tuple[PoolRecall, ...]:
+    """Recall@k against the number of candidates to choose from.
+
+    Parameters
+    ----------
+    ranks : Ranks
+        Of N queries.
+    pools : array_like of int, shape (N,)
+        How many candidates each query has; mostly 10, 50 or 200, fewer where the map holds no more.
+    k : int
+        At least 1.
+    weights : array_like, shape (N,), optional
+        Not negative.
+
+    Returns
+    -------
+    tuple of PoolRecall
+        One for each size that occurs, the smallest first: no query is left out.
+
+    Examples
+    --------
+    >>> ranks = Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=2, tied=1, right=1), MISS])
+    >>> [(point.pool, point.recall) for point in recall_by_pool(ranks, [10, 50, 50])]
+    [(10, 1.0), (50, 0.0)]
+    """
+    values = hits(ranks, k)
+    sizes = check_column(pools, "pools", len(values))
+    mass = np.ones(len(values)) if weights is None else check_column(weights, "weights", len(values))
+    found = []
+    for size in np.unique(sizes):
+        chosen = sizes == size
+        share = weighted_mean(values[chosen], mass[chosen])
+        found.append(PoolRecall(pool=int(size), queries=int(chosen.sum()), recall=share))
+    return tuple(found)
+
+
+METRICS: Final = (
+    *(
+        Metric(
+            name=f"recall_at_{k}",
+            unit="1",
+            better="higher",
+            bounds=(0.0, 1.0),
+            compute=partial(recall, k=k),
+            source="share of queries; ties as in McSherry and Najork, ECIR 2008",
+        )
+        for k in RECALL_AT
+    ),
+    Metric(
+        name="mrr",
+        unit="1",
+        better="higher",
+        bounds=(0.0, 1.0),
+        compute=mean_reciprocal_rank,
+        source="Voorhees, TREC-8 1999; ties as in McSherry and Najork, ECIR 2008",
+    ),
+)

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What rejectors say of the answers of many contestants, and the figures of it, by several processes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import pandas as pd
+
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.parallel import spread
+from sasgeo_bench.scoring.integrity import integrity_rows
+from sasgeo_bench.scoring.rejection import OWN, Rule, judge, own_word, why_not
+from sasgeo_bench.scoring.rows import to_frame
+from sasgeo_bench.tasks.split import Split
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judging:
+    """Answers of one contestant that rejectors are to judge.
+
+    Parameters
+    ----------
+    matcher : str
+        Its name on the board.
+    scores : pandas.DataFrame
+        Its scored rows.
+    predictions : mapping of str to Prediction
+        Its answers, by query.
+    rules : mapping of str to Rule
+        Rejectors by name; its own word is always among them.
+    split : Split, optional
+        Says which places calibrate.
+    is_taught : bool
+        Whether it has learnt from other places of the split.
+    """
+
+    matcher: str
+    scores: pd.DataFrame
+    predictions: Mapping[str, Prediction]
+    rules: Mapping[str, Rule]
+    split: Split | None
+    is_taught: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """What came of it: by rejector what it says (`judge`), rows of the board, why some were not applied, or failed."""
+
+    matcher: str
+    said: Mapping[str, pd.DataFrame]
+    rows: tuple[pd.DataFrame, ...] = ()
+    lines: tuple[str, ...] = field(default=())
+    failed: Mapping[str, Exception] = field(default_factory=dict)
+
+
+def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]:
+    """Have all of them judged, by several processes if there are several jobs; no figure hangs on how many there are.
+
+    Parameters
+    ----------
+    judgings : sequence of Judging
+        One for each contestant.
+    jobs : int
+        Processes.
+
+    Yields
+    ------
+    Judged
+        One for each, in their order.
+
+    Examples
+    --------
+    >>> list(carry_out([], jobs=2))
+    []
+    """
+    yield from spread(judged, judgings, jobs=jobs)
+
+
+def judged(judging: Judging) -> Judged:
+    """What the rejectors say of one contestant, its own word among them; no row where one is not applied."""
+    said, rows, lines, failed = {}, [], [], {}
+    for name in (OWN, *judging.rules):
+        try:
+            frame = _said(judging, name)
+            rows += [_figures(judging, name, frame)] if len(frame) else []
+        except Exception as error:  # noqa: BLE001 - these answers and this rejector alone do without a figure
+            failed[name] = error
+            continue
+        if len(frame) or name != OWN:
+            said[name] = frame
+        if not len(frame) and name != OWN:
+            why = why_not(judging.scores, is_taught=judging.is_taught)
+            lines.append(f"{name} on {judging.matcher}: not applied, {why}")
+    return Judged(matcher=judging.matcher, said=said, rows=tuple(rows), lines=tuple(lines), failed=failed)
+
+
+def _said(judging: Judging, name: str) -> pd.DataFrame:
+    """What a rejector says of the answers, or a matcher itself."""
+    if name == OWN:
+        return own_word(judging.scores, judging.split, is_taught=judging.is_taught)
+    rule = judging.rules[name]
+    return judge(judging.scores, judging.predictions, rule.make, rule.split, is_taught=judging.is_taught)
+
+
+def _figures(judging: Judging, name: str, frame: pd.DataFrame) -> pd.DataFrame:
+    """Rows of the board; its own word is taken for a probability."""
+    is_calibrated = name == OWN or judging.rules[name].card.is_calibrated
+    return to_frame(list(integrity_rows(judging.matcher, name, frame, is_calibrated=is_calibrated)))

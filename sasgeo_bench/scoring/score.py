@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predictions held against truths: one scored row for every query, whether it was answered or not."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import SAME_PLACE_M
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.pose import first_pose, pose_errors
+from sasgeo_bench.scoring.ranking import MISS, Rank, rank_candidate, rank_of
+from sasgeo_bench.tasks.query import Head, Truth, base_of
+
+SCORER_VERSION: Final = 4  # raised whenever the same predictions get other figures; rows of two never share a board
+FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false, on either track
+MISSING: Final = "missing"  # status of a query without a row
+NOT_APPLICABLE: Final = "not applicable"
+
+Errors = tuple[float, float, float]
+_NO_ERROR: Final[Errors] = (math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Score:
+    """One query of one matcher, scored.
+
+    Parameters
+    ----------
+    query_id, track, suite, suite_version, part, region, prior_group, view_cells, cell_size_m
+        Of the query.
+    pool : int
+        Candidates to choose from; 0 for localization.
+    place : str
+        What stays together in the split; the region where no split is given.
+    block, pair_id, role, kind, strength, strength_unit, scene
+        Of the truth; so are unknown_share, changed_share, feature_density and alias_index.
+    is_present : bool
+        Whether there is something to be right about.
+    status : str
+        Of the prediction, or "missing". "not applicable" only where all queries of the same suite, track and prior
+        group are: else whoever answers could choose what to be asked.
+    is_answered : bool
+        Whether there is a fix that could be accepted.
+    above, tied, right : int
+        Rank of the right candidate (`ranking.Rank`); 0, 0, 0 for a miss and for localization.
+    position_error_m, yaw_error_deg, log_scale_error : float
+        Of the first pose, for localization of a place that is present; infinite without an answer, else NaN.
+    is_right : bool
+        Whether the fix lies within `FIX_M` of where the view was taken (Eq. 12); never for an absent place. In
+        retrieval, too: a pick beside the right candidate is no false fix if it is that near, though no hit.
+    confidence : float
+        What the matcher says; NaN where it does not.
+    latency_s : float
+        NaN where it is not known.
+    """
+
+    query_id: str
+    track: str
+    suite: str
+    suite_version: int
+    part: str
+    region: str
+    place: str
+    block: str
+    prior_group: str
+    view_cells: int
+    cell_size_m: float
+    pool: int
+    pair_id: str
+    role: str
+    kind: str
+    strength: float
+    strength_unit: str
+    unknown_share: float
+    changed_share: float
+    feature_density: float | None
+    alias_index: float | None
+    scene: str
+    is_present: bool
+    status: str
+    is_answered: bool
+    above: int
+    tied: int
+    right: int
+    position_error_m: float
+    yaw_error_deg: float
+    log_scale_error: float
+    is_right: bool
+    confidence: float
+    latency_s: float
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Score))
+
+
+def score_task(
+    heads: Iterable[Head],
+    truths: Iterable[Truth],
+    predictions: Mapping[str, Prediction],
+    *,
+    place_of: Mapping[str, str] | None = None,
+) -> pd.DataFrame:
+    """Score the predictions of one task.
+
+    Parameters
+    ----------
+    heads : iterable of Head
+        Every query of the task.
+    truths : iterable of Truth
+        Of the same queries.
+    predictions : mapping of str to Prediction
+        By query id; a query without one is a miss.
+    place_of : mapping of str to str, optional
+        Block -> place of the split.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for each query, the columns those of `Score`, in the order of the queries.
+
+    Raises
+    ------
+    MetricError
+        If a query has no truth or a prediction belongs to no query.
+
+    Examples
+    --------
+    >>> score_task([], [], {}).columns[0]
+    'query_id'
+    """
+    by_id = {truth.query_id: truth for truth in truths}
+    asked = list(heads)
+    lost = next((head.query_id for head in asked if head.query_id not in by_id), None)
+    if lost is not None:
+        message = f"query {lost} has no truth: these are the truths of other queries, make the queries again"
+        raise MetricError(message)
+    foreign = next(iter(set(predictions) - {head.query_id for head in asked}), None)
+    if foreign is not None:
+        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
+        raise MetricError(message)
+    told = [predictions.get(head.query_id) for head in asked]
+    errors = _errors([by_id[head.query_id] for head in asked], told)
+    rows = [
+        _score(head, by_id[head.query_id], prediction, error, place_of or {})
+        for head, prediction, error in zip(asked, told, errors, strict=True)
+    ]
+    return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
+
+
+def _errors(truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
+    """Metres, degrees and logarithm of the scale of each first pose; NaN where there is no pose to be right about."""
+    found = [_NO_ERROR] * len(truths)
+    asked = [(at, truth.pose) for at, truth in enumerate(truths) if truth.is_present and truth.pose is not None]
+    errors = pose_errors([first_pose(told[at]) for at, _ in asked], [pose for _, pose in asked])
+    columns = (errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist())
+    for (at, _), *error in zip(asked, *columns, strict=True):
+        found[at] = (error[0], error[1], error[2])
+    return found
+
+
+def _score(
+    head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, place_of: Mapping[str, str]
+) -> Score:
+    rank = MISS
+    is_right = errors[0] <= FIX_M  # a candidate's heading is given and its place was moved by chance: no errors of it
+    if head.track == "retrieval":
+        errors = _NO_ERROR
+        rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS
+    base = base_of(head.region)
+    return Score(
+        query_id=head.query_id,
+        track=head.track,
+        suite=head.suite,
+        suite_version=head.suite_version,
+        part=head.part,
+        region=head.region,
+        place=place_of.get(truth.block, base),
+        block=truth.block,
+        prior_group=head.prior_group,
+        view_cells=head.view_cells,
+        cell_size_m=head.cell_size_m,
+        pool=len(head.candidates),
+        pair_id=truth.pair_id,
+        role=truth.role,
+        kind=truth.kind,
+        strength=truth.strength,
+        strength_unit=truth.strength_unit,
+        unknown_share=truth.unknown_share,
+        changed_share=truth.changed_share,
+        feature_density=truth.feature_density,
+        alias_index=truth.alias_index,
+        scene=truth.scene,
+        is_present=truth.is_present,
+        status=MISSING if prediction is None else prediction.status,
+        is_answered=first_pose(prediction) is not None,
+        above=rank.above,
+        tied=rank.tied,
+        right=rank.right,
+        position_error_m=errors[0],
+        yaw_error_deg=errors[1],
+        log_scale_error=errors[2],
+        is_right=is_right,
+        confidence=math.nan if prediction is None or prediction.confidence is None else prediction.confidence,
+        latency_s=math.nan if prediction is None or prediction.latency_s is None else prediction.latency_s,
+    )
+
+
+def _rank(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
+    """Rank of the right candidate; the full comparison only where another candidate lies on the same spot."""
+    right = candidates[truth.candidate]
+    twins = sum(_is_at(other, right, within_m=2 * SAME_PLACE_M) for other in candidates)
+    if twins > 1:
+        return rank_candidate(prediction, truth, candidates)
+    if prediction is None or prediction.status != "ok":
+        return MISS
+    scores = [score for _, score in prediction.candidates]
+    return rank_of(scores, [_is_at(pose, right) for pose, _ in prediction.candidates])
+
+
+def _is_at(pose: Pose, place: Pose, *, within_m: float = SAME_PLACE_M) -> bool:
+    return math.hypot(pose.easting_m - place.easting_m, pose.northing_m - place.northing_m) <= within_m
+
+
+def settle_not_applicable(scores: pd.DataFrame) -> pd.DataFrame:
+    """Take "not applicable" for a miss where not all queries of the same suite, track and prior group are.
+
+    A card names what a matcher needs, and that is the same for all of them; a file that leaves out single queries would
+    choose what it is asked.
+
+    Parameters
+    ----------
+    scores : pandas.DataFrame
+        Of one matcher, all tasks.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A copy with the status "missing" where it was claimed for a part.
+    """
+    claimed = scores["status"] == NOT_APPLICABLE
+    group = [scores["suite"], scores["track"], scores["prior_group"]]
+    is_whole = claimed.groupby(group).transform("all").astype(bool)
+    return scores.assign(status=scores["status"].where(~claimed | is_whole, MISSING))

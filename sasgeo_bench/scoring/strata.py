@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a suite that are told apart on a board; which part a query is in never depends on an answer."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.scoring.base import Bools
+
+ALL: Final = "all"
+STRESS: Final = "stress"
+CONTROL: Final = "control"
+_MOST_STEPS: Final = 24  # more are no steps: a strength drawn from a range is another one for each query
+_EDGES: Final = {  # fixed, so that boards can be compared
+    "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
+    "changed_share": (0.0, 0.1, 0.2, 0.4, 1.0),
+    "feature_density": (0.0, 0.05, 0.1, 0.2, 1.0),
+    "alias_index": (0.0, 0.7, 0.8, 0.9, 1.0),
+}
+
+
+_MAPPING: Final = ("real-age",)  # suites whose maps differ mostly by how much was mapped, not by what was built
+
+
+def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
+    """Names and masks, shape (N,), of every part of one suite that holds a query.
+
+    Roles, then each step of each kind at each size of view, then bins of what was measured at the truth. A kind that is
+    drawn in one step and size has no rows for them apart.
+
+    Examples
+    --------
+    >>> table = {"role": ["control", "stress"], "kind": ["control", "U1"], "strength": [0.0, 0.3]}
+    >>> table |= {"view_cells": [96, 96]}
+    >>> table |= {name: [0.1, 0.5] for name in ("unknown_share", "changed_share", "feature_density", "alias_index")}
+    >>> [name for name, _ in strata(pd.DataFrame(table))][:4]
+    ['all', 'control', 'stress', 'U1']
+    """
+    yield ALL, np.ones(len(scores), dtype=bool)
+    role = scores["role"].to_numpy()
+    for name in (CONTROL, STRESS, "falsifier"):
+        if (role == name).any():
+            yield name, role == name
+    kind, strength = scores["kind"].to_numpy(), scores["strength"].to_numpy(float)
+    cells = scores["view_cells"].to_numpy()
+    for one in dict.fromkeys(sorted(set(kind) - {CONTROL})):
+        mine = kind == one
+        yield one, mine
+        steps = sorted({(step, size) for step, size in zip(strength[mine], cells[mine], strict=True)})
+        if 1 < len(steps) <= _MOST_STEPS:
+            for step, size in steps:
+                yield step_name(one, step, size), mine & (strength == step) & (cells == size)
+    sizes = sorted(set(cells[role == CONTROL]))
+    if len(sizes) > 1:
+        for size in sizes:
+            yield control_name(size), (role == CONTROL) & (cells == size)
+    yield from _bins(scores, role != CONTROL)
+
+
+def step_name(kind: str, step: float, view_cells: int) -> str:
+    """Name of one step of a kind at one size of view, of a kind that has several of them.
+
+    Examples
+    --------
+    >>> step_name("G1", 5.0, 96)
+    'G1 5, 96 cells'
+    """
+    return f"{kind} {step:g}, {view_cells} cells"
+
+
+def control_name(view_cells: int) -> str:
+    """Name of the controls at one size of view, of a suite that has several sizes.
+
+    Examples
+    --------
+    >>> control_name(96)
+    'control, 96 cells'
+    """
+    return f"{CONTROL}, {view_cells} cells"
+
+
+def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:
+    """Bins of what was measured, without the controls."""
+    is_mapping = (
+        scores["suite"].isin(_MAPPING).to_numpy(bool) if "suite" in scores else np.zeros(len(scores), dtype=bool)
+    )
+    for column, edges in _EDGES.items():
+        name = f"{column} (mostly mapping)" if column == "changed_share" and is_mapping.all() else column
+        values = scores[column].to_numpy(float)
+        for low, high in pairwise(edges):
+            is_last = high == edges[-1]
+            inside = counted & (values >= low) & ((values <= high) if is_last else (values < high))
+            if inside.any():
+                yield f"{name} {low:g}-{high:g}", inside

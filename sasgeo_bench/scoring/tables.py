@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scored rows of some matchers -> the leaderboard: figures with intervals, denominators and ranks."""
+
+import hashlib
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.scoring.base import Bools, Floats, Ints
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
+from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
+from sasgeo_bench.scoring.intervals import Interval, bootstrap_means, effective_count, share_interval
+from sasgeo_bench.scoring.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
+from sasgeo_bench.scoring.pose import error_quantile
+from sasgeo_bench.scoring.power import sensitivity
+from sasgeo_bench.scoring.rows import Row, Told, bare, is_unranked, side_by_side, to_frame
+from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
+from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS, strata
+
+GROUP: Final = ("suite", "track", "prior_group")
+_WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
+
+
+def leaderboard(
+    scored: Mapping[str, pd.DataFrame],
+    *,
+    draws: int = DRAWS,
+    apart: Collection[str] = (),
+    done: Callable[[], None] = lambda: None,
+) -> pd.DataFrame:
+    """Figures of every matcher on every suite, track, prior group and stratum.
+
+    Parameters
+    ----------
+    scored : mapping of str to pandas.DataFrame
+        By matcher, from `score.score_task`; all hold the same queries.
+    draws : int
+        Of the bootstrap.
+    apart : collection of str
+        Matchers that have figures and no rank, and are nobody's rivals; controls are so in any case.
+    done : callable
+        Called after each suite, track and prior group.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns as the fields of `Row`.
+
+    Raises
+    ------
+    MetricError
+        If two matchers were scored on different queries.
+    """
+    groups = _groups(_aligned(scored))
+    beside = frozenset({*apart, *filter(is_unranked, scored)})
+    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws, beside), groups, done))
+
+
+def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """The frames with their rows in one order."""
+    frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
+    first = next(iter(frames.values()), None)
+    for name, frame in frames.items():
+        if first is not None and not frame["query_id"].equals(first["query_id"]):
+            message = f"{name} was scored on other queries than {next(iter(frames))}: score them together"
+            raise MetricError(message)
+    return frames
+
+
+def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str, str], dict[str, pd.DataFrame]]]:
+    """Suite, track and prior group, with the rows of each matcher."""
+    if not frames:
+        return
+    first = next(iter(frames.values()))
+    keys = list(zip(*(first[name] for name in GROUP), strict=True))
+    for suite, track, prior_group in sorted(set(keys)):
+        index = [at for at, key in enumerate(keys) if key == (suite, track, prior_group)]
+        yield (suite, track, prior_group), {name: frame.iloc[index] for name, frame in frames.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Group:
+    """Queries of one suite, track and prior group as columns: shape (N,), or (N, M) for M matchers.
+
+    What is the same in every part of them is worked out once: values of measures by name, errors by column, and codes
+    of blocks, places and sites in the order of their names.
+    """
+
+    key: tuple[str, str, str]
+    names: tuple[str, ...]
+    rivals: tuple[str, ...]  # those of them that are ranked
+    first: pd.DataFrame  # rows of any matcher: what they say of the queries is the same in all
+    blocks: Ints
+    places: Ints
+    sites: Ints
+    is_answered: Bools
+    is_missing: Bools
+    measured: dict[str, Floats]
+    errors: dict[str, Floats]
+
+    @classmethod
+    def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
+        """Columns of the rows of some matchers, of which some stand beside the ranks."""
+        first = next(iter(frames.values()))
+        columns = dict.fromkeys(quantile.column for quantile in QUANTILE_MEASURES)
+        codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
+
+        def beside(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
+            """A column of each matcher, side by side."""
+            return np.column_stack([np.asarray(column(frame)) for frame in frames.values()])
+
+        return cls(
+            key=key,
+            names=tuple(frames),
+            rivals=tuple(name for name in frames if name not in unranked),
+            first=first,
+            blocks=codes[0],
+            places=codes[1],
+            sites=codes[2],
+            is_answered=beside(lambda frame: frame["is_answered"].to_numpy(bool)),
+            is_missing=beside(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
+            measured={measure.name: beside(measure.values) for measure in MEASURES[key[1]]},
+            errors={name: beside(partial(_floats, name=name)) for name in columns},
+        )
+
+
+def _floats(frame: pd.DataFrame, name: str) -> Floats:
+    return np.asarray(frame[name].to_numpy(float))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cell:
+    """Some queries of a group: `chosen` are their numbers in it."""
+
+    group: _Group
+    stratum: str
+    chosen: Ints
+    draws: int
+
+    @property
+    def seed(self) -> int:
+        """Of these queries alone, so that all matchers are drawn alike."""
+        text = "/".join((*self.group.key, self.stratum))
+        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+
+    def told(self) -> list[Told]:
+        """What all rows of each matcher say of these queries."""
+        suite, track, prior_group = self.group.key
+        blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
+        return [
+            Told(
+                matcher=name,
+                suite=suite,
+                track=track,
+                prior_group=prior_group,
+                stratum=self.stratum,
+                n=len(self.chosen),
+                answered=int(self.group.is_answered[self.chosen, at].sum()),
+                missing=int(self.group.is_missing[self.chosen, at].sum()),
+                blocks=blocks,
+                places=places,
+            )
+            for at, name in enumerate(self.group.names)
+        ]
+
+
+def _rows_of_group(
+    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, beside: Collection[str]
+) -> Iterator[Row]:
+    able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
+    for name, frame in frames.items():
+        if name not in able:
+            yield _not_applicable(name, key, frame)
+    if not able:
+        return
+    group = _Group.of(key, able, beside)
+    counted = {measure.name: measure.counts(group.first) for measure in MEASURES[key[1]]}
+    for stratum, inside in strata(group.first):
+        by_count: dict[bytes, list[Measure]] = {}
+        for measure in MEASURES[key[1]]:
+            mask = inside & counted[measure.name]
+            if mask.any():
+                by_count.setdefault(mask.tobytes(), []).append(measure)
+        for key_of_mask, measures in by_count.items():
+            chosen = np.flatnonzero(np.frombuffer(key_of_mask, dtype=bool))
+            yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), measures)
+
+
+def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -> Row:
+    """The one row of a matcher that cannot."""
+    suite, track, prior_group = key
+    primary = primary_of(track)
+    told = Told.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
+    return told.row(primary.name, primary.unit, primary.better, bare(math.nan), is_applicable=False)
+
+
+def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
+    """Means that share a denominator, by the same draws."""
+    group, count = cell.group, len(cell.group.names)
+    told, sites = cell.told(), group.sites[cell.chosen]
+    trials = effective_count(sites)
+    below = list(_thresholds(cell, measures))
+    columns = [group.measured[measure.name][cell.chosen] for measure in measures]
+    table = np.column_stack((*columns, *(item.is_below for item in below)))
+    drawn = ClusterDraws(blocks=group.blocks[cell.chosen], sites=sites, seed=cell.seed, draws=cell.draws)
+    means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.full((0, table.shape[1]), np.nan)
+    for number, measure in enumerate(measures):
+        part = slice(number * count, (number + 1) * count)
+        yield from _ranked(cell, told, measure, table[:, part], means[:, part], trials)
+    for at, item in enumerate(below, start=len(measures) * count):
+        found, how = share_interval(item.quantile.share, means[:, at], trials)
+        errors = group.errors[item.quantile.column][cell.chosen, item.matcher]
+        lo, hi = (_inverse(errors, share) for share in (found.lo, found.hi))
+        interval = Interval(value=item.value, lo=lo, hi=hi)
+        yield told[item.matcher].row(item.quantile.name, item.quantile.unit, "lower", interval, how)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Below:
+    """A quantile of the errors of one matcher (its number), and which errors lie below it.
+
+    Errors that equal it count in proportion, so that the mean is the quantile's share even where many are infinite.
+    """
+
+    matcher: int
+    quantile: Quantile
+    value: float
+    is_below: Floats
+
+
+def _thresholds(cell: _Cell, measures: Sequence[Measure]) -> Iterator[_Below]:
+    """Quantiles of errors, whose intervals are those of the share below them, read backwards (Woodruff 1952)."""
+    is_pose = cell.group.key[1] == "localization" and any(measure.is_primary for measure in measures)
+    if not is_pose or cell.stratum not in _WHOLE:
+        return
+    for at in range(len(cell.group.names)):
+        for quantile in QUANTILE_MEASURES:
+            errors = cell.group.errors[quantile.column][cell.chosen, at]
+            value = error_quantile(errors, quantile.share)
+            is_below, is_equal = errors < value, errors == value
+            part = np.clip((quantile.share - is_below.mean()) / is_equal.mean(), 0.0, 1.0)
+            yield _Below(matcher=at, quantile=quantile, value=value, is_below=is_below + part * is_equal)
+
+
+def _inverse(errors: Floats, share: float) -> float:
+    """Least error that a share of the queries does not exceed; 0 and infinity beyond the shares there are."""
+    if math.isnan(share):
+        return math.nan
+    return error_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
+
+
+def _ranked(
+    cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, means: Floats, trials: float
+) -> Iterator[Row]:
+    """Rows of one measure; of the primary one with ranks."""
+    names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
+    found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
+    is_decidable = measure.is_primary and told[0].blocks >= LEAST_BLOCKS
+    ranks = _ranks(cell.group, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
+    for at, name in enumerate(names):
+        interval, how = found[at]
+        rank = ranks.get(name)
+        detectable = _detectable(name, cell.group, table, blocks) if is_decidable else math.nan
+        yield told[at].row(
+            measure.name,
+            measure.unit,
+            measure.better,
+            interval,
+            how,
+            rank_best=None if rank is None else rank.best,
+            rank_worst=None if rank is None else rank.worst,
+            detectable=detectable,
+        )
+
+
+def _ranks(group: _Group, values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
+    """Rank intervals of all rivals."""
+    chosen = [group.names.index(name) for name in group.rivals]
+    if not chosen:
+        return {}
+    better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
+    return {group.names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
+
+
+def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
+    """Least difference from the best other rival that would be found."""
+    others = [group.names.index(other) for other in group.rivals if other != name]
+    if not others or name not in group.rivals:
+        return math.nan
+    best = max(others, key=lambda at: float(table[:, at].mean()))
+    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks).detectable

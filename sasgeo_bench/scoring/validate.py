@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predictions held against the tasks they answer: every violation by row and column, found and expected."""
+
+import difflib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+
+from sasgeo_bench.bounds import MOST_CANDIDATES
+from sasgeo_bench.errors import MatchError, StoreError, counted
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Match, check_match
+from sasgeo_bench.matching.submission import Submission
+from sasgeo_bench.regions.region_files import read_manifest
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.prediction_rows import differing_columns, prediction_of, row_faults
+from sasgeo_bench.scoring.submission_files import SAID, predictions_name
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
+from sasgeo_bench.tasks.task_rows import ASKED
+
+Bounds = tuple[float, float, float, float]  # west, south, east, north, metres
+
+_ANSWERED: Final = "ok"
+_NO_ROW: Final = "no row for "
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Violation:
+    """One fault: the file, the row's number in it (from 0; -1 for the whole file), the column, found and expected."""
+
+    file: str
+    row: int
+    column: str
+    found: str
+    expected: str
+
+    @property
+    def is_missing_row(self) -> bool:
+        """Whether it says that a query has no row."""
+        return self.found.startswith(_NO_ROW)
+
+    def to_text(self) -> str:
+        """One line.
+
+        Examples
+        --------
+        >>> Violation(file="mine.parquet", row=3, column="confidence", found="1.5", expected="0..1 or null").to_text()
+        'mine.parquet, row 3, confidence: found 1.5, expected 0..1 or null'
+        """
+        where = self.file if self.row < 0 else f"{self.file}, row {self.row}"
+        return f"{where}, {self.column}: found {self.found}, expected {self.expected}"
+
+
+def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
+    """Hold predictions against tasks.
+
+    Parameters
+    ----------
+    path : Path
+        A predictions file, or a run's folder of parts, newest first; there a query may have been asked again.
+    tasks : sequence of Path
+        Task folders that it should answer, and no others; rows of a run's folder that say they answer something else
+        are passed over (`set_aside` counts them).
+
+    Yields
+    ------
+    Violation
+        In the order of the rows; queries without a row come last, unless a file could not be read by its columns.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be read at all, a task is of another version, or the folder holds runs of two matchers.
+    """
+    prediction_files.check_one_matcher([path])
+    queries = _asked_of(tasks)
+    asked = _asked(tasks)
+    seen: dict[str, str] = {}
+    files = prediction_files.parts_of(path)
+    if not files:
+        message = f"{path} holds no predictions: name a predictions file, or the folder of a run"
+        raise StoreError(message)
+    under = {
+        parent: prediction_files.asked_in(parent, asked) for parent in {file.parent for file in files} if path.is_dir()
+    }
+    unread = 0
+    # In a run's folder a query stands twice where it was asked again: the newer row counts.
+    for file in reversed(files):
+        before = frozenset(seen) if path.is_dir() else frozenset()
+        table = prediction_files.read_part(file)
+        differing = differing_columns(table)
+        for column, found, expected in differing:
+            yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
+        unread += bool(differing)
+        wrong = {} if differing else _faults_by_row(file.name, table)
+        for row, item in enumerate([] if differing else table.to_pylist()):
+            tie = prediction_files.tie_of(item)
+            is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
+            if item["query_id"] not in before and not is_aside:
+                yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
+    yield from _missing(path.name, [] if unread else queries, seen)
+
+
+def submission_faults(
+    folder: Path, said: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
+) -> Iterator[Violation]:
+    """Hold a submission against the tasks of a board; its folder and hashes are `read_submission`'s business.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the submission.
+    said : Submission
+        From `read_submission`.
+    tasks : sequence of Path, optional
+        Task folders of the board; those that the submission does not name are passed over. Without any, the rows are
+        held against nothing.
+    board : str
+        Id of the board; empty where nobody says it.
+    places : collection of str
+        Of the board's split; without any, what the card says of training is not looked at.
+
+    Yields
+    ------
+    Violation
+        Faults of what it says, then of its rows; last, as of a file, the queries without a row, which are misses.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be read, or a task is of another version.
+    """
+    yield from _said_faults(said, board, places)
+    if tasks is None or said.task_version not in TASK_VERSIONS:
+        return
+    named = {(item.suite, item.region) for item in said.tasks}
+    mine = [task for task in tasks if _name_of(task) in named]
+    lost = sorted(named - {_name_of(task) for task in mine})
+    for suite, region in lost:
+        yield Violation(
+            file=SAID, row=-1, column="tasks", found=f"{suite}/{region}", expected="tasks that the board holds"
+        )
+    queries, asked = _asked_of(mine), _asked(mine)
+    seen: dict[str, str] = {}
+    file = folder / predictions_name(said.card.name)
+    table = prediction_files.read_part(file)
+    wrong = _faults_by_row(file.name, table)
+    for row, item in enumerate(table.to_pylist()):
+        name = item["query_id"]
+        yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
+        if name in asked and item[ASKED] != asked[name]:
+            yield Violation(
+                file=file.name,
+                row=row,
+                column=ASKED,
+                found=f"an answer to query {name} as it was drawn otherwise",
+                expected=f"{asked[name]}, for answers belong to queries: run and submit again",
+            )
+    yield from _missing(file.name, queries, seen)
+
+
+def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
+    """What a submission says of itself that does not fit a board."""
+    if said.task_version not in TASK_VERSIONS:
+        yield Violation(
+            file=SAID,
+            row=-1,
+            column="task_version",
+            found=str(said.task_version),
+            expected=f"{TASK_VERSION}: run and submit again",
+        )
+    if board and said.board != board:
+        yield Violation(file=SAID, row=-1, column="board", found=repr(said.board), expected=repr(board))
+    for place in said.card.places if places else ():
+        if place not in places:
+            near = difflib.get_close_matches(place, places, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else ": what else taught it goes into trained_elsewhere"
+            yield Violation(
+                file=SAID, row=-1, column="trained_on", found=repr(place), expected=f"places of the split{hint}"
+            )
+
+
+def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iterator[Violation]:
+    for name in queries:
+        if name not in seen:
+            yield Violation(
+                file=file, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
+            )
+
+
+def set_aside(path: Path, tasks: Sequence[Path]) -> int:
+    """How many answers of a run's folder are to queries that the tasks do not hold, or do not hold as they were.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be read.
+    """
+    asked = _asked(tasks)
+    found: set[tuple[str, str]] = set()
+    for parent in {part.parent for part in prediction_files.parts_of(path)} if path.is_dir() else ():
+        under = prediction_files.asked_in(parent, asked)
+        found |= {
+            (tie.query_id, tie.asked)
+            for tie in prediction_files.read_ties(parent)
+            if tie.asked and not tie.answers(under)
+        }
+    return len(found)
+
+
+def _asked(tasks: Sequence[Path]) -> dict[str, str]:
+    return {name: said for task in tasks for name, said in task_files.read_asked(task).items()}
+
+
+def _name_of(task: Path) -> tuple[str, str]:
+    about = task_files.read_task(task)
+    return str(about["suite"]), str(about["region"])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Asked:
+    """A query, and where its answers may lie; None for retrieval, which says it by candidates, or without a map."""
+
+    head: Head
+    bounds_m: Bounds | None
+
+
+def _asked_of(tasks: Sequence[Path]) -> dict[str, _Asked]:
+    return {asked.head.query_id: asked for task in tasks for asked in _queries(task)}
+
+
+def _queries(task: Path) -> Iterator[_Asked]:
+    """Queries of a task that this program can read; what was seen is no matter, and stored results hold none of it."""
+    _, region = _name_of(task)
+    bounds_m = _bounds_m(task.resolve().parents[2] / "regions" / region)
+    by_group: dict[str, Bounds] = {}
+    for head in task_files.read_heads(task):
+        group = head.prior_group
+        if bounds_m is not None and head.track == "localization" and group not in by_group:
+            by_group[group] = _reach_m(bounds_m, PriorGroup.parse(group))
+        yield _Asked(head=head, bounds_m=by_group.get(group) if head.track == "localization" else None)
+
+
+def _bounds_m(region: Path) -> Bounds | None:
+    """Where a region lies; None where its map is not beside the tasks."""
+    try:
+        return read_manifest(region).bounds_m
+    except StoreError:
+        return None
+
+
+def _reach_m(bounds_m: Bounds, group: PriorGroup) -> Bounds:
+    """The region, and what a disc of a prior can hold beyond its rim: at most its diameter."""
+    more_m = 2 * (group.radius_m or 0.0)
+    west, south, east, north = bounds_m
+    return west - more_m, south - more_m, east + more_m, north + more_m
+
+
+def _faults_by_row(file: str, table: pa.Table) -> dict[int, list[Violation]]:
+    """Numbers, names and texts out of their bounds."""
+    found: dict[int, list[Violation]] = {}
+    for one in row_faults(table):
+        wrong = Violation(file=file, row=one.row, column=one.column, found=one.found, expected=one.expected)
+        found.setdefault(one.row, []).append(wrong)
+    return found
+
+
+def _row_faults(
+    file: str,
+    row: int,
+    item: Mapping[str, Any],
+    queries: Mapping[str, _Asked],
+    seen: dict[str, str],
+    wrong: Sequence[Violation],
+) -> Iterator[Violation]:
+    name = item["query_id"]
+    if name not in queries:
+        yield Violation(
+            file=file, row=row, column="query_id", found=repr(name), expected="the id of a query of the tasks"
+        )
+        return
+    if name in seen:
+        yield Violation(
+            file=file, row=row, column="query_id", found=f"{name} again ({seen[name]})", expected="each query once"
+        )
+        return
+    seen[name] = f"{file}, row {row}"
+    if wrong:
+        yield from wrong
+        return
+    if item["status"] != _ANSWERED:
+        if item["candidates"]:
+            count = len(item["candidates"])
+            yield Violation(
+                file=file,
+                row=row,
+                column="candidates",
+                found=counted(count, "pose"),
+                expected=f"none with {item['status']}",
+            )
+        return
+    yield from _answer_faults(file, row, item, queries[name])
+
+
+def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) -> Iterator[Violation]:
+    """What is wrong with the answer itself."""
+    try:
+        prediction = prediction_of(item)
+        match = Match(
+            poses=[pose for pose, _ in prediction.candidates],
+            scores=[score for _, score in prediction.candidates],
+            confidence=prediction.confidence,
+            diagnostics=prediction.diagnostics,
+        )
+        check_match(match, query.head, top_k=MOST_CANDIDATES)
+        _check_inside(match.poses, query)
+    except MatchError as error:
+        found, _, expected = str(error).partition(", expected ")
+        yield Violation(file=file, row=row, column="candidates", found=found, expected=expected or "an answer")
+
+
+def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:
+    """Refuse a place neither in the region nor where a prior's disc may reach: it is of another map or CRS."""
+    if query.bounds_m is None:
+        return
+    west, south, east, north = query.bounds_m
+    for pose in poses:
+        if not (west <= pose.easting_m <= east and south <= pose.northing_m <= north):
+            message = (
+                f"candidates hold ({pose.easting_m:.1f}, {pose.northing_m:.1f}), outside of {query.head.region}, "
+                f"expected eastings of {west:.0f}..{east:.0f} m and northings of {south:.0f}..{north:.0f} m"
+            )
+            raise MatchError(message)

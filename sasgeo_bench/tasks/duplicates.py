@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same ground twice: patches of one map that lie, turned and moved, in another one.
+
+Parts of a split keep their distance on the globe. That does not help where one file holds a place under another name,
+another date or other coordinates; then the same buildings stand in the same order, and that is what is looked for.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from sasgeo_bench.tasks.split import Split
+
+NEIGHBOURS: Final = 4
+LEAST_ALIKE: Final = 8  # buildings that must lie alike for a patch to count
+LEAST_AREA_M2: Final = 40.0
+
+_STEP_M: Final = 1.0  # distances within this are the same
+_STEP_AREA: Final = 0.1  # of the area's logarithm
+_REACH_M: Final = 250.0  # neighbours farther off are no constellation
+_MOST_ALIKE: Final = 3  # a constellation that stands more often in one map is a row of equal houses
+_WITHIN_M: Final = 2.0  # of where the other map says it is
+_TRIES: Final = 300
+_FEWEST_APART_M: Final = 20.0  # between the two buildings that a placement is made from
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Constellations:
+    """Buildings of one map and a key of each that is the same wherever the map lies and however it is turned.
+
+    `en_m` has shape (N, 2), easting and northing; `keys` has shape (N,), uint64.
+    """
+
+    en_m: Points
+    keys: NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Duplicate:
+    """The largest patch two maps share: how many buildings lie alike, and the middle of them in either map."""
+
+    count: int
+    first_m: tuple[float, float]
+    second_m: tuple[float, float]
+
+
+def constellations(features: gpd.GeoDataFrame) -> Constellations:
+    """Describe each building by its area, and by the distances and areas of the four nearest ones.
+
+    Parameters
+    ----------
+    features : geopandas.GeoDataFrame
+        A region's features.
+
+    Returns
+    -------
+    Constellations
+        Of the buildings of at least 40 m2 that have four others within 250 m; distances count by the metre, areas by
+        tenths of their size, so that another projection of the same ground gives nearly the same keys.
+    """
+    is_building = (features["class"] == "building").to_numpy() & features["is_visible"].to_numpy()
+    shapes = features.geometry.to_numpy()[is_building]
+    shapes = shapes[shapely.area(shapes) >= LEAST_AREA_M2]
+    en_m = shapely.get_coordinates(shapely.centroid(shapes)).reshape(-1, 2)
+    if len(en_m) <= NEIGHBOURS:
+        return Constellations(en_m=np.zeros((0, 2)), keys=np.zeros(0, dtype=np.uint64))
+    apart_m, nearest = (np.asarray(found) for found in KDTree(en_m).query(en_m, k=NEIGHBOURS + 1))
+    areas = np.log(shapely.area(shapes)) / _STEP_AREA
+    described = np.column_stack((areas, apart_m[:, 1:] / _STEP_M, areas[nearest[:, 1:]]))
+    is_near = apart_m[:, -1] < _REACH_M
+    return Constellations(en_m=en_m[is_near], keys=_keys(np.floor(described[is_near]).astype(np.int64)))
+
+
+def _keys(numbers: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """One number for each row: a multiplicative hash that is the same on any machine."""
+    keys = np.zeros(len(numbers), dtype=np.uint64)
+    for column in numbers.T.astype(np.uint64):
+        keys = (keys ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        keys ^= keys >> np.uint64(29)
+    return keys
+
+
+def find_duplicate(first: Constellations, second: Constellations) -> Duplicate | None:
+    """Find ground that two maps share.
+
+    Parameters
+    ----------
+    first, second : Constellations
+        Of two maps.
+
+    Returns
+    -------
+    Duplicate or None
+        The largest patch found whose buildings lie alike up to a move and a turn; None if there are fewer than
+        `LEAST_ALIKE` such buildings.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> at, size = rng.uniform(0, 400, (60, 2)), rng.uniform(7, 15, 60)
+    >>> def table(points):
+    ...     squares = [shapely.box(x, y, x + side, y + side) for (x, y), side in zip(points, size, strict=True)]
+    ...     return gpd.GeoDataFrame({"class": "building", "is_visible": True}, index=range(60), geometry=squares)
+    >>> maps = [constellations(table(at + move)) for move in (0.0, 5000.0)]
+    >>> find_duplicate(*maps).count > 50
+    True
+    """
+    one, two = _matches(first, second)
+    if len(one) < LEAST_ALIKE:
+        return None
+    rng = np.random.default_rng(0)
+    best = np.zeros(0, dtype=np.int64)
+    for _ in range(_TRIES):
+        at, other = rng.choice(len(one), size=2, replace=False)
+        alike = _alike(one, two, int(at), int(other))
+        if len(alike) > len(best):
+            best = alike
+    if len(best) < LEAST_ALIKE:
+        return None
+    middles = (tuple(float(value) for value in side[best].mean(axis=0)) for side in (one, two))
+    (x0, y0), (x1, y1) = middles
+    return Duplicate(count=len(best), first_m=(x0, y0), second_m=(x1, y1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedGround:
+    """Two blocks of different parts that hold the same ground, and how many buildings say so."""
+
+    first: str
+    second: str
+    count: int
+
+
+def search_split(split: Split, maps: Mapping[str, Constellations]) -> tuple[SharedGround, ...]:
+    """Search every two regions of different parts for ground they share.
+
+    Parameters
+    ----------
+    split : Split
+        Says which parts must not meet.
+    maps : mapping of str to Constellations
+        By region; a region of the split that is not among them is not searched.
+
+    Returns
+    -------
+    tuple of SharedGround
+        One for each two regions that share some, in the order of the split.
+    """
+    part_of = {block.region: split.part_of(place) for place, blocks in split.blocks.items() for block in blocks}
+    listed = [region for region in part_of if region in maps]
+    found = []
+    for one, two in combinations(listed, 2):
+        if part_of[one] == part_of[two]:
+            continue
+        shared = find_duplicate(maps[one], maps[two])
+        if shared is not None:
+            first, second = _block_at(split, one, shared.first_m), _block_at(split, two, shared.second_m)
+            found.append(SharedGround(first=first, second=second, count=shared.count))
+    return tuple(found)
+
+
+def _block_at(split: Split, region: str, en_m: tuple[float, float]) -> str:
+    return min(split.blocks_in(region), key=lambda block: float(block.polygon().distance(shapely.Point(en_m)))).id
+
+
+def _matches(first: Constellations, second: Constellations) -> tuple[Points, Points]:
+    """Buildings of two maps with the same key, as long as it is a rare one; each pair once, two arrays (M, 2)."""
+    rare = [_rare(item.keys) for item in (first, second)]
+    left, right = first.keys[rare[0]], second.keys[rare[1]]
+    order = np.argsort(right, kind="stable")
+    low, high = (np.searchsorted(right[order], left, side=side) for side in ("left", "right"))
+    pairs = [(at, int(order[index])) for at in np.flatnonzero(high > low) for index in range(low[at], high[at])]
+    index = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return first.en_m[rare[0]][index[:, 0]], second.en_m[rare[1]][index[:, 1]]
+
+
+def _rare(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+    _, back, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    return np.flatnonzero(counts[back] <= _MOST_ALIKE)
+
+
+def _alike(one: Points, two: Points, at: int, other: int) -> NDArray[np.int64]:
+    """Matches that agree with the move and turn that two of them give."""
+    a, b = (complex(*(side[other] - side[at])) for side in (one, two))
+    if abs(a) < _FEWEST_APART_M or abs(abs(a) - abs(b)) > _WITHIN_M:
+        return np.zeros(0, dtype=np.int64)
+    turn = b / a / abs(b / a)
+    shifted = (one - one[at]) @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]]) + two[at]
+    # Farther from the two, a small error of the turn moves more.
+    reach_m = np.hypot(*(one - one[at]).T)
+    return np.flatnonzero(np.hypot(*(shifted - two).T) <= _WITHIN_M * (1 + reach_m / abs(a)))

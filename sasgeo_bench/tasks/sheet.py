@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact sheets: of some queries the view, the map at the true place, what differs, and its twin or likest decoy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Final
+
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.preview import PAINT_ORDER
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.tasks.query import Query, Truth
+
+GROUND: Final = "#fbfaf5"
+HIDDEN: Final = "#9e9e9e"
+ONLY_SEEN: Final = "#c2185b"
+ONLY_MAPPED: Final = "#1565c0"
+AGREE: Final = "#d9d9d9"
+TWIN: Final = "map at the twin"
+DECOY: Final = "map at the hardest decoy"
+_COLUMNS: Final = ("view", "map at the true place", "view against map")
+_CELL_INCHES: Final = 2.4
+_WORDS_INCHES: Final = 3.0  # the column of words, in letters that stay readable where the sheet is shown smaller
+_LETTERS: Final = 36  # in a line of it
+_DPI: Final = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """One row of a sheet: a query, its truth, and what the map shows there and at a rival; None for no such place.
+
+    `rival` names what that other place is: the twin that a suite made of the true place, or a decoy that is like it.
+    """
+
+    query: Query
+    truth: Truth
+    at_truth: Evidence | None
+    at_decoy: Evidence | None
+    rival: str = DECOY
+
+
+def paint(evidence: Evidence) -> NDArray[np.float64]:
+    """Colours of a view, shape (rows, cols, 3), 0..1; grey where at least half of the classes are unknown."""
+    picture = np.empty((*evidence.shape, 3))
+    picture[:] = to_rgb(GROUND)
+    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+    for name in PAINT_ORDER:
+        if name in evidence.classes:
+            picture[evidence.layer(name) == PRESENT] = colours[name]
+    unknown = (evidence.cells == UNKNOWN).mean(axis=0)[..., None]
+    return np.asarray(picture * (1 - unknown) + np.array(to_rgb(HIDDEN)) * unknown)
+
+
+def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
+    """Where view and map agree, where only the view has something, where only the map has."""
+    known = (seen.cells != UNKNOWN) & (mapped.cells != UNKNOWN)
+    one, two = (known & (item.cells == PRESENT) for item in (seen, mapped))
+    picture = np.empty((*seen.shape, 3))
+    picture[:] = to_rgb(GROUND)
+    picture[(one & two).any(axis=0)] = to_rgb(AGREE)
+    picture[(two & ~one).any(axis=0)] = to_rgb(ONLY_MAPPED)
+    picture[(one & ~two).any(axis=0)] = to_rgb(ONLY_SEEN)
+    picture[~known.any(axis=0)] = to_rgb(HIDDEN)
+    return picture
+
+
+def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
+    """Draw a contact sheet.
+
+    Parameters
+    ----------
+    path : Path
+        The PNG to write.
+    title : str
+        What the sheet shows.
+    panels : sequence of Panel
+        Its rows.
+    """
+    figure = sheet_figure(title, panels)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+
+
+def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Figure:
+    """A contact sheet as a figure; see `write_sheet`."""
+    has_vectors = any(panel.query.vectors is not None for panel in panels)
+    rivals = list(dict.fromkeys(panel.rival for panel in panels)) or [DECOY]
+    columns = (*_COLUMNS, " / ".join(rivals), *(("perceived vectors",) if has_vectors else ()))
+    width, height = _WORDS_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
+    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
+    figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
+    legend = (
+        "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"
+    )
+    figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=9.5, color="#444444")
+    _draw_legend(figure, width, height)
+    for at, panel in enumerate(panels):
+        bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
+        text = "\n".join(line for part in _words(panel) for line in wrap(part, _LETTERS))
+        figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=10)
+        pictures = (*_pictures(panel), None)[: len(columns)]
+        for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):
+            left = _WORDS_INCHES + _CELL_INCHES * place
+            box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
+            chart = figure.add_axes(box)
+            chart.set_xticks([])
+            chart.set_yticks([])
+            if picture is not None:
+                chart.imshow(picture, interpolation="nearest")
+            elif name == "perceived vectors" and panel.query.vectors is not None:
+                _draw_vectors(chart, panel.query)
+            else:
+                chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=9, transform=chart.transAxes)
+            if at == 0:
+                chart.set_title(name, fontsize=10, pad=3)
+    figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
+    return figure
+
+
+def _draw_legend(figure: Figure, width: float, height: float) -> None:
+    """The colours of the classes, in one line below the title's."""
+    left = 0.15
+    for item in load_taxonomy().classes:
+        name = item.name.replace("_", " ")
+        figure.text(left / width, 1 - 0.66 / height, "\u25a0", va="top", fontsize=11, color=item.colour)
+        figure.text((left + 0.15) / width, 1 - 0.67 / height, name, va="top", fontsize=8.5, color="#444444")
+        left += 0.28 + 0.075 * len(name)
+
+
+def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:
+    seen, mapped, decoy = panel.query.evidence, panel.at_truth, panel.at_decoy
+    return (
+        paint(seen),
+        None if mapped is None else paint(mapped),
+        None if mapped is None else paint_difference(seen, mapped),
+        None if decoy is None else paint(decoy),
+    )
+
+
+def _draw_vectors(chart: Axes, query: Query) -> None:
+    """Lines and outlines in the colours of their classes; what passes over something is dashed."""
+    colours = {item.name: item.colour for item in load_taxonomy().classes}
+    vectors = query.vectors
+    if vectors is None:
+        return
+    for name, is_bridge, shape in zip(vectors["class"], vectors["is_bridge"], vectors.geometry, strict=True):
+        for line in shapely.get_parts(shapely.boundary(shape) if shapely.get_dimensions(shape) > 1 else shape):
+            at = shapely.get_coordinates(line)
+            chart.plot(at[:, 0], at[:, 1], color=colours[name], linewidth=1.0, linestyle=":" if is_bridge else "-")
+    rows, cols = query.evidence.shape
+    half_m = query.evidence.cell_size_m / 2
+    chart.set_xlim(-cols * half_m, cols * half_m)
+    chart.set_ylim(-rows * half_m, rows * half_m)
+    chart.set_aspect("equal")
+
+
+def strength_text(truth: Truth) -> str:
+    """The step of a query; of an older map the age that it has, for its date is only the nearest there is to the step.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> strength_text(SimpleNamespace(strength=5.0, strength_unit="years", measured={"age_years": 3.58}))
+    'map 3.6 years old (step 5)'
+    """
+    age_years = truth.measured.get("age_years")
+    if age_years is None:
+        return f"strength {truth.strength:g} ({truth.strength_unit})"
+    return f"map {age_years:.1f} years old (step {truth.strength:g})"
+
+
+def _words(panel: Panel) -> tuple[str, ...]:
+    query, truth = panel.query, panel.truth
+    rows, cols = query.evidence.shape
+    alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
+    measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items())
+    return (
+        f"{truth.role}: {truth.kind}",
+        strength_text(truth),
+        f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
+        f"priors {query.prior_group}; {len(query.candidates)} candidates"
+        + (f", {len(query.vectors)} vectors" if query.vectors is not None else ""),
+        "present" if truth.is_present else "ABSENT",
+        f"unknown {truth.unknown_share:.2f}, changed {truth.changed_share:.2f}{alias}",
+        f"measured: {measured}" if measured else "",
+        f"{truth.block}, {query.query_id[:8]}",
+    )

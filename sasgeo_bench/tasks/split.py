@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which blocks are train, calibration and test; parts that come too near each other are refused, in metres."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+import numpy as np
+import pyproj
+import shapely
+from pydantic import Field, model_validator
+
+from sasgeo_bench.config import Document, Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+
+Part = Literal["train", "calibration", "test"]
+PARTS: Final[tuple[Part, ...]] = ("train", "calibration", "test")
+Half = Literal["a", "b"]
+HALVES: Final[tuple[Half, ...]] = ("a", "b")
+
+_WGS84: Final = 4326
+_LEAST_PLACES: Final = 2  # of a half: one is tested, and another one calibrates
+_GEOD: Final = pyproj.Geod(ellps="WGS84")
+
+
+class Place(Document):
+    """Regions, or single blocks of them, that always stay together.
+
+    A hold-out split says the `part` of each, a cross-fit the `half`; neither says the other's.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
+    regions: list[str] = []
+    blocks: list[str] = []
+    part: Part | None = None
+    half: Half | None = None
+
+    @model_validator(mode="after")
+    def _holds_something(self) -> Self:
+        if not self.regions and not self.blocks:
+            message = f"place {self.name!r} needs regions or blocks"
+            raise ValueError(message)
+        return self
+
+
+class SplitFile(NamedDocument):
+    """What a file in `splits/` says.
+
+    Examples
+    --------
+    >>> halves = {"vaduz": "a", "eschen": "a", "monaco": "b", "porto": "b"}
+    >>> places = [{"name": name, "regions": [name], "half": half} for name, half in halves.items()]
+    >>> spec = {"id": "mine", "title": "Mine", "kind": "crossfit", "buffer_m": 0.0, "place": places}
+    >>> SplitFile.model_validate(spec).block_m
+    1000.0
+    """
+
+    id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
+    title: Line
+    kind: Literal["holdout", "crossfit"]
+    buffer_m: Annotated[float, Field(ge=0, le=1e6)]
+    block_m: Annotated[float, Field(ge=100, le=20_000)] = 1000.0
+    reach_m: Annotated[float, Field(ge=0, le=5000)] = 360.0
+    place: Annotated[list[Place], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        names = [place.name for place in self.place]
+        regions = [region for place in self.place for region in place.regions]
+        for what, listed in (("place", names), ("region", regions)):
+            twice = sorted({name for name in listed if listed.count(name) > 1})
+            if twice:
+                message = f"{what} {twice[0]!r} is listed twice"
+                raise ValueError(message)
+        needs_part = self.kind == "holdout"
+        wrong = next((place.name for place in self.place if (place.part is not None) != needs_part), None)
+        if wrong is not None:
+            message = f"place {wrong!r} " + ("needs a part" if needs_part else "must not say a part in a cross-fit")
+            raise ValueError(message)
+        self._check_halves()
+        return self
+
+    def _check_halves(self) -> None:
+        """Refuse a cross-fit that does not say where to learn and to calibrate, and a hold-out that does."""
+        is_cut = self.kind == "crossfit"
+        wrong = next((place.name for place in self.place if (place.half is not None) != is_cut), None)
+        if wrong is not None:
+            fault = 'needs a half, "a" or "b"' if is_cut else "must not say a half in a hold-out"
+            message = f"place {wrong!r} {fault}"
+            raise ValueError(message)
+        for half in HALVES if is_cut else ():
+            if sum(place.half == half for place in self.place) < _LEAST_PLACES:
+                message = f"half {half!r} needs two places at least: one is tested, and another one calibrates"
+                raise ValueError(message)
+
+    @property
+    def region_ids(self) -> tuple[str, ...]:
+        """Every region the split speaks of, in the order of the file."""
+        named = (
+            region
+            for place in self.place
+            for region in (*place.regions, *(name.split("/")[0] for name in place.blocks))
+        )
+        return tuple(dict.fromkeys(named))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """One evaluation block: a rectangle of about `block_m` within a region; queries are centred in it."""
+
+    region: str
+    row: int
+    col: int
+    epsg: int
+    bounds_m: tuple[float, float, float, float]
+
+    @property
+    def id(self) -> str:
+        """Region, row and column, as in "vaduz/0-3"."""
+        return f"{self.region}/{self.row}-{self.col}"
+
+    def holds(self, en_m: tuple[float, float]) -> bool:
+        """Whether a place lies in it; of two blocks that touch, its south-western edges belong to it."""
+        west, south, east, north = self.bounds_m
+        return west <= en_m[0] < east and south <= en_m[1] < north
+
+    def polygon(self) -> shapely.Polygon:
+        """The rectangle in the region's CRS."""
+        return shapely.box(*self.bounds_m)
+
+
+def blocks_of(region: str, grid: Grid, *, block_m: float = 1000.0) -> tuple[Block, ...]:
+    """Tile a region by blocks of equal size, as near to `block_m` as whole numbers allow; from the north-west.
+
+    Examples
+    --------
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4096.0, cell_size_m=1.0, rows=4096, cols=3072)
+    >>> blocks = blocks_of("vaduz", grid)
+    >>> len(blocks), blocks[-1].id, blocks[0].bounds_m
+    (12, 'vaduz/3-2', (0.0, 3072.0, 1024.0, 4096.0))
+    """
+    west, south, east, north = grid.bounds_m
+    rows, cols = max(1, round((north - south) / block_m)), max(1, round((east - west) / block_m))
+    easts, norths = np.linspace(west, east, cols + 1).tolist(), np.linspace(north, south, rows + 1).tolist()
+    return tuple(
+        Block(
+            region=region,
+            row=row,
+            col=col,
+            epsg=grid.epsg,
+            bounds_m=(easts[col], norths[row + 1], easts[col + 1], norths[row]),
+        )
+        for row in range(rows)
+        for col in range(cols)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fold:
+    """One way to use a split: every place in one part.
+
+    `held_out` names the test place of a cross-fit fold. The rest of its half calibrates and the other half trains, so
+    that what is learnt for a place is learnt once for its half, from places that neither test it nor calibrate it.
+    """
+
+    held_out: str | None
+    part_of: Mapping[str, Part]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Split:
+    """A checked split: place -> blocks, and the folds that use them."""
+
+    spec: SplitFile
+    blocks: Mapping[str, tuple[Block, ...]]
+
+    @cached_property
+    def folds(self) -> tuple[Fold, ...]:
+        """One fold of a hold-out; one for each place of a cross-fit."""
+        if self.spec.kind == "holdout":
+            return (Fold(held_out=None, part_of={place.name: place.part or "test" for place in self.spec.place}),)
+        return tuple(_fold(self.spec, place.name) for place in self.spec.place)
+
+    @cached_property
+    def place_of(self) -> Mapping[str, str]:
+        """Block id -> place."""
+        return {block.id: place for place, blocks in self.blocks.items() for block in blocks}
+
+    @cached_property
+    def half_of(self) -> Mapping[str, Half]:
+        """Place -> half, of a cross-fit; a hold-out has none."""
+        return {place.name: place.half for place in self.spec.place if place.half is not None}
+
+    def places_in(self, region: str) -> tuple[str, ...]:
+        """Places that hold blocks of a region; none where the split does not speak of it."""
+        return tuple(place for place, blocks in self.blocks.items() if any(block.region == region for block in blocks))
+
+    def blocks_in(self, region: str) -> tuple[Block, ...]:
+        """Blocks of one region, in the order of their rows."""
+        found = [block for blocks in self.blocks.values() for block in blocks if block.region == region]
+        return tuple(sorted(found, key=lambda block: (block.row, block.col)))
+
+    def part_of(self, place: str) -> str:
+        """What must not meet another such: the part in a hold-out, each place by itself in a cross-fit."""
+        return place if self.spec.kind == "crossfit" else self.folds[0].part_of[place]
+
+    def part_in_task(self, block: Block) -> str:
+        """What a query in a block is for: a part of a hold-out; "crossfit" where every place is test in its fold."""
+        return "crossfit" if self.spec.kind == "crossfit" else self.folds[0].part_of[self.place_of[block.id]]
+
+    def to_text(self) -> str:
+        """A line for each place and its part, and how near parts come to each other."""
+        lines = [
+            f"{self.spec.id}: {self.spec.title} ({self.spec.kind}, at least {self.spec.buffer_m:g} m between parts)"
+        ]
+        for place in self.spec.place:
+            count, part = len(self.blocks[place.name]), place.part or f"half {place.half}"
+            regions = ", ".join(dict.fromkeys(block.region for block in self.blocks[place.name]))
+            blocks = f"{count:4d} {'block' if count == 1 else 'blocks':6s}"
+            lines.append(f"  {part:12s} {place.name:18s} {blocks}  {regions}")
+        near = nearest_pair(self)
+        if self.half_of:
+            lines.append(
+                "  each place is tested in its own fold: the rest of its half calibrates, the other half trains"
+            )
+        if near is not None:
+            lines.append(f"  nearest blocks of two parts: {near.first} and {near.second}, {near.gap_m:,.0f} m")
+        return "\n".join(lines)
+
+
+def _fold(spec: SplitFile, held_out: str) -> Fold:
+    """Hold one place out: the rest of its half is for calibration, the other half for training."""
+    own = next(place.half for place in spec.place if place.name == held_out)
+    parts: dict[str, Part] = {place.name: "calibration" if place.half == own else "train" for place in spec.place}
+    return Fold(held_out=held_out, part_of=parts | {held_out: "test"})
+
+
+def make_split(spec: SplitFile, grids: Mapping[str, Grid]) -> Split:
+    """Lay out the blocks of a split and check that no two parts meet.
+
+    Parameters
+    ----------
+    spec : SplitFile
+        The file.
+    grids : mapping of str to Grid
+        Lattice of every region that exists.
+
+    Returns
+    -------
+    Split
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If a region or block is unknown, a block stands in two places, or blocks of two parts, with the reach of the
+        queries' footprints, overlap or come nearer than the buffer; the pair is named.
+    """
+    unknown = [region for region in spec.region_ids if region not in grids]
+    if unknown:
+        message = f"split {spec.id!r} names the unknown region {unknown[0]!r}: list-regions shows all there are"
+        raise ConfigError(message)
+    blocks = {place.name: _blocks_of_place(spec, place, grids) for place in spec.place}
+    split = Split(spec=spec, blocks=blocks)
+    seen: dict[str, str] = {}
+    for place, listed in blocks.items():
+        for block in listed:
+            if seen.setdefault(block.id, place) != place:
+                message = f"split {spec.id!r}: block {block.id} stands in {seen[block.id]!r} and in {place!r}"
+                raise ConfigError(message)
+    near = nearest_pair(split, within_m=spec.buffer_m + 2 * spec.reach_m)
+    if near is not None and near.gap_m - 2 * spec.reach_m < spec.buffer_m:
+        message = (
+            f"split {spec.id!r}: blocks {near.first} and {near.second} of different parts are {near.gap_m:.0f} m "
+            f"apart; footprints reach {spec.reach_m:g} m beyond each, and {spec.buffer_m:g} m must stay between them"
+        )
+        raise ConfigError(message)
+    return split
+
+
+def _blocks_of_place(spec: SplitFile, place: Place, grids: Mapping[str, Grid]) -> tuple[Block, ...]:
+    found = [block for region in place.regions for block in blocks_of(region, grids[region], block_m=spec.block_m)]
+    for name in place.blocks:
+        region = name.split("/")[0]
+        known = {block.id: block for block in blocks_of(region, grids[region], block_m=spec.block_m)}
+        if name not in known:
+            message = f"split {spec.id!r} names the unknown block {name!r}; {region} has {', '.join(known)}"
+            raise ConfigError(message)
+        found.append(known[name])
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pair:
+    """Two blocks of different parts and the metres between them."""
+
+    first: str
+    second: str
+    gap_m: float
+
+
+def nearest_pair(split: Split, *, within_m: float = math.inf) -> Pair | None:
+    """Find the two blocks of different parts that are nearest to each other, or None if all are farther apart.
+
+    In a cross-fit every place is a part of its own. Distances are taken on the real outlines: on the ellipsoid between
+    far regions, in the CRS of the first where they are near.
+    """
+    parts: dict[str, list[Block]] = {}
+    for place, blocks in split.blocks.items():
+        parts.setdefault(split.part_of(place), []).extend(blocks)
+    return nearest_blocks(parts, within_m=within_m)
+
+
+def nearest_blocks(parts: Mapping[str, Sequence[Block]], *, within_m: float = math.inf) -> Pair | None:
+    """Find the two blocks of different groups that are nearest to each other; as `nearest_pair` measures it."""
+    groups: dict[tuple[str, str], list[Block]] = {}
+    for part, blocks in parts.items():
+        for block in blocks:
+            groups.setdefault((part, block.region), []).append(block)
+    pairs = sorted(_group_pairs(groups), key=lambda item: item[0])
+    best: Pair | None = None
+    for least_m, first, second in pairs:
+        if least_m > min(within_m, best.gap_m if best else math.inf):
+            break
+        found = min(_gaps(first, second), key=lambda pair: pair.gap_m)
+        if found.gap_m <= within_m and (best is None or found.gap_m < best.gap_m):
+            best = found
+    return best
+
+
+def _group_pairs(
+    groups: Mapping[tuple[str, str], list[Block]],
+) -> Iterator[tuple[float, list[Block], list[Block]]]:
+    """Pairs of groups of different parts with a lower bound of their distance, metres."""
+    centres = {key: _disc(blocks) for key, blocks in groups.items()}
+    for first, second in combinations(groups, 2):
+        if first[0] == second[0]:
+            continue
+        (lon_a, lat_a, radius_a), (lon_b, lat_b, radius_b) = centres[first], centres[second]
+        apart_m = _GEOD.inv(lon_a, lat_a, lon_b, lat_b)[2]
+        yield max(0.0, apart_m - 1.01 * (radius_a + radius_b)), groups[first], groups[second]
+
+
+def _disc(blocks: list[Block]) -> tuple[float, float, float]:
+    """Longitude and latitude of a centre, and a radius in metres that holds all blocks of one region."""
+    west, south, east, north = shapely.total_bounds([block.polygon() for block in blocks])
+    to_lonlat = pyproj.Transformer.from_crs(blocks[0].epsg, _WGS84, always_xy=True)
+    lon_deg, lat_deg = to_lonlat.transform((west + east) / 2, (south + north) / 2)
+    return (lon_deg, lat_deg, math.hypot(east - west, north - south) / 2)
+
+
+def _gaps(first: Iterable[Block], second: Iterable[Block]) -> Iterator[Pair]:
+    """Distance of every pair, with the second group brought into the CRS of the first."""
+    for a in first:
+        for b in second:
+            outline = b.polygon()
+            if a.epsg != b.epsg:
+                change = pyproj.Transformer.from_crs(b.epsg, a.epsg, always_xy=True)
+                fine = shapely.segmentize(outline, 100.0)
+                outline = shapely.transform(fine, lambda at, to=change: np.column_stack(to.transform(*at.T)))
+            yield Pair(first=a.id, second=b.id, gap_m=float(shapely.distance(a.polygon(), outline)))
+
+
+def read_split_file(path: Path) -> SplitFile:
+    """Read one split file; raises as `read_document` does."""
+    return read_document(path, SplitFile, "splits")
+
+
+def list_split_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
+    """Split id -> file, of the given folders and those shipped; raises as `list_documents` does.
+
+    Examples
+    --------
+    >>> sorted(list_split_files())
+    ['crossfit', 'holdout']
+    """
+    return list_documents("splits", SplitFile, folders)
+
+
+def find_split_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
+    """Find a split file by its id, or take the path of one; raises as `find_document` does."""
+    return find_document(id_or_path, "split", "or name a .toml file", lambda: list_split_files(folders=folders))
+
+
+def find_split(id_or_path: str, *, folders: Sequence[Path] = ()) -> Split:
+    """The checked split of an id or file, laid out on all regions that are known; raises as `make_split` does.
+
+    Examples
+    --------
+    >>> find_split("crossfit").half_of["porto"]
+    'a'
+    """
+    grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
+    return make_split(read_split_file(find_split_file(id_or_path)), grids)

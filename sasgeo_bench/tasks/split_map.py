@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map of a split: every place with its blocks, coloured by part."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyproj
+import shapely
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Patch, Polygon
+from numpy.typing import NDArray
+
+from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.tasks.split import HALVES, Block, Split
+
+# Blue, orange and green of Okabe and Ito, told apart by colour-blind readers.
+COLOURS: Final = {"train": "#0072b2", "calibration": "#e69f00", "test": "#009e73", "a": "#0072b2", "b": "#e69f00"}
+_COLUMNS: Final = 6
+_M_PER_DEG: Final = 111_320.0
+
+
+def write_split_map(path: Path, split: Split) -> None:
+    """Draw one panel for each place, all blocks in their true shape and distance, with a bar of one kilometre.
+
+    Parameters
+    ----------
+    path : Path
+        The PNG to write.
+    split : Split
+        What to draw.
+    """
+    places = list(split.blocks)
+    rows = -(-len(places) // _COLUMNS)
+    width, height = 2.3 * _COLUMNS, 2.4 * rows + 1.1
+    figure = PlainFigure(figsize=(width, height), dpi=100, facecolor="white")
+    FigureCanvasAgg(figure)
+    for at, place in enumerate(places):
+        row, col = divmod(at, _COLUMNS)
+        box = (col / _COLUMNS + 0.01, (height - 0.95 - 2.4 * (row + 1) + 0.25) / height, 0.88 / _COLUMNS, 2.0 / height)
+        chart = figure.add_axes(box)
+        blocks = split.blocks[place]
+        part = colour_of(split, place)
+        outlines = [_outline_m(block, blocks[0]) for block in blocks]
+        for outline in outlines:
+            chart.add_patch(Polygon(outline, closed=True, facecolor=COLOURS[part], edgecolor="white", lw=0.5))
+        west, south, east, north = shapely.total_bounds([shapely.Polygon(outline) for outline in outlines])
+        half_m = max(east - west, north - south) / 2 * 1.12
+        chart.set_xlim((west + east) / 2 - half_m, (west + east) / 2 + half_m)
+        chart.set_ylim((south + north) / 2 - half_m, (south + north) / 2 + half_m)
+        chart.plot(
+            [(west + east) / 2 - half_m * 0.95 + at_m for at_m in (0, 1000)],
+            [(south + north) / 2 - half_m * 0.95] * 2,
+            color="black",
+            lw=2,
+        )
+        chart.set_xticks([])
+        chart.set_yticks([])
+        chart.set_title(f"{place} ({len(blocks)})", fontsize=8.5, pad=3)
+    title = f"{split.spec.id}: {split.spec.title}"
+    figure.text(0.01, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
+    note = "blocks of about 1 km; the bar is 1 km; panels are not to one scale"
+    figure.text(0.01, 1 - 0.45 / height, note, va="top", fontsize=9, color="#444444")
+    parts = sorted({colour_of(split, place) for place in split.blocks}, key=list(COLOURS).index)
+    names: dict[str, str] = {half: f"half {half}: test, calibration; train for the other" for half in HALVES}
+    handles = [Patch(facecolor=COLOURS[part], label=names.get(part, part)) for part in parts]
+    figure.legend(handles=handles, loc="upper right", frameon=False, fontsize=9, ncols=len(handles))
+    figure.text(0.01, 0.06 / height, ATTRIBUTION, fontsize=8)
+    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+
+
+def colour_of(split: Split, place: str) -> str:
+    """What a place is coloured by: its part in a hold-out, its half in a cross-fit."""
+    return split.half_of.get(place) or split.part_of(place)
+
+
+def _outline_m(block: Block, origin: Block) -> NDArray[np.float64]:
+    """Corners of a block in metres around the first block of the place, near enough for a picture."""
+    corners = np.array(block.polygon().exterior.coords)[:-1]
+    if block.epsg == origin.epsg:
+        return corners
+    change = pyproj.Transformer.from_crs(block.epsg, origin.epsg, always_xy=True)
+    return np.column_stack(change.transform(*corners.T))

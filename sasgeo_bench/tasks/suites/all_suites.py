@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every suite by its name; a new suite is a file of its own and a line here."""
+
+import difflib
+from typing import Final
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.tasks.suites import (
+    absent,
+    alias,
+    board_controls,
+    clean,
+    false_unknown,
+    grade_separation,
+    growth,
+    instance_twins,
+    local_warp,
+    no_priors,
+    occlusion,
+    real_age,
+    season,
+    stable_not_distinctive,
+    synthetic_age,
+    topology_twins,
+    volatile_lure,
+)
+from sasgeo_bench.tasks.suites.base import Suite
+
+SUITES: Final[dict[str, Suite]] = {
+    suite.card.name: suite
+    for suite in (
+        clean.SUITE,
+        occlusion.SUITE,
+        false_unknown.SUITE,
+        local_warp.SUITE,
+        topology_twins.SUITE,
+        instance_twins.SUITE,
+        grade_separation.SUITE,
+        no_priors.SUITE,
+        real_age.SUITE,
+        synthetic_age.SUITE,
+        volatile_lure.SUITE,
+        growth.SUITE,
+        season.SUITE,
+        stable_not_distinctive.SUITE,
+        alias.SUITE,
+        absent.SUITE,
+    )
+}
+# Drawn for every board beside its experiment, and for none of its figures.
+EVERY_SUITE: Final[dict[str, Suite]] = {**SUITES, board_controls.SUITE.card.name: board_controls.SUITE}
+
+
+def find_suite(name: str) -> Suite:
+    """Return the suite of a name.
+
+    Raises
+    ------
+    ConfigError
+        If there is none; the line suggests the nearest one.
+
+    Examples
+    --------
+    >>> find_suite("real-age").card.version
+    1
+    """
+    if name not in EVERY_SUITE:
+        near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        message = f"there is no suite {name!r}{hint} (list-suites shows all)"
+        raise ConfigError(message)
+    return EVERY_SUITE[name]

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `grade-separation`: an overpass against a level junction of the same shape."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Seeds, Site, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of
+from sasgeo_bench.tasks.twin import Change, level_crossings
+
+
+def _overpasses(scene: Scene) -> NDArray[np.float64]:
+    """Places where two roads cross without meeting."""
+    nodes = nodes_of(scene, ["crossing"])
+    is_road = nodes["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    return places_of(nodes[is_road & (nodes["level_difference"].to_numpy() != 0)])
+
+
+def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
+    del scene, site, rng
+    return level_crossings
+
+
+class GradeSeparation(TwinSuite):
+    """As every twin suite; the bridge layer is unknown in every view, so that only the vectors tell."""
+
+    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+        """Hide the bridge layer."""
+        draft = super().draw(scene, site, variant, seeds)
+        return Draft(evidence=without(draft.evidence, "bridge"), vectors=draft.vectors)
+
+
+def without(evidence: Evidence, class_name: str) -> Evidence:
+    """Make one class unknown everywhere."""
+    cells = evidence.cells.copy()
+    cells[evidence.classes.index(class_name)] = UNKNOWN
+    return evidence.replace(cells)
+
+
+SUITE: Final = GradeSeparation(
+    card=SuiteCard(
+        name="grade-separation",
+        version=1,
+        title="Grade separation (G4)",
+        what="A twin in which bridges lie on the ground, so that roads which pass over each other meet.",
+        separates="Crossings without connection in the perceived vectors from rasters, in which both look alike.",
+        falsifier="Bridges withheld: the vectors of both places show a level junction, and nothing separates them.",
+        strength_unit="1 with perceived vectors",
+        tracks=("retrieval", "localization"),
+        group=TWIN_GROUP,
+        min_density=0.02,
+    ),
+    variants=(
+        Variant(role="control", kind="no vectors"),
+        Variant(role="stress", kind="G4", strength=1.0),
+        Variant(role="falsifier", kind="bridge withheld"),
+    ),
+    change_of=_change,
+    find=_overpasses,
+    needs="no bridge that carries one road over another",
+    falsifier_sees_change=True,
+)

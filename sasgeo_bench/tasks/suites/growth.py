@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `growth`: many buildings stand that the map does not know."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.regions.evidence import PRESENT, Evidence
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.suites.base import (
+    VIEW_CELLS,
+    Draft,
+    Scene,
+    Seeds,
+    Site,
+    Suite,
+    SuiteCard,
+    Variant,
+    changed_share,
+    controls,
+    ladder,
+    perceived,
+)
+from sasgeo_bench.tasks.suites.twins import nodes_of, places_of
+
+ERROR_FACTOR: Final = 2.0  # the detector across domains: in its own, new houses alone mislead nobody
+NEW_PER_OLD: Final = (0.5, 1.0, 2.0, 4.0)
+
+
+class GrowthSuite(Suite):
+    """Buildings appear near those that are there; nothing vanishes."""
+
+    def lack(self, scene: Scene) -> str | None:
+        """Growth starts from buildings."""
+        return None if len(self.anchors(scene)) else "no building to grow from"
+
+    def anchors(self, scene: Scene) -> NDArray[np.float64]:
+        """Near buildings."""
+        return places_of(nodes_of(scene, ("building", "building_cluster")))
+
+    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+        """Let the place grow, then perceive; a control sees it as mapped."""
+        if variant.strength == 0:
+            seen = perceived(scene.world, site, variant, seeds, error_factor=ERROR_FACTOR)
+            return Draft(evidence=seen, changed_share=0.0)
+        clean = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+        grown = growth(variant.strength)(clean, seeds.rng("growth", variant.view_cells))
+        share = changed_share(clean, grown)
+        measured = {"changed_share": share, "new_per_old_area": _new_per_old(clean, grown)}
+        seen = perceived(scene.world, site, variant, seeds, error_factor=ERROR_FACTOR, clean=grown)
+        return Draft(evidence=seen, changed_share=share, measured=measured)
+
+
+def growth(new_per_old: float) -> Ageing:
+    """Ageing in which so many buildings appear for each that is there, and nothing else happens."""
+    building = Rates(vanish_per_year=0.0, appear_per_year=float(np.log1p(new_per_old)))
+    rates = AgeingRates(classes={"building": building}, places=())
+    return Ageing(years=1.0, rates=rates, place="-")
+
+
+def _new_per_old(before: Evidence, after: Evidence) -> float:
+    old, new = (int((item.layer("building") == PRESENT).sum()) for item in (before, after))
+    return (new - old) / old if old else 0.0
+
+
+SUITE: Final = GrowthSuite(
+    card=SuiteCard(
+        name="growth",
+        version=1,
+        title="Growth (S3)",
+        what="For each building on the map 0.5 to 4 others have appeared nearby, on free ground; all is seen with "
+        "twice the detector's error.",
+        separates="Matchers that weigh what is seen and not mapped by its class from those that punish it alike.",
+        falsifier="Nothing has appeared: scores as in the control.",
+        strength_unit="new buildings for each on the map",
+        min_density=0.05,
+    ),
+    variants=(
+        *controls(views=VIEW_CELLS),
+        *ladder("S3", NEW_PER_OLD, small=NEW_PER_OLD, large=(2.0,)),
+        Variant(role="falsifier", kind="no growth"),
+    ),
+)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `local-warp`: what is seen is bent smoothly, so that cells miss the map while roads keep their order."""
+
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, folded_share, moved, warped
+from sasgeo_bench.tasks.suites.base import (
+    VIEW_CELLS,
+    Draft,
+    Scene,
+    Seeds,
+    Site,
+    Suite,
+    SuiteCard,
+    Variant,
+    controls,
+    ladder,
+    perceived,
+)
+from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors, round_vectors
+
+RMS_M: Final = (5.0, 10.0, 15.0)
+_STEP_M: Final = 8.0  # of vertices before a line is bent: an eighth of the shortest wave
+_STRAIGHT_M: Final = 0.3  # what bending may leave out again: finer than the vectors' own noise
+
+
+class LocalWarpSuite(Suite):
+    """One field of shifts for a site, of growing strength; vectors are bent with the cells, as one camera sees both."""
+
+    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+        """Perceive, then bend."""
+        seen = perceived(scene.world, site, variant, seeds)
+        vectors = perceive_vectors(
+            scene.world,
+            site.pose,
+            side_m=variant.side_m,
+            noise=VectorNoise(),
+            rng=seeds.rng("vectors", variant.view_cells),
+        )
+        if variant.strength == 0:
+            return Draft(evidence=seen, vectors=vectors)
+        warp = LocalWarp(rms_m=variant.strength)
+        field_m = warp.field(seen.shape, seen.cell_size_m, seeds.rng("warp", variant.view_cells))
+        after = warped(seen, field_m)
+        return Draft(
+            evidence=after,
+            vectors=bent(vectors, field_m, seen.cell_size_m),
+            measured={
+                "rms_m": float(np.sqrt((field_m**2).sum(axis=0).mean())),
+                "folded": folded_share(field_m, seen.cell_size_m),
+                "cells_changed": float((after.cells != seen.cells).mean()),
+            },
+        )
+
+
+def bent(vectors: gpd.GeoDataFrame, field_m: NDArray[np.float64], cell_size_m: float) -> gpd.GeoDataFrame:
+    """Vectors of a view moved as a warp moves its cells."""
+    dense = shapely.segmentize(vectors.geometry.to_numpy(), _STEP_M)
+    shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))
+    return round_vectors(vectors, shapely.simplify(shapes, _STRAIGHT_M))
+
+
+SUITE: Final = LocalWarpSuite(
+    card=SuiteCard(
+        name="local-warp",
+        version=1,
+        title="Local warp (G1)",
+        what="A smooth field of shifts of 5, 10 or 15 m rms and waves of 70 to 110 m bends the view and its vectors.",
+        separates="The graph, whose order of roads survives, from rasters, whose cells no longer overlap.",
+        falsifier="A field of 0 m: scores as in the control.",
+        strength_unit="m rms of the shift",
+    ),
+    variants=(
+        *controls(views=VIEW_CELLS),
+        *ladder("G1", RMS_M, small=RMS_M, large=(15.0,)),
+        Variant(role="falsifier", kind="no warp"),
+    ),
+)

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decoys: the places most like the true one by four unlike scorers, so that they favour no single method."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State
+
+SCORERS: Final = ("histogram", "rings", "distance", "graph")
+STRIDE_M: Final = 32.0
+LEAST_RADII: Final = 3.0  # no decoy nearer to the truth, in footprint radii (half diagonals)
+
+_COARSE_M: Final = 8.0
+RINGS: Final = 4
+_SECTORS: Final = 12
+_FAR_M: Final = 64.0  # distances are cut here: farther than this is far
+_THIN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "building")
+_NODE_KINDS: Final = (
+    *("intersection", "dead_end", "crossing", "building", "building_cluster", "level_crossing"),
+    *("river_bend", "road_rail_crossing", "road_water_crossing"),
+)
+_SHORTLIST: Final = 400  # places whose best turn is looked for; the others are too unlike at any turn
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Windows:
+    """Every place on a lattice of a map, as four scorers describe it.
+
+    `points_m` is easting and northing, shape (N, 2); `spacing_m` the lattice; each descriptor has shape (N, D), scaled
+    so that its columns have unit variance over the map, but `polar`, shape (N, D, sectors), and `shares`, shape (N, D),
+    of the drawn classes in rings, both 0..1.
+    """
+
+    points_m: NDArray[np.float64]
+    radius_m: float
+    shares: Floats
+    plain: dict[str, Floats]
+    polar: Floats
+    spectrum: Floats
+
+
+def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
+    """Describe every place of a map that is mapped, for views of one size.
+
+    Parameters
+    ----------
+    state : State
+        The map.
+    side_m : float
+        Side of the view.
+    clear_m : float
+        Half the side of the square that must be mapped whole, as around a site: nearer to the rim of the map a place
+        could not be the true one, and a matcher would know.
+
+    Returns
+    -------
+    Windows
+        All such places on a lattice.
+
+    Notes
+    -----
+    The scorers: shares of the classes in the disc; shares in rings; distances to thin classes on a polar grid, at the
+    best turn; nodes of the graph by kind in two rings. None of them is a method that is scored.
+    """
+    factor = max(1, round(_COARSE_M / state.grid.cell_size_m))
+    grid = state.grid.coarsen(factor)
+    known = _mean_blocks(state.known, factor)
+    radius = side_m / 2 / grid.cell_size_m
+    kernels = _rings(radius, RINGS)
+    step = max(1, round(STRIDE_M / grid.cell_size_m))
+    rows, cols = np.meshgrid(
+        np.arange(step // 2, grid.rows, step), np.arange(step // 2, grid.cols, step), indexing="ij"
+    )
+    square = np.ones((2 * math.ceil(clear_m / grid.cell_size_m) + 1,) * 2, dtype=np.uint8)
+    # Beyond the map nothing is known: the border counts as 0.
+    whole = (known >= 1).astype(np.uint8)
+    mapped = cv2.erode(whole, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)[rows, cols] == 1
+    cells = np.column_stack((rows[mapped], cols[mapped])).astype(np.int64)
+    rings = np.stack(
+        [
+            _filtered(share, kernel)[cells[:, 0], cells[:, 1]]
+            for share in (_mean_blocks(state.has(name), factor) for name in state.classes)
+            for kernel in kernels
+        ],
+        axis=1,
+    ).reshape(len(cells), len(state.classes), RINGS)
+    drawn = [index for index, name in enumerate(state.classes) if name in (*DRAWN_CLASSES, "water")]
+    areas = np.array([kernel.size for kernel in kernels], dtype=np.float32)
+    polar = _polar(state, factor, cells, radius)
+    return Windows(
+        points_m=grid.to_centres_m(cells),
+        radius_m=side_m / 2,
+        shares=rings[:, drawn].reshape(len(cells), -1),
+        plain={
+            "histogram": _scaled((rings * areas).sum(axis=2) / areas.sum()),
+            "rings": _scaled(rings.reshape(len(cells), -1)),
+            "graph": _scaled(_node_counts(state.graph.nodes, grid.to_centres_m(cells), side_m / 2)),
+        },
+        polar=polar,
+        spectrum=np.abs(np.fft.rfft(polar, axis=2)).astype(np.float32).reshape(len(cells), -1),
+    )
+
+
+def _mean_blocks(mask: NDArray[np.bool_], factor: int) -> Floats:
+    """Share of a mask in square blocks; the last ones are padded with False."""
+    rows, cols = -(-mask.shape[0] // factor), -(-mask.shape[1] // factor)
+    padded = np.zeros((rows * factor, cols * factor), dtype=np.uint8)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    return np.asarray(
+        cv2.resize(padded * np.uint8(255), (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32
+    ) / np.float32(255)
+
+
+def _rings(radius: float, count: int) -> list[Floats]:
+    """Kernels of equal area that tile a disc, each summing to 1."""
+    reach = int(np.ceil(radius))
+    down, right = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    ring = np.floor(count * (down**2 + right**2) / max(radius, 1.0) ** 2).astype(int)
+    kernels = []
+    for index in range(count):
+        kernel = (ring == index).astype(np.float32)
+        kernels.append(kernel / max(float(kernel.sum()), 1.0))
+    return kernels
+
+
+def _filtered(share: Floats, kernel: Floats) -> Floats:
+    return np.asarray(cv2.filter2D(share, -1, kernel, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
+
+
+def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -> Floats:
+    """Cut distances to thin classes, sampled on rings and sectors, shape (N, classes * rings, sectors), 0..1."""
+    turns = np.arange(_SECTORS) * 2 * np.pi / _SECTORS
+    reach = radius * (np.arange(RINGS) + 0.5) / RINGS
+    down = np.rint(-np.cos(turns)[None, :] * reach[:, None]).astype(int)  # sector 0 is north, the next one clockwise
+    right = np.rint(np.sin(turns)[None, :] * reach[:, None]).astype(int)
+    found = []
+    for name in _THIN:
+        if name not in state.classes:
+            continue
+        share = _mean_blocks(state.has(name), factor)
+        distance = cv2.distanceTransform((share <= 0).astype(np.uint8), cv2.DIST_L2, 3)
+        near = np.minimum(distance, _FAR_M / _COARSE_M) * (_COARSE_M / _FAR_M)
+        rows = np.clip(cells[:, 0, None, None] + down, 0, near.shape[0] - 1)
+        cols = np.clip(cells[:, 1, None, None] + right, 0, near.shape[1] - 1)
+        found.append(near[rows, cols])
+    return np.concatenate(found, axis=1).astype(np.float32)
+
+
+def _node_counts(nodes: gpd.GeoDataFrame, points_m: NDArray[np.float64], radius_m: float) -> Floats:
+    """Nodes of each kind within half the disc's area and within all of it, as square roots (variance of a count)."""
+    kinds = nodes["kind"].to_numpy()
+    counts = np.zeros((len(points_m), 2 * len(_NODE_KINDS)), dtype=np.float32)
+    centres = shapely.points(points_m)
+    for at, kind in enumerate(_NODE_KINDS):
+        tree = shapely.STRtree(nodes.geometry.to_numpy()[kinds == kind])
+        for ring, reach_m in enumerate((radius_m / np.sqrt(2), radius_m)):
+            hit = tree.query(centres, predicate="dwithin", distance=reach_m)[0]
+            counts[:, 2 * at + ring] = np.bincount(hit, minlength=len(points_m))
+    return np.sqrt(counts)
+
+
+def _scaled(table: Floats) -> Floats:
+    spread = table.std(axis=0)
+    return np.asarray(table / np.where(spread > 0, spread, 1.0), dtype=np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decoys:
+    """Places most like one, most alike first, all far enough from it.
+
+    `alias_index`, 0..1, is how like the likest place is: the mean of how the drawn classes' shares in rings overlap,
+    and of one less the root mean square by which distances to thin classes miss at the best turn. Both have scales of
+    their own, not the map's, so that regions can be compared. `scorer` says which scorer each comes from, `points_m`
+    has shape (N, 2).
+    """
+
+    points_m: NDArray[np.float64]
+    scorer: tuple[str, ...]
+    alias_index: float
+
+
+def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Decoys:
+    """Find decoys for one place: the best of each scorer in turn.
+
+    Parameters
+    ----------
+    windows : Windows
+        Of the map that is searched.
+    center_m : tuple of float
+        Easting and northing of the true place.
+    count : int
+        At most so many.
+
+    Returns
+    -------
+    Decoys
+        None nearer than `LEAST_RADII` half diagonals to the truth or to another one: were they nearer to each other
+        than to the truth, the loneliest candidate would be the true one.
+    """
+    apart_m = np.hypot(*(windows.points_m - center_m).T)
+    is_far = apart_m >= least_apart_m(windows.radius_m)
+    here = int(np.argmin(apart_m)) if len(apart_m) else -1
+    if here < 0 or not is_far.any():
+        return Decoys(points_m=np.zeros((0, 2)), scorer=(), alias_index=0.0)
+    far = np.flatnonzero(is_far)
+    order = []
+    for name in SCORERS:
+        distance = _distances(windows, name, here, far)
+        order.append(far[np.argsort(distance, kind="stable")])
+        if name == "distance":
+            misses = float(distance.min()) / math.sqrt(windows.polar[here].size)
+    spacing_m = least_apart_m(windows.radius_m)
+    picked = list(_in_turn(order, windows.points_m, spacing_m=spacing_m, count=count))
+    return Decoys(
+        points_m=windows.points_m[[index for index, _ in picked]].reshape(-1, 2),
+        scorer=tuple(name for _, name in picked),
+        alias_index=(_overlap(windows.shares, here, far) + 1.0 - misses) / 2,
+    )
+
+
+def _overlap(shares: Floats, here: int, far: NDArray[np.int64]) -> float:
+    """Largest overlap of the drawn classes' shares in rings with another place's: 1 less Bray and Curtis' index."""
+    apart = np.abs(shares[far] - shares[here]).sum(axis=1)
+    total = (shares[far] + shares[here]).sum(axis=1)
+    return 1.0 - float(np.divide(apart, total, out=np.zeros_like(apart), where=total > 0).min())
+
+
+def least_apart_m(radius_m: float) -> float:
+    """Least distance of a decoy from the truth, for views of half that side: three half diagonals.
+
+    Examples
+    --------
+    >>> round(least_apart_m(96.0), 1)
+    407.3
+    """
+    return LEAST_RADII * radius_m * float(np.sqrt(2))
+
+
+def _distances(windows: Windows, name: str, here: int, far: NDArray[np.int64]) -> Floats:
+    if name in windows.plain:
+        table = windows.plain[name]
+        return np.asarray(np.linalg.norm(table[far] - table[here], axis=1))
+    # Turns: the spectrum's magnitude is blind to them and picks the short list; there, the best turn counts.
+    rough = np.linalg.norm(windows.spectrum[far] - windows.spectrum[here], axis=1)
+    short = np.argsort(rough, kind="stable")[:_SHORTLIST]
+    ours, theirs = windows.polar[here], windows.polar[far[short]]
+    turned = np.stack([np.roll(ours, turn, axis=1) for turn in range(_SECTORS)]).reshape(_SECTORS, -1)
+    flat = theirs.reshape(len(short), -1)
+    squared = (flat**2).sum(axis=1)[:, None] - 2 * flat @ turned.T + (turned**2).sum(axis=1)[None, :]
+    best = np.sqrt(np.maximum(squared.min(axis=1), 0.0))
+    distance = np.full(len(far), np.inf, dtype=np.float32)
+    distance[short] = best
+    beyond = np.setdiff1d(np.arange(len(far)), short)
+    distance[beyond] = best.max() + rough[beyond]
+    return distance
+
+
+def _in_turn(
+    order: list[NDArray[np.int64]], points_m: NDArray[np.float64], *, spacing_m: float, count: int
+) -> Iterator[tuple[int, str]]:
+    """First of the first scorer, first of the second, ..., second of the first; none near one taken before."""
+    places = np.rint((points_m - points_m.min(axis=0)) / STRIDE_M).astype(np.int64)
+    reach = int(np.ceil(spacing_m / STRIDE_M))
+    aside = np.arange(-reach, reach + 1) * STRIDE_M
+    disc = np.hypot(aside[:, None], aside[None, :]) < spacing_m
+    # One cell for each place of the lattice, and a rim as wide as the disc, so that it need not be cut.
+    is_taken = np.zeros(places.max(axis=0) + 1 + 2 * reach, dtype=bool)
+    flat = np.ravel_multi_index(tuple((places + reach).T), is_taken.shape)
+    taken, at = 0, [0] * len(order)
+    while taken < count and any(at[scorer] < len(ranked) for scorer, ranked in enumerate(order)):
+        for scorer, ranked in enumerate(order):
+            at[scorer] = _next_free(ranked, at[scorer], is_taken.ravel(), flat)
+            if at[scorer] == len(ranked):
+                continue
+            index = int(ranked[at[scorer]])
+            yield index, SCORERS[scorer]
+            x, y = places[index]
+            is_taken[x : x + len(disc), y : y + len(disc)] |= disc
+            taken += 1
+            if taken == count:
+                return
+
+
+def _next_free(ranked: NDArray[np.int64], start: int, is_taken: NDArray[np.bool_], flat: NDArray[np.int64]) -> int:
+    """Position of the first free place from `start` on; looks at ever longer parts of the ranking."""
+    length = 64
+    while start < len(ranked):
+        free = np.flatnonzero(~is_taken[flat[ranked[start : start + length]]])
+        if len(free):
+            return start + int(free[0])
+        start, length = start + length, 2 * length
+    return len(ranked)
+
+
+def candidates(
+    truth: tuple[float, float] | None,
+    decoys_m: NDArray[np.float64],
+    *,
+    yaw_deg: float,
+    jitter_m: float,
+    rng: np.random.Generator,
+) -> tuple[tuple[Pose, ...], int]:
+    """Shuffle the true place among decoys; every one is moved by the same kind of chance.
+
+    Decoys lie on a lattice and the truth does not: without the jitter, coordinates alone would tell it.
+
+    Returns
+    -------
+    tuple of Pose, int
+        Candidates, and the index of the true one, -1 without a truth.
+    """
+    points = decoys_m if truth is None else np.vstack((np.array([truth]), decoys_m))
+    moved = points + rng.uniform(-jitter_m, jitter_m, points.shape)
+    order = rng.permutation(len(moved))
+    poses = tuple(
+        Pose(easting_m=round(float(x), 2), northing_m=round(float(y), 2), yaw_deg=yaw_deg) for x, y in moved[order]
+    )
+    return poses, -1 if truth is None else int(np.argmin(order))

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `occlusion`: parts of the view are unknown, by rectangles, by geometry, by what hides, by an adversary."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
+from sasgeo_bench.tasks.perturbations.base import Perturbation
+from sasgeo_bench.tasks.perturbations.border import Border
+from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
+from sasgeo_bench.tasks.perturbations.glare import Glare
+from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
+from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
+from sasgeo_bench.tasks.suites.base import VIEW_CELLS, PlainSuite, SuiteCard, Variant, controls, ladder
+
+SHARES: Final = (0.15, 0.3, 0.45, 0.6)
+SMALL_SHARES: Final = (0.3, 0.6)
+ALL_UNKNOWN: Final = "all unknown"
+
+
+# What hides a given share of the view.
+HIDERS: Final[dict[str, Callable[[float], Perturbation]]] = {
+    "none": lambda share: Rectangles(share=share),
+    "U1 rectangles": lambda share: Rectangles(share=share),
+    "U2 border": lambda share: Border(share=share),
+    "U2 wedge": lambda share: TiltWedge(share=share),
+    "U2 glare": lambda share: Glare(share=share),
+    "U3 canopy and shadow": lambda share: CanopyAndShadow(share=share),
+    "U4 adversarial": lambda share: AdversarialMask(share=share),
+}
+
+
+def _hide(variant: Variant, evidence: Evidence, rng: np.random.Generator) -> Evidence:
+    """Occlude a view as the variant says."""
+    if variant.kind == ALL_UNKNOWN:
+        return evidence.replace(np.full_like(evidence.cells, UNKNOWN))
+    return HIDERS[variant.kind](variant.strength)(evidence, rng)
+
+
+SUITE: Final = PlainSuite(
+    card=SuiteCard(
+        name="occlusion",
+        version=1,
+        title="Occlusion (U1-U4)",
+        what="Rectangles (U1), border, tilt wedge and glare (U2), canopy and shadow over thin classes (U3), and the "
+        "mask of a fixed library that hides most of what is there (U4), over 15 to 60 % of the view.",
+        separates="Matchers that leave unknown cells out from those that take them for absent.",
+        falsifier="Nothing hidden: scores as in the control. Everything hidden: must be withheld.",
+        strength_unit="share of the view that is hidden; in U3 of where trees and shadows hide thin classes",
+        tracks=("localization", "retrieval"),
+    ),
+    variants=(
+        *controls(views=VIEW_CELLS),
+        *ladder("U1 rectangles", SHARES, small=SMALL_SHARES, large=(0.6,)),
+        *ladder("U2 border", (0.3, 0.6), small=SMALL_SHARES),
+        *ladder("U2 wedge", (0.3, 0.6), small=SMALL_SHARES),
+        *ladder("U2 glare", (0.3, 0.6), small=SMALL_SHARES),
+        *ladder("U3 canopy and shadow", (0.5, 1.0), small=(0.5, 1.0)),
+        *ladder("U4 adversarial", (0.3, 0.6), small=SMALL_SHARES),
+        Variant(role="falsifier", kind="none"),
+        Variant(role="falsifier", kind=ALL_UNKNOWN, strength=1.0),
+    ),
+    change=_hide,
+)

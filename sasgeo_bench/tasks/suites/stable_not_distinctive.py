@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `stable-not-distinctive`: a straight road among changing fields, stable and the same for kilometres."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.angles import bearing_deg, wrap_deg
+from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Site, Suite, SuiteCard, Variant, perceived
+from sasgeo_bench.tasks.suites.mining import least_apart_m
+from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
+from sasgeo_bench.tasks.suites.twins import Places
+
+STABLE: Final = ("road_major", "railway", "waterway")
+VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building")  # in this order they change
+MOST_ALIASES: Final = 8
+
+_STEP_M: Final = 40.0
+_REACH_M: Final = 90.0  # along the line, either way: most of a view of 192 m
+_STRAIGHT: Final = 0.995  # of the length along it
+_SAME_DEG: Final = 12.0
+_MOST_BUILT: Final = 0.03
+
+
+class StableNotDistinctive(Suite):
+    """Sites along straight lines of a stable class; other places along such lines of one direction are candidates."""
+
+    def lack(self, scene: Scene) -> str | None:
+        """Straight stretches in open land are needed."""
+        return None if len(straight_places(scene)) else "no straight major road, railway or waterway in open land"
+
+    def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
+        """On the lines."""
+        return straight_places(scene)[:, :2]
+
+    def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit | None:
+        """No change of the map: the twins are there, as far off a line as sites are, and as far from each other."""
+        places = straight_places(scene)
+        apart_m = least_apart_m(self.main_side_m / 2)
+        spread_m = ANCHOR_SPREAD * self.main_side_m
+        twins = {}
+        for site in sites:
+            rng = seeds.rng("alias", site.index)
+            here = np.array([site.pose.easting_m, site.pose.northing_m])
+            own = places[int(np.argmin(np.hypot(*(places[:, :2] - here).T))), 2]
+            turned = np.abs(wrap_deg(2 * (places[:, 2] - own)) / 2)  # a line has no direction: modulo 180
+            like = rng.permutation(places[turned <= _SAME_DEG, :2])
+            like = like + rng.uniform(-spread_m, spread_m, like.shape)
+            is_whole = [scene.map.is_mapped(place, self.clear_m(scene)) for place in like]
+            twins[site.index] = _spaced(like[is_whole], here, apart_m)
+        return Edit(
+            map_pastes=(), world_pastes=None, sites=tuple(site for site in sites if twins[site.index]), twins=twins
+        )
+
+    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+        """Mirror the layers of some volatile classes within the view: all of them at strength 1."""
+        seen = perceived(scene.world, site, variant, seeds)
+        after = mirrored(seen, round(variant.strength * len(VOLATILE)))
+        return Draft(evidence=after, measured={"cells_changed": float((seen.cells != after.cells).mean())})
+
+
+def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], apart_m: float) -> Places:
+    """The first few places that keep their distance from here and from each other."""
+    taken = [here]
+    for point in points:
+        if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= apart_m:
+            taken.append(point)
+    return tuple((float(x), float(y)) for x, y in taken[1:])
+
+
+def mirrored(evidence: Evidence, count: int) -> Evidence:
+    """Mirror the first so many volatile classes from left to right: as much is there as before, elsewhere."""
+    cells = evidence.cells.copy()
+    for name in VOLATILE[:count]:
+        index = evidence.classes.index(name)
+        cells[index] = cells[index][:, ::-1]
+    return evidence.replace(cells)
+
+
+def straight_places(scene: Scene) -> NDArray[np.float64]:
+    """Easting, northing and bearing of points on straight stretches of stable lines in open land, shape (N, 3)."""
+    features = scene.map.features
+    chosen = features["class"].isin(STABLE).to_numpy() & features["is_visible"].to_numpy()
+    lines = shapely.line_merge(shapely.union_all(features.geometry.to_numpy()[chosen])) if chosen.any() else None
+    if lines is None:
+        return np.zeros((0, 3))
+    found = [_along(line) for line in shapely.get_parts(lines) if line.length > 2 * _REACH_M]
+    places = np.concatenate(found) if found else np.zeros((0, 3))
+    return np.asarray(places[_is_open(scene, places[:, :2])])
+
+
+def _along(line: shapely.Geometry) -> NDArray[np.float64]:
+    at = np.arange(_REACH_M, line.length - _REACH_M, _STEP_M)
+    before, here, after = (
+        shapely.get_coordinates(shapely.line_interpolate_point(line, at + shift)).reshape(-1, 2)
+        for shift in (-_REACH_M, 0.0, _REACH_M)
+    )
+    chord = after - before
+    is_straight = np.hypot(*chord.T) >= _STRAIGHT * 2 * _REACH_M
+    bearings = bearing_deg(chord[:, 0], chord[:, 1])
+    return np.asarray(np.column_stack((here, bearings))[is_straight])
+
+
+def _is_open(scene: Scene, places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Few buildings within the reach of a view."""
+    built, grid = scene.map.has("building"), scene.map.grid
+    half = round(_REACH_M / grid.cell_size_m)
+    found = []
+    for row, col in grid.to_cells(places).tolist():
+        window = built[max(0, row - half) : row + half, max(0, col - half) : col + half]
+        found.append(window.size > 0 and float(window.mean()) <= _MOST_BUILT)
+    return np.array(found, dtype=bool)
+
+
+SUITE: Final = StableNotDistinctive(
+    card=SuiteCard(
+        name="stable-not-distinctive",
+        version=1,
+        title="Stable, not distinctive (S5)",
+        what="A straight road, railway or canal in open land whose fields have changed; others are candidates.",
+        separates="Stability times distinctiveness from stability alone, which trusts what is the same everywhere.",
+        falsifier="The same places with the fields as mapped.",
+        strength_unit="share of the volatile classes that have changed",
+        tracks=("retrieval", "localization"),
+        min_density=0.005,
+    ),
+    variants=(
+        Variant(role="control", kind="unchanged"),
+        Variant(role="stress", kind="S5", strength=0.4),
+        Variant(role="stress", kind="S5", strength=1.0),
+        Variant(role="falsifier", kind="unchanged again"),
+    ),
+)

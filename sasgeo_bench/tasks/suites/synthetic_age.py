@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suite `synthetic-age`: the world is the map grown older, at rates measured in other places."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from sasgeo_bench.ageing.ratebook import PooledRates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.suites.base import (
+    VIEW_CELLS,
+    Draft,
+    Scene,
+    Seeds,
+    Site,
+    Suite,
+    SuiteCard,
+    Variant,
+    changed_share,
+    controls,
+    ladder,
+    perceived,
+)
+
+YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
+REDRAWN_WITHIN_YEARS: Final = 10.0  # the span that the share of redrawn things in a scene's ageing stands for
+_MOST_NEW_PER_OLD: Final = 1.0
+_SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
+_MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
+
+
+class SyntheticAgeSuite(Suite):
+    """Years pass between map and view; for places of which there is one date only."""
+
+    def lack(self, scene: Scene) -> str | None:
+        """Rates of other places are needed."""
+        return "no rates of ageing from another place" if scene.ageing is None else super().lack(scene)
+
+    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+        """Let the years pass, then perceive; a control sees the map's own day."""
+        if variant.strength == 0 or scene.ageing is None:
+            return Draft(evidence=perceived(scene.world, site, variant, seeds), changed_share=0.0)
+        clean = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+        grown = after(scene.ageing, variant.strength)(clean, seeds.rng("ageing", variant.view_cells))
+        share = changed_share(clean, grown)
+        return Draft(
+            evidence=perceived(scene.world, site, variant, seeds, clean=grown),
+            changed_share=share,
+            measured={"changed_share": share},
+        )
+
+
+def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
+    """Ageing by measured rates of other places; no year has passed yet.
+
+    What is drawn anew, and how far off, are medians over the classes whose centre moves because they were drawn anew
+    and not because they grew.
+    """
+    told = [pooled.classes[name] for name in _SHIFTED if name in pooled.classes]
+    shares = [
+        1 - (1 - item.redrawn_share) ** (REDRAWN_WITHIN_YEARS / item.years)
+        for item in told
+        if item.redrawn_share is not None
+    ]
+    shifts_m = [item.shift_median_m for item in told if item.shift_median_m is not None]
+    classes = {
+        name: Rates(vanish_per_year=item.vanish_per_year, appear_per_year=item.appear_per_year)
+        for name, item in pooled.classes.items()
+    }
+    return Ageing(
+        years=0.0,
+        rates=AgeingRates(classes=classes, places=pooled.places),
+        place=place,
+        redrawn=float(np.median(shares)) if shares else 0.0,
+        shift_m=float(np.median(shifts_m)) / _MEDIAN_OF_SHIFT if shifts_m else 0.0,
+    )
+
+
+def after(ageing: Ageing, years: float) -> Ageing:
+    """Ageing by so many years; the share that was drawn anew grows with them.
+
+    A class no more than doubles: rates of appearing were measured on maps that were being filled, and one that is full
+    has not as much to catch up on.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.tasks.perturbations.ageing import AgeingRates
+    >>> slow = Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="-", redrawn=0.36)
+    >>> round(after(slow, 5.0).redrawn, 3)
+    0.2
+    """
+    kept = (1 - ageing.redrawn) ** (years / REDRAWN_WITHIN_YEARS)
+    most = float(np.log1p(_MOST_NEW_PER_OLD)) / years if years > 0 else np.inf
+    classes = {
+        name: replace(rates, appear_per_year=min(rates.appear_per_year, most))
+        for name, rates in ageing.rates.classes.items()
+    }
+    return replace(ageing, years=years, redrawn=1 - kept, rates=replace(ageing.rates, classes=classes))
+
+
+SUITE: Final = SyntheticAgeSuite(
+    card=SuiteCard(
+        name="synthetic-age",
+        version=1,
+        title="Synthetic ageing",
+        what="Things vanish, appear and are drawn anew for 2 to 40 years, at the rates measured in other places.",
+        separates="Stability from uniform weights where no second date is there; to be read beside real-age.",
+        falsifier="No year has passed: scores as in the control.",
+        strength_unit="years between map and world",
+        needs=("rates of ageing",),
+    ),
+    variants=(
+        *controls(views=VIEW_CELLS),
+        *ladder("aged", YEARS, small=(5.0, 10.0, 20.0, 40.0), large=(10.0, 40.0)),
+        Variant(role="falsifier", kind="no year"),
+    ),
+)

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A detector of vectors: lines and outlines as a view shows them, with errors of its own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.pose import Pose, inverse
+from sasgeo_bench.regions.evidence import footprint
+from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.vectors import vector_table
+
+VECTOR_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway")
+_LEAST_M: Final = 2.0
+_WAVES: Final = 8
+_WAVELENGTHS_M: Final = (60.0, 150.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VectorNoise:
+    """Errors of perceived vectors.
+
+    Parameters
+    ----------
+    missed_share : float
+        Share of objects not seen at all.
+    gap_share, gap_m : float
+        Share of lines with a gap, and its length.
+    shift_m : float
+        Root mean square of a smooth shift of all coordinates, each axis; what meets goes on meeting.
+    """
+
+    missed_share: float = 0.10
+    gap_share: float = 0.15
+    gap_m: float = 6.0
+    shift_m: float = 1.0
+
+
+def perceive_vectors(
+    state: State, pose: Pose, *, side_m: float, noise: VectorNoise, rng: np.random.Generator
+) -> gpd.GeoDataFrame:
+    """Vectors of the visible features in a view, in the view's frame.
+
+    Parameters
+    ----------
+    state : State
+        The world.
+    pose : Pose
+        Of the view.
+    side_m : float
+        Its side for scale 1.
+    noise : VectorNoise
+        The detector's errors.
+    rng : numpy.random.Generator
+        Their chance.
+
+    Returns
+    -------
+    geopandas.GeoDataFrame
+        Columns `class`, `level`, `is_bridge` and `geometry`: (right, up) from the middle of the view, metres.
+    """
+    outline = footprint(pose, size_m=(side_m, side_m))
+    features = state.features
+    near = features.sindex.query(outline, predicate="intersects")
+    table = features.iloc[np.sort(near)]
+    table = table[table["is_visible"].to_numpy() & table["class"].isin(VECTOR_CLASSES).to_numpy()]
+    clipped = shapely.intersection(shapely.make_valid(table.geometry.to_numpy()), outline)
+    back = inverse(pose)
+    local = shapely.transform(clipped, back.to_map)
+    seen = rng.random(len(local)) >= noise.missed_share
+    local = shapely.transform(local, smooth_shift(noise.shift_m, rng))
+    gaps = rng.random(len(local)) < noise.gap_share
+    places = rng.random(len(local))
+    rows = []
+    for at, (shape, (_, row)) in enumerate(zip(local, table.iterrows(), strict=True)):
+        if seen[at]:
+            parts = _parts(shape, cut_m=noise.gap_m if gaps[at] else 0.0, place=float(places[at]))
+            rows += [(row["class"], int(row["level"]), bool(row["is_bridge"]), part) for part in parts]
+    return vector_table(rows)
+
+
+def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Draw a smooth field of shifts: points of shape (N, 2), metres -> shifted points. A sum of a few plane waves."""
+    turns = rng.uniform(0, 2 * np.pi, _WAVES)
+    waves = (
+        np.column_stack((np.cos(turns), np.sin(turns))) * (2 * np.pi / rng.uniform(*_WAVELENGTHS_M, _WAVES))[:, None]
+    )
+    phases = rng.uniform(0, 2 * np.pi, (2, _WAVES))
+    scale_m = rms_m * np.sqrt(2 / _WAVES)
+
+    def shifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points, shape (N, 2), moved by the field."""
+        angle = points @ waves.T
+        return np.asarray(points + scale_m * np.column_stack([np.cos(angle + phase).sum(axis=1) for phase in phases]))
+
+    return shifted
+
+
+def round_vectors(vectors: gpd.GeoDataFrame, shapes: NDArray[np.object_]) -> gpd.GeoDataFrame:
+    """The same vectors with other shapes, rounded."""
+    columns = (vectors[name].to_list() for name in ("class", "level", "is_bridge"))
+    return vector_table(list(zip(*columns, shapes, strict=True)))
+
+
+def _parts(shape: shapely.Geometry, *, cut_m: float, place: float) -> list[shapely.Geometry]:
+    """Lines and polygons of a shape; a gap is cut into its first line."""
+    parts = [
+        part for part in shapely.get_parts(shapely.get_parts(shape)) if part.geom_type in ("LineString", "Polygon")
+    ]
+    if cut_m and parts and parts[0].geom_type == "LineString" and parts[0].length > 2 * cut_m:
+        middle = shapely.line_interpolate_point(parts[0], place * parts[0].length)
+        parts = [*shapely.get_parts(shapely.difference(parts[0], middle.buffer(cut_m / 2))), *parts[1:]]
+    return [part for part in parts if part.length >= _LEAST_M]

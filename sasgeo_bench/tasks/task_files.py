@@ -1,0 +1,498 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
+
+import hashlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any, Final, TypeVar
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+from pydantic import Field
+
+from sasgeo_bench.config import Document, check_document
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.hashes import file_record, sha256_of
+from sasgeo_bench.files.json import read_json
+from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
+from sasgeo_bench.regions.evidence import CELLS_PER_BYTE
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, Query, Truth
+from sasgeo_bench.tasks.task_rows import (
+    ASKED,
+    FILE_SCHEMA,
+    HEAD_SCHEMA,
+    MAY_BE_NULL,
+    PLAIN_TRUTH_SCHEMA,
+    QUERY_SCHEMA,
+    TRUTH_SCHEMA,
+    VIEW_BYTES,
+    asked_sha256,
+    is_like,
+    poses_of,
+    query_of,
+    query_row,
+    stream_of,
+    truth_of,
+    truth_row,
+)
+from sasgeo_bench.texts import FOLDER, json_text
+
+Row = TypeVar("Row")
+Made = TypeVar("Made")
+Count = Annotated[int, Field(ge=0)]
+Folder = Annotated[str, Field(pattern=FOLDER)]  # never a way out
+
+QUERIES: Final = "queries.parquet"
+TASK: Final = "task.json"
+TRUTH: Final = "truth.parquet"
+TRUTH_OF: Final = "truth.json"
+PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
+SCHEMA_VERSION: Final = 1
+_MEND: Final = "make the queries again"
+_ROWS: Final = 128  # a row group; what is held in memory at once
+_MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
+_READ: Final = " and ".join(map(str, TASK_VERSIONS))  # versions of tasks that are read
+
+
+class TaskFile(Document):
+    """Hash and size of the queries."""
+
+    sha256: str
+    bytes: Count
+
+
+class TaskFiles(Document):
+    """Files of a task, of which there is one."""
+
+    queries: Annotated[TaskFile, Field(alias=QUERIES)]
+
+
+class TaskSaid(Document):
+    """What `task.json` says; an unknown key is an error, for a later schema says so by its version.
+
+    Examples
+    --------
+    >>> TaskSaid.model_fields["suite"].is_required()
+    True
+    """
+
+    schema_version: int
+    task_version: int
+    suite: Folder
+    suite_version: Count | None = None
+    title: str
+    what: str | None = None
+    separates: str | None = None
+    falsifier: str | None = None
+    strength_unit: str | None = None
+    region: Folder
+    map_date: str | None = None
+    map_fingerprint: str
+    map_inputs_sha256: str | None = None
+    split: str | None = None
+    split_sha256: str | None = None
+    sites: Count | None = None
+    views_cells: list[Count] | None = None
+    epsg: int | None = None
+    made_by: str | None = None
+    counts: dict[str, Count]
+    prior_groups: list[str] | None = None
+    candidates_sha256: str | None = None
+    private_seed: dict[str, str | int] | None = None  # its commitment and bits
+    files: TaskFiles
+    licence: str | None = None
+    attribution: str | None = None
+
+
+def write_task(
+    task_folder: Path,
+    truth_folder: Path,
+    pairs: Iterable[tuple[Query, Truth]],
+    about: dict[str, Any],
+    hidden: dict[str, Any] | None = None,
+) -> int:
+    """Write queries and truths, a row group at a time, then `task.json`, which makes the folder a task.
+
+    Parameters
+    ----------
+    task_folder, truth_folder : Path
+        Two folders that are there, empty.
+    pairs : iterable of (Query, Truth)
+        In the order of the query ids, which says nothing about the answers.
+    about : dict
+        What `task.json` says besides the counts and hashes.
+    hidden : dict, optional
+        What `truth.json` says besides which queries the truths belong to.
+
+    Returns
+    -------
+    int
+        How many were written.
+    """
+    counts: dict[str, int] = {}
+    groups: set[str] = set()
+    total = 0
+    frozen = hashlib.sha256()
+    with ExitStack() as stack:
+        queries, truths = (
+            stack.enter_context(table_writer(path, schema, compression_level=9))
+            for path, schema in ((task_folder / QUERIES, FILE_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
+        )
+        for part in _batches(pairs):
+            rows = pa.Table.from_pylist([query_row(query) for query, _ in part], schema=QUERY_SCHEMA)
+            asked = [asked_sha256(row, _map_said(about)) for row in rows.to_pylist()]
+            queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
+            truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
+            for query, _ in part:
+                counts[query.track] = counts.get(query.track, 0) + 1
+                groups.add(query.prior_group)
+                frozen.update(query.query_id.encode() + _candidate_bytes(query))
+            total += len(part)
+    record = file_record(task_folder / QUERIES)
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "task_version": TASK_VERSION,
+        **about,
+        "counts": counts,
+        "prior_groups": sorted(groups),
+        "candidates_sha256": frozen.hexdigest(),
+        "files": {QUERIES: record.model_dump()},
+        "licence": LICENCE,
+        "attribution": ATTRIBUTION,
+    }
+    _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **(hidden or {})})
+    _write_json(task_folder / TASK, content)
+    return total
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json_text(content), encoding="utf-8")
+
+
+def _candidate_bytes(query: Query) -> bytes:
+    """Poses of the candidates in their order, four little-endian doubles each: what the task's hash of them is of."""
+    rows = [(pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale) for pose in query.candidates]
+    return np.array(rows, dtype="<f8").tobytes()
+
+
+def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Query, Truth]]]:
+    batch: list[tuple[Query, Truth]] = []
+    for pair in pairs:
+        batch.append(pair)
+        if len(batch) == _ROWS:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def read_task(folder: Path) -> dict[str, Any]:
+    """Read `task.json`.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no task, or one of another schema.
+
+    Examples
+    --------
+    >>> read_task(Path("nowhere"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: nowhere holds no task.json: make the queries first
+    """
+    path = folder / TASK
+    if not path.is_file():
+        message = f"{folder} holds no {TASK}: make the queries first"
+        raise StoreError(message)
+    content = read_json(path, mend=_MEND)
+    said = content if isinstance(content, dict) else {}
+    for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):
+        if name in said and said[name] not in known:
+            noun, versions = name.replace("_", " "), " and ".join(map(str, known))
+            message = f"{path} has {noun} {said[name]!r}, this version reads {versions}: {_MEND}"
+            raise StoreError(message)
+    try:
+        check_document(content, TaskSaid, source=TASK)
+    except ConfigError as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
+        raise StoreError(message) from error
+    return said
+
+
+def check_queries(folder: Path) -> None:
+    """Refuse queries that are not those `task.json` speaks of.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or has another hash.
+    """
+    said = read_task(folder)["files"][QUERIES]["sha256"]
+    path = folder / QUERIES
+    if not path.is_file() or sha256_of(path) != said:
+        message = f"{path} is not what {TASK} says: make the queries again"
+        raise StoreError(message)
+
+
+def check_ours(folder: Path, names: Sequence[str]) -> None:
+    """Refuse to put a folder in place of one that holds something which is not ours.
+
+    Raises
+    ------
+    StoreError
+        Naming it.
+    """
+    if folder.exists() and not folder.is_dir():
+        message = f"{folder} is a file: move it away, a task goes there"
+        raise StoreError(message)
+    other = next((path for path in sorted(folder.glob("*")) if path.name not in names), None)
+    if other is not None:
+        message = f"{other} is no part of a task and would be lost: move it away"
+        raise StoreError(message)
+
+
+def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
+    """Hold a task against its `task.json` and its truths; a line for each fault.
+
+    Parameters
+    ----------
+    task_folder, truth_folder : Path
+        A task, and where its truths are; without truths only the task itself is looked at.
+
+    Raises
+    ------
+    StoreError
+        If the folder holds no task, or a file cannot be read.
+    """
+    about = read_task(task_folder)
+    faults = []
+    path, said = task_folder / QUERIES, about["files"][QUERIES]
+    if not path.is_file():
+        return [f"{QUERIES}: missing"]
+    known = {task_folder / TASK, path}
+    faults += [f"{other.name}: not part of a task" for other in sorted(task_folder.rglob("*")) if other not in known]
+    found = file_record(path)
+    if found.model_dump() != said:  # what is in it is not worth a look
+        was = f"{said['bytes']} bytes, {said['sha256']}"
+        return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}", *faults]
+    counts: dict[str, int] = {}
+    names = []
+    for query in read_queries(task_folder):
+        counts[query.track] = counts.get(query.track, 0) + 1
+        names.append(query.query_id)
+    if counts != about["counts"]:
+        faults.append(f"{QUERIES}: holds {counts}, {TASK} says {about['counts']}")
+    if (truth_folder / TRUTH).is_file():
+        belongs = _belongs_to(truth_folder)
+        if belongs != found.sha256:
+            faults.append(f"{TRUTH_OF}: the truths are of other queries, SHA-256 {belongs}: make the queries again")
+        answered = [truth.query_id for truth in read_truths(truth_folder)]
+        if answered != names:
+            faults.append(f"{TRUTH}: {len(answered)} truths that are not those of the {len(names)} queries, in order")
+    return faults
+
+
+def _belongs_to(truth_folder: Path) -> str:
+    """SHA-256 of the queries that the truths of a folder are of; "unknown" where it does not say."""
+    return str(read_hidden(truth_folder).get("queries_sha256", "unknown"))
+
+
+def check_truths(task_folder: Path, truth_folder: Path) -> None:
+    """Refuse truths that are not there, are those of other queries, or of another task version.
+
+    Raises
+    ------
+    StoreError
+        Naming both folders, or the file that cannot be read.
+    """
+    if not (truth_folder / TRUTH).is_file():
+        message = (
+            f"{truth_folder} holds no truths of {task_folder}: "
+            "name their folder with --truth, or make the queries again"
+        )
+        raise StoreError(message)
+    if (truth_folder / TRUTH_OF).is_file():
+        read_json(truth_folder / TRUTH_OF, mend=_MEND)  # a damaged one is not one of other queries
+    if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
+        message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
+        raise StoreError(message)
+    metadata = read_schema(truth_folder / TRUTH, mend=_MEND).metadata or {}
+    version = metadata.get(b"task_version", b"none").decode(errors="replace")
+    if version not in map(str, TASK_VERSIONS):
+        message = (
+            f"{truth_folder} holds truths of task version {version}, this version reads {_READ}: make the queries again"
+        )
+        raise StoreError(message)
+
+
+def read_hidden(truth_folder: Path) -> dict[str, Any]:
+    """What `truth.json` says; nothing where it cannot be read."""
+    try:
+        said = read_json(truth_folder / TRUTH_OF, mend=_MEND)
+    except StoreError:
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+def map_of(manifest: Manifest) -> dict[str, str]:
+    """What `task.json` says of a map: what is on it, and all that it was built of."""
+    return {"map_fingerprint": manifest.fingerprint, "map_inputs_sha256": manifest.inputs_sha256}
+
+
+def is_of_map(about: Mapping[str, Any], manifest: Manifest) -> bool:
+    """Whether a task is to be searched in this very build of a map; one of an older program says less of it."""
+    return all(about.get(name, said) == said for name, said in map_of(manifest).items())
+
+
+def _map_said(about: Mapping[str, Any]) -> dict[str, str]:
+    return {name: str(about[name]) for name in _MAP if name in about}
+
+
+def read_asked(folder: Path) -> dict[str, str]:
+    """By query id, the hash of the query and of its map: what an answer has to say that it answers.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing or damaged.
+    """
+    about, path = _map_said(read_task(folder)), folder / QUERIES
+    is_said = ASKED in read_schema(path, mend=_MEND).names
+    columns = ["query_id", ASKED] if is_said else QUERY_SCHEMA.names
+    rows = (row for batch in read_batches(path, columns) for row in batch.to_pylist())
+    return {row["query_id"]: _asked_of(row, about) for row in rows}
+
+
+def _asked_of(row: Mapping[str, Any], about: Mapping[str, str]) -> str:
+    """As the file says, or reckoned from the row where it was drawn before files said so."""
+    said = row.get(ASKED)
+    return asked_sha256(row, about) if said is None else str(said)
+
+
+def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
+    """The queries of some ids, each with its bytes for a matcher's process and the hash of what is asked.
+
+    A row group is in memory at a time.
+    """
+    about = _map_said(read_task(folder))
+    with open_table(folder / QUERIES, mend=_MEND, is_whole=False) as source:
+        for batch in source.iter_batches(batch_size=_ROWS):
+            sent = batch.select([name for name in batch.schema.names if name != ASKED])
+            for at, name in enumerate(batch["query_id"].to_pylist()):
+                if name in wanted:
+                    row = batch.slice(at, 1).to_pylist()[0]
+                    yield _made(folder / QUERIES, query_of, row), stream_of(sent.slice(at, 1)), _asked_of(row, about)
+
+
+def read_ids(folder: Path) -> list[str]:
+    """Ids of a task's queries, in their order.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or damaged.
+    """
+    batches = read_batches(folder / QUERIES, ["query_id"])
+    return [str(name) for batch in batches for name in batch["query_id"].to_pylist()]
+
+
+def read_view_bytes(folder: Path) -> dict[str, int]:
+    """Bytes of what each query shows, as it travels: the packed view, confidences and vectors, nothing compressed.
+
+    The size of a packed view follows from its shape, so that no view is read. Stored results say it.
+    """
+    if VIEW_BYTES in read_schema(folder / QUERIES, mend=_MEND).names:
+        table = read_table(folder / QUERIES, mend=_MEND, columns=["query_id", VIEW_BYTES])
+        return dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
+    found: dict[str, int] = {}
+    columns = ["query_id", "rows", "cols", "classes", "confidence", "vectors"]
+    for batch in read_batches(folder / QUERIES, columns):
+        shape = (batch["rows"], batch["cols"], pc.list_value_length(batch["classes"]))
+        cells = np.prod([np.asarray(side, dtype=np.int64) for side in shape], axis=0)
+        confidence = np.asarray(pc.fill_null(pc.binary_length(batch["confidence"]), 0))
+        vectors = batch["vectors"]
+        ends = np.concatenate(([0], np.cumsum(np.asarray(pc.binary_length(vectors.values.field("wkb"))))))
+        offsets = np.asarray(vectors.offsets)
+        total = -(-cells // CELLS_PER_BYTE) + confidence + ends[offsets[1:]] - ends[offsets[:-1]]
+        found |= dict(zip(batch["query_id"].to_pylist(), total.tolist(), strict=True))
+    return found
+
+
+def read_queries(folder: Path) -> Iterator[Query]:
+    """Queries of a task in the order of their ids, a row group in memory at a time."""
+    for row in _rows(folder / QUERIES, QUERY_SCHEMA):
+        yield _made(folder / QUERIES, query_of, row)
+
+
+def read_heads(folder: Path) -> Iterator[Head]:
+    """Queries of a task without their views, in the order of their ids."""
+    for batch in read_batches(folder / QUERIES, HEAD_SCHEMA.names):
+        rows = batch.drop_columns(["candidates"]).to_pylist()
+        for row, poses in zip(rows, _made(folder / QUERIES, poses_of, batch["candidates"]), strict=True):
+            yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
+
+
+def read_truths(folder: Path) -> Iterator[Truth]:
+    """Truths of a task in the order of the query ids."""
+    for row in _rows(folder / TRUTH, TRUTH_SCHEMA):
+        yield _made(folder / TRUTH, truth_of, row)
+
+
+def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """Some columns of queries or truths, a row group in memory at a time.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing or damaged, or lacks a column.
+    """
+    with open_table(path, mend=_MEND, is_whole=False) as source:
+        _check_columns(path, source.schema_arrow, columns)
+        for batch in source.iter_batches(batch_size=_ROWS, columns=list(columns)):
+            empty = next((name for name in columns if name not in MAY_BE_NULL and batch[name].null_count), None)
+            if empty is not None:
+                message = f"{path} is damaged ({empty} is null in a row): {_MEND}"
+                raise StoreError(message)
+            yield batch
+
+
+def check_columns(path: Path, needed: Sequence[str]) -> None:
+    """Refuse queries or truths without some columns; raises as `read_batches` does."""
+    _check_columns(path, read_schema(path, mend=_MEND), needed)
+
+
+def _check_columns(path: Path, found: pa.Schema, needed: Sequence[str]) -> None:
+    missing = [name for name in needed if name not in found.names]
+    if missing:
+        message = f"{path} lacks the columns {', '.join(missing)}: {_MEND}"
+        raise StoreError(message)
+    odd = next((name for name in needed if found.names.count(name) > 1 or not _is_known(found.field(name))), None)
+    if odd is not None:
+        message = f"{path} holds the column {odd} twice, or with another type than it should: {_MEND}"
+        raise StoreError(message)
+
+
+def _is_known(field: pa.Field) -> bool:
+    """Whether a column has the type that it has in files of ours, those of a release included."""
+    schemas = (FILE_SCHEMA, TRUTH_SCHEMA, PLAIN_TRUTH_SCHEMA)
+    wanted = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
+    return not wanted or any(is_like(field.type, kind) for kind in wanted)
+
+
+def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:
+    """What a row says, which may be anyone's."""
+    try:
+        return make(row)
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
+        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
+        raise StoreError(message) from error
+
+
+def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:
+    for batch in read_batches(path, schema.names):
+        yield from batch.to_pylist()

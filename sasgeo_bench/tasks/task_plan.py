@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a user asks for -> one request for each region and suite; all that can be refused before anything is read."""
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sasgeo_bench.errors import ConfigError, ExtractError
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.regions.build import plan_build
+from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
+from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.split import Split, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.suites.all_suites import find_suite
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
+from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
+
+PRIVATE_ROOT: Final = "private"  # below the root of public queries: nothing of the two is ever in one folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What is asked for: one suite on one region.
+
+    Parameters
+    ----------
+    suite : str
+        Its name.
+    region : RegionFile
+        Where.
+    split : Split
+        Says the blocks and their parts.
+    count : int
+        Sites; each carries all the variants of the suite.
+    seed : int or PrivateSeed
+        Root of all chance.
+    out : Path
+        Root of what is built.
+    group : PriorGroup, optional
+        Priors; those of the suite unless given.
+    elsewhere : RegionFile, optional
+        Where views of a wrong place are taken.
+    extract_folders : sequence of Path
+        For regions that are not built yet.
+    may_be_fewer : bool
+        Whether as many sites as the region holds will do.
+    choice : Choice
+        Of the suite's variants; those that are left out change no other query.
+    """
+
+    suite: str
+    region: RegionFile
+    split: Split
+    count: int
+    seed: Seed
+    out: Path
+    group: PriorGroup | None = None
+    elsewhere: RegionFile | None = None
+    extract_folders: tuple[Path, ...] = ()
+    may_be_fewer: bool = False
+    choice: Choice = EVERYTHING
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What a user asks for: suites, regions, a split, and how much of each; no regions are all that can be built.
+
+    `regions` are ids or files; the other fields are those of a `Request`.
+    """
+
+    suites: tuple[str, ...]
+    regions: tuple[str, ...]
+    split: str
+    count: int
+    seed: Seed
+    out: Path
+    group: PriorGroup | None = None
+    extract_folders: tuple[Path, ...] = ()
+    region_folders: tuple[Path, ...] = ()
+    may_be_fewer: bool = False
+    choice: Choice = EVERYTHING
+
+
+def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
+    """Turn what a user asks for into one request for each region and suite; nothing is read but files of settings.
+
+    Raises
+    ------
+    ConfigError
+        If a suite, region or split is unknown, the split is not sound or does not speak of a region, the count is not
+        positive, or the truths would lie among the tasks.
+    """
+    for name in wanted.suites:
+        fault = wanted.choice.lack(find_suite(name))
+        if fault is not None:
+            raise ConfigError(fault)
+    check_count(wanted.count)
+    check_roots(wanted.out)
+    files = list_region_files(folders=wanted.region_folders)
+    known = {name: read_region_file(path) for name, path in files.items()}
+    named = [read_region_file(find_region_file(name, folders=wanted.region_folders)) for name in wanted.regions]
+    known |= {spec.id: spec for spec in named}
+    spec = read_split_file(find_split_file(wanted.split))
+    split = make_split(spec, {name: item.grid() for name, item in known.items()})
+    if not named:
+        listed = [known[name] for name in split.spec.region_ids]
+        named = [item for item in listed if is_reachable(item, wanted.extract_folders, wanted.out)]
+        left = [item.id for item in listed if item not in named]
+        if left:
+            tell(f"{len(left)} regions have no extract on this machine and are left out: {', '.join(left)}")
+    stranger = next((item.id for item in named if item.id not in split.spec.region_ids), None)
+    if stranger is not None:
+        message = f"split {split.spec.id!r} does not speak of region {stranger!r}: add it to a split file of your own"
+        raise ConfigError(message)
+    return tuple(
+        Request(
+            suite=name,
+            region=item,
+            split=split,
+            count=wanted.count,
+            seed=wanted.seed,
+            out=wanted.out,
+            group=wanted.group,
+            elsewhere=wrong_place(split, item, known),
+            extract_folders=wanted.extract_folders,
+            may_be_fewer=wanted.may_be_fewer,
+            choice=wanted.choice,
+        )
+        for item in {item.id: item for item in named}.values()
+        for name in dict.fromkeys(wanted.suites)
+    )
+
+
+def root_of(out: Path, seed: PrivateSeed | None) -> Path:
+    """Root of what a seed draws: that of public queries, or for a private seed the folder `private` in it.
+
+    Examples
+    --------
+    >>> root_of(Path("out"), PrivateSeed("3f" * 16)).as_posix(), root_of(Path("out"), None).as_posix()
+    ('out/private', 'out')
+    """
+    return out if seed is None else out / PRIVATE_ROOT
+
+
+def check_count(count: int) -> None:
+    """Refuse to draw no queries."""
+    if count < 1:
+        message = f"--n must be at least 1, got {count}"
+        raise ConfigError(message)
+
+
+def check_roots(out: Path) -> None:
+    """Refuse to write truths where those who may see the tasks would find them."""
+    check_apart(out / "tasks", out / "truth")
+    above = next((folder for folder in (out, *out.resolve().parents) if (folder / task_files.TASK).is_file()), None)
+    if above is not None:
+        message = f"{out / 'truth'} lies inside {above}, where the queries are: choose another --out"
+        raise ConfigError(message)
+
+
+def check_apart(tasks: Path, truth: Path) -> None:
+    """Refuse folders of tasks and of truths of which one lies within the other, links followed."""
+    one, two = tasks.resolve(), truth.resolve()
+    if two.is_relative_to(one) or one.is_relative_to(two):
+        message = f"{truth} lies inside {tasks}, where the queries are: choose another --out"
+        raise ConfigError(message)
+
+
+def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -> bool:
+    """Whether a region is a town, or its newest extract is on this machine."""
+    offline = spec.model_copy(update={"extract": [item.model_copy(update={"urls": ()}) for item in spec.extract]})
+    try:
+        plan_build(offline, out=out, extract_folders=request_folders)
+    except ExtractError:
+        return False
+    return True
+
+
+def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile]) -> RegionFile | None:
+    """The region where views of a wrong place are taken: the next place of the split, town for town and real for real.
+
+    It depends on the split alone, so that asking for more regions changes no query.
+    """
+    places = [[name for name in place.regions if name in known] for place in split.spec.place]
+    at = next((index for index, names in enumerate(places) if region.id in names), None)
+    if at is None:
+        return None
+    is_town = region.pick(None).town is not None
+    for step in range(1, len(places)):
+        for name in places[(at + step) % len(places)]:
+            if (known[name].pick(None).town is not None) == is_town:
+                return known[name]
+    return None
+
+
+def aged_dates(spec: RegionFile) -> tuple[dt.date, ...]:
+    """Dates of the older maps for real ageing: for each age the nearest there is, oldest first.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+    >>> [str(date) for date in aged_dates(read_region_file(find_region_file("dreieich")))]
+    ['2013-07-19']
+    """
+    newest = spec.pick(None).date
+    older = sorted(extract.date for extract in spec.extract if extract.date < newest)
+    if not older:
+        return ()
+    ages_years = np.array([(newest - date).days / DAYS_PER_YEAR for date in older])
+    return tuple(sorted({older[int(np.argmin(np.abs(np.log(ages_years / years))))] for years in AGES_YEARS}))

@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Queries and truths as rows: the columns of `queries.parquet` and `truth.parquet`, and back."""
+
+import datetime as dt
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate, pairwise
+from typing import Any, Final
+
+import geopandas as gpd
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.evidence import Evidence, pack, unpack
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth
+
+POSE_FIELDS: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
+_POSE: Final = pa.struct([(name, pa.float64()) for name in POSE_FIELDS])
+
+
+_VECTOR: Final = pa.struct(
+    [("class", pa.string()), ("level", pa.int16()), ("is_bridge", pa.bool_()), ("wkb", pa.binary())]
+)
+
+
+_ASKED_VERSION: Final = 1  # raised if the same row is to be answered in another way, not when other rows are drawn
+_META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
+
+
+# The last five columns are for sequences and images, which no suite draws yet.
+QUERY_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("track", pa.string()),
+        ("suite", pa.string()),
+        ("suite_version", pa.int16()),
+        ("part", pa.string()),
+        ("region", pa.string()),
+        ("cell_size_m", pa.float64()),
+        ("rows", pa.int32()),
+        ("cols", pa.int32()),
+        ("classes", pa.list_(pa.string())),
+        ("evidence", pa.binary()),
+        ("confidence", pa.binary()),
+        ("observed_on", pa.date32()),
+        ("season", pa.string()),
+        ("prior_group", pa.string()),
+        ("prior_easting_m", pa.float64()),
+        ("prior_northing_m", pa.float64()),
+        ("prior_radius_m", pa.float64()),
+        ("prior_yaw_deg", pa.float64()),
+        ("prior_yaw_sigma_deg", pa.float64()),
+        ("prior_scale_sigma", pa.float64()),
+        ("candidates", pa.list_(_POSE)),
+        ("vectors", pa.list_(_VECTOR)),
+        ("sequence_id", pa.string()),
+        ("frame", pa.int32()),
+        ("increment", pa.list_(pa.float64())),
+        ("increment_covariance", pa.list_(pa.float64())),
+        ("image", pa.binary()),
+    ],
+    metadata=_META,
+)
+
+
+# What is asked, in one word: an answer says it too, so that it is taken for that query on that map and for no other.
+ASKED: Final = "asked_sha256"
+VIEW_BYTES: Final = "view_bytes"  # column of stored results, which hold no views: bytes that each of them has
+FILE_SCHEMA: Final = QUERY_SCHEMA.append(pa.field(ASKED, pa.string()))
+
+
+HEAD_SCHEMA: Final = pa.schema(
+    [
+        QUERY_SCHEMA.field(name)
+        for name in (
+            *("query_id", "track", "suite", "suite_version", "part", "region"),
+            *("rows", "cell_size_m", "prior_group", "candidates"),
+        )
+    ]
+)
+
+
+TRUTH_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("is_present", pa.bool_()),
+        ("easting_m", pa.float64()),
+        ("northing_m", pa.float64()),
+        ("yaw_deg", pa.float64()),
+        ("scale", pa.float64()),
+        ("candidate", pa.int32()),
+        ("pair_id", pa.string()),
+        ("role", pa.string()),
+        ("kind", pa.string()),
+        ("strength", pa.float64()),
+        ("strength_unit", pa.string()),
+        ("unknown_share", pa.float64()),
+        ("changed_share", pa.float64()),
+        ("feature_density", pa.float64()),
+        ("alias_index", pa.float64()),
+        ("block", pa.string()),
+        ("scene", pa.string()),
+        ("measured", pa.map_(pa.string(), pa.float64())),
+    ],
+    metadata=_META,
+)
+
+
+# Columns of queries and truths that need not say anything; of no use where what they go with is missing.
+MAY_BE_NULL: Final = frozenset(
+    {
+        *("confidence", "observed_on", "season", "prior_easting_m", "prior_northing_m", "prior_radius_m"),
+        *("prior_yaw_deg", "prior_yaw_sigma_deg", "candidates", "vectors", "sequence_id", "frame", "increment"),
+        *("increment_covariance", "image", ASKED, *POSE_FIELDS, "alias_index"),
+    }
+)
+
+
+# Truths as a release holds them: lists of pairs where not every reader of parquet knows maps.
+_PAIR: Final = pa.struct([("name", pa.string()), ("value", pa.float64())])
+PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
+    TRUTH_SCHEMA.get_field_index("measured"), pa.field("measured", pa.list_(_PAIR))
+)
+
+
+def query_row(query: Query) -> dict[str, Any]:
+    """One query as a row of `QUERY_SCHEMA`."""
+    seen, prior = query.evidence, query.prior
+    center = prior.center_m or (None, None)
+    return {
+        "query_id": query.query_id,
+        "track": query.track,
+        "suite": query.suite,
+        "suite_version": query.suite_version,
+        "part": query.part,
+        "region": query.region,
+        "cell_size_m": seen.cell_size_m,
+        "rows": seen.shape[0],
+        "cols": seen.shape[1],
+        "classes": list(seen.classes),
+        "evidence": pack(seen.cells),
+        "confidence": None if seen.confidence is None else seen.confidence.tobytes(),
+        "observed_on": query.observed_on,
+        "season": query.season,
+        "prior_group": query.prior_group,
+        "prior_easting_m": center[0],
+        "prior_northing_m": center[1],
+        "prior_radius_m": prior.radius_m,
+        "prior_yaw_deg": prior.yaw_deg,
+        "prior_yaw_sigma_deg": prior.yaw_sigma_deg,
+        "prior_scale_sigma": prior.scale_sigma,
+        "candidates": [_pose_row(pose) for pose in query.candidates],
+        "vectors": None if query.vectors is None else _vector_rows(query.vectors),
+    }
+
+
+def _pose_row(pose: Pose) -> dict[str, float]:
+    return {"easting_m": pose.easting_m, "northing_m": pose.northing_m, "yaw_deg": pose.yaw_deg, "scale": pose.scale}
+
+
+def _vector_rows(vectors: gpd.GeoDataFrame) -> list[dict[str, Any]]:
+    columns = [vectors[name].to_list() for name in ("class", "level", "is_bridge")]
+    shapes = [bytes(shape) for shape in shapely.to_wkb(vectors.geometry.to_numpy())]
+    return [
+        {"class": name, "level": level, "is_bridge": is_bridge, "wkb": wkb}
+        for name, level, is_bridge, wkb in zip(*columns, shapes, strict=True)
+    ]
+
+
+def query_of(row: dict[str, Any]) -> Query:
+    """Inverse of `query_row`."""
+    shape = (len(row["classes"]), row["rows"], row["cols"])
+    confidence = row["confidence"]
+    evidence = Evidence(
+        classes=tuple(row["classes"]),
+        cells=unpack(row["evidence"], shape),
+        cell_size_m=row["cell_size_m"],
+        confidence=None if confidence is None else np.frombuffer(confidence, dtype=np.uint8).reshape(shape).copy(),
+    )
+    has_place = row["prior_radius_m"] is not None
+    prior = Prior(
+        center_m=(row["prior_easting_m"], row["prior_northing_m"]) if has_place else None,
+        radius_m=row["prior_radius_m"],
+        yaw_deg=row["prior_yaw_deg"],
+        yaw_sigma_deg=row["prior_yaw_sigma_deg"],
+        scale_sigma=row["prior_scale_sigma"],
+    )
+    return Query(
+        query_id=row["query_id"],
+        track=row["track"],
+        suite=row["suite"],
+        suite_version=row["suite_version"],
+        part=row["part"],
+        region=row["region"],
+        evidence=evidence,
+        observed_on=row["observed_on"],
+        season=row["season"],
+        prior=prior,
+        prior_group=row["prior_group"],
+        candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
+        vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
+    )
+
+
+def _vectors_of(rows: list[dict[str, Any]]) -> gpd.GeoDataFrame:
+    return gpd.GeoDataFrame(
+        {
+            "class": np.array([row["class"] for row in rows], dtype=object),
+            "level": np.array([row["level"] for row in rows], dtype=np.int16),
+            "is_bridge": np.array([row["is_bridge"] for row in rows], dtype=bool),
+        },
+        geometry=gpd.GeoSeries(shapely.from_wkb([row["wkb"] for row in rows]), dtype="geometry"),
+    )
+
+
+def asked_sha256(row: Mapping[str, Any], map_said: Mapping[str, str]) -> str:
+    """Hash of all that decides an answer: the row of a query, and the map it is to be searched in.
+
+    Parameters
+    ----------
+    row : mapping
+        Of `QUERY_SCHEMA`, as it is read from a file; what is null or no column of the schema says nothing.
+    map_said : mapping of str to str
+        What `task.json` says of the map.
+
+    Examples
+    --------
+    >>> asked_sha256({"query_id": "a", "season": None}, {}) == asked_sha256({"query_id": "a", "more": 1}, {})
+    True
+    """
+    said = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
+    text = json.dumps([_ASKED_VERSION, dict(map_said), said], sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(value: bytes | dt.date) -> str:
+    """A value that JSON does not know, as text."""
+    return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
+
+
+def truth_row(truth: Truth) -> dict[str, Any]:
+    """One truth as a row of `TRUTH_SCHEMA`."""
+    pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(("easting_m", "northing_m", "yaw_deg", "scale"))
+    names = [name for name in TRUTH_SCHEMA.names if name not in pose and name != "measured"]
+    return {name: getattr(truth, name) for name in names} | pose | {"measured": list(truth.measured.items())}
+
+
+def truth_of(row: dict[str, Any]) -> Truth:
+    """Inverse of `truth_row`; rows of a release (`PLAIN_TRUTH_SCHEMA`) are read too."""
+    names = ("easting_m", "northing_m", "yaw_deg", "scale")
+    pose = None if row["easting_m"] is None else Pose(**{name: row[name] for name in names})
+    rest = {name: value for name, value in row.items() if name not in (*names, "measured")}
+    pairs = [(pair["name"], pair["value"]) if isinstance(pair, dict) else pair for pair in row["measured"]]
+    return Truth(**rest, pose=pose, measured=dict(pairs))
+
+
+def truth_sha256(truth: Truth) -> str:
+    """Hash of all that a truth says."""
+    return hashlib.sha256(json.dumps(truth_row(truth), sort_keys=True).encode()).hexdigest()
+
+
+def asked_under(asked: str, key: str | None) -> str:
+    """What an answer says that it answers: the hash of what is asked, and of what the matcher had learnt, if anything.
+
+    Examples
+    --------
+    >>> asked_under("ab", None), len(asked_under("ab", "cd"))
+    ('ab', 64)
+    """
+    return asked if key is None else hashlib.sha256(f"{asked} {key}".encode()).hexdigest()
+
+
+def poses_of(lists: pa.ListArray) -> list[tuple[Pose, ...]]:
+    """Poses of each row of a column of lists; without a dictionary for each, which takes longer than the pose."""
+    columns = [lists.values.field(name).to_numpy(zero_copy_only=False).tolist() for name in POSE_FIELDS]
+    poses = [
+        Pose(easting_m=easting_m, northing_m=northing_m, yaw_deg=yaw_deg, scale=scale)
+        for easting_m, northing_m, yaw_deg, scale in zip(*columns, strict=True)
+    ]
+    return [tuple(poses[begin:end]) for begin, end in pairwise(lists.offsets.to_pylist())]
+
+
+def query_bytes(query: Query) -> bytes:
+    """One query as it goes to a matcher's process: a row in Arrow's stream format."""
+    return stream_of(pa.RecordBatch.from_pylist([query_row(query)], schema=QUERY_SCHEMA))
+
+
+def query_from(data: bytes) -> Query:
+    """Inverse of `query_bytes`."""
+    with pa.ipc.open_stream(data) as stream:
+        return query_of(stream.read_all().to_pylist()[0])
+
+
+def pairs_bytes(pairs: Iterable[tuple[bytes, Truth]]) -> tuple[list[int], bytes]:
+    """Queries, each as its bytes, with their truths, as they go to a process that learns; how long each query is."""
+    queries, truths = zip(*pairs, strict=True)
+    rows = pa.RecordBatch.from_pylist([truth_row(truth) for truth in truths], schema=TRUTH_SCHEMA)
+    return [len(query) for query in queries], b"".join((*queries, stream_of(rows)))
+
+
+def pairs_from(sizes: Sequence[int], data: bytes) -> Iterator[tuple[Query, Truth]]:
+    """Inverse of `pairs_bytes`."""
+    ends = list(accumulate(sizes, initial=0))
+    with pa.ipc.open_stream(data[ends[-1] :]) as stream:
+        truths = [truth_of(row) for row in stream.read_all().to_pylist()]
+    for (begin, end), truth in zip(pairwise(ends), truths, strict=True):
+        yield query_from(data[begin:end]), truth
+
+
+def stream_of(batch: pa.RecordBatch) -> bytes:
+    """Some rows in Arrow's stream format."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, batch.schema) as stream:
+        stream.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+_LIKE: Final = (  # a kind of column, and which others can be read as it
+    (pa.types.is_floating, (pa.types.is_floating, pa.types.is_integer)),
+    (pa.types.is_integer, (pa.types.is_integer,)),
+    (pa.types.is_string, (pa.types.is_string, pa.types.is_large_string)),
+    (pa.types.is_binary, (pa.types.is_large_binary,)),
+    (pa.types.is_map, (pa.types.is_map,)),
+)
+
+
+def is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
+    """Whether a column can be read as another: any float for a float, any string for a string, null for anything.
+
+    Examples
+    --------
+    >>> is_like(pa.int16(), pa.float64()), is_like(pa.string(), pa.float64())
+    (True, False)
+    """
+    if pa.types.is_null(found) or found.equals(wanted):
+        return True
+    if pa.types.is_list(wanted):
+        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
+        return is_list and _is_like_inside(found.value_type, wanted.value_type)
+    return any(kind(wanted) and any(other(found) for other in others) for kind, others in _LIKE)
+
+
+def _is_like_inside(found: pa.DataType, wanted: pa.DataType) -> bool:
+    """Whether items of a list can be read as others; structs may have more fields."""
+    if not pa.types.is_struct(wanted):
+        return is_like(found, wanted)
+    names = [field.name for field in found] if pa.types.is_struct(found) else []
+    return all(names.count(field.name) == 1 and is_like(found.field(field.name).type, field.type) for field in wanted)

@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Twins: parts of a map copied to another place of it, with or without a change, so that two places look alike."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.osm.features import check_features
+
+Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
+
+_ARC_SEGMENTS: Final = 16
+_DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
+_FINE_DECIMALS: Final = 6  # of a cut or a copy: both stay on the line that was cut, so that the mask stays cell by cell
+_AT_M: Final = 0.1  # a road this near to a junction meets it
+_BEND_M: Final = 10.0  # of a road whose junction is moved, what is bent to meet it
+_OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
+_LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paste:
+    """One copy: what lies within a disc around `source_m` takes the place of what lies around `target_m`.
+
+    `change` edits the copy before it is moved, in the coordinates of the source; None copies it as it is.
+    """
+
+    source_m: tuple[float, float]
+    target_m: tuple[float, float]
+    radius_m: float
+    change: Change | None = None
+
+
+def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFrame:
+    """Copy parts of a map.
+
+    Parameters
+    ----------
+    features : geopandas.GeoDataFrame
+        A feature table.
+    pastes : sequence of Paste
+        Sources are read from the table as given, whatever is pasted over them.
+
+    Returns
+    -------
+    geopandas.GeoDataFrame
+        Another feature table; whatever crosses the rim of a disc is cut there.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.osm.features import DTYPES, make_features
+    >>> base = {name: [0] for name in DTYPES} | {"osm_type": ["way"], "class": ["building"], "timestamp": [None]}
+    >>> house = make_features(base | {"geometry": [shapely.box(0, 0, 9, 9)]}, epsg=32632)
+    >>> twice = paste(house, [Paste(source_m=(4.5, 4.5), target_m=(104.5, 4.5), radius_m=20.0)])
+    >>> twice.geometry.iloc[1].bounds
+    (100.0, 0.0, 109.0, 9.0)
+    """
+    if not pastes:
+        return features
+    discs = [_disc(item.target_m, item.radius_m) for item in pastes]
+    kept = _cut(features, shapely.union_all(discs), keep_inside=False)
+    # Neither the order of the rows nor the numbers of the ways say which place is the original.
+    copies, first_id = [], int(features["osm_id"].max()) + 1
+    for item in sorted(pastes, key=lambda paste: paste.target_m):
+        copies.append(_copy(features, item, first_id=first_id))
+        first_id += len(copies[-1])
+    table = pd.concat([kept, *copies], ignore_index=True)
+    return check_features(gpd.GeoDataFrame(table, geometry="geometry", crs=features.crs).astype(dict(_types(features))))
+
+
+def _types(features: gpd.GeoDataFrame) -> Iterable[tuple[str, object]]:
+    return ((name, kind) for name, kind in features.dtypes.items() if name != "geometry")
+
+
+def around(features: gpd.GeoDataFrame, center_m: tuple[float, float], radius_m: float) -> gpd.GeoDataFrame:
+    """What lies within a disc, cut at its rim."""
+    return _cut(features, _disc(center_m, radius_m), keep_inside=True)
+
+
+def _copy(features: gpd.GeoDataFrame, item: Paste, *, first_id: int) -> gpd.GeoDataFrame:
+    piece = around(features, item.source_m, item.radius_m)
+    if item.change is not None:
+        piece = item.change(piece)
+    shift = np.subtract(item.target_m, item.source_m)
+    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_FINE_DECIMALS))
+    again = piece.set_geometry(gpd.GeoSeries(moved, index=piece.index, crs=features.crs))
+    return again.assign(osm_id=first_id + np.unique(again["osm_id"], return_inverse=True)[1])
+
+
+def _disc(center_m: tuple[float, float], radius_m: float) -> shapely.Polygon:
+    return shapely.Point(center_m).buffer(radius_m, quad_segs=_ARC_SEGMENTS)
+
+
+def _cut(features: gpd.GeoDataFrame, area: shapely.Geometry, *, keep_inside: bool) -> gpd.GeoDataFrame:
+    """Features inside (or outside) an area; what crosses its rim is cut, parts of another dimension are dropped."""
+    geometry = features.geometry.to_numpy()
+    shapely.prepare(area)
+    meets, within = shapely.intersects(area, geometry), shapely.contains_properly(area, geometry)
+    chosen = np.flatnonzero(meets if keep_inside else ~within)
+    shapes = geometry[chosen].copy()
+    crossing = (meets & ~within)[chosen]
+    cut = shapely.intersection if keep_inside else shapely.difference
+    shapes[crossing] = _same_dimension(cut(shapely.make_valid(shapes[crossing]), area), shapes[crossing])
+    shapes[crossing] = shapely.transform(shapes[crossing], lambda at: at.round(_FINE_DECIMALS))
+    is_left = ~shapely.is_empty(shapes) & (np.maximum(shapely.length(shapes), shapely.area(shapes)) > _LEAST_M)
+    table = features.iloc[chosen[is_left]]
+    return table.set_geometry(gpd.GeoSeries(shapes[is_left], index=table.index, crs=features.crs))
+
+
+def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Drop the points and lines that a cut leaves of areas, and the points it leaves of lines."""
+    found = np.empty(len(shapes), dtype=object)
+    wanted = shapely.get_dimensions(like)
+    for at, shape in enumerate(shapes):
+        parts = shapely.get_parts(shapely.get_parts(shape))
+        parts = [part for part in parts if shapely.get_dimensions(part) == wanted[at] and not shapely.is_empty(part)]
+        gather = shapely.MultiPolygon if wanted[at] == 2 else shapely.MultiLineString  # noqa: PLR2004
+        found[at] = parts[0] if len(parts) == 1 else gather(parts)  # of none it makes an empty one
+    return found
+
+
+def mirror(features: gpd.GeoDataFrame, classes: Sequence[str], center_m: tuple[float, float]) -> gpd.GeoDataFrame:
+    """Mirror the features of some classes from east to west about a place; the others stay.
+
+    Amount and kind of what is there are as before, only its place has changed.
+    """
+    is_one = features["class"].isin(list(classes)).to_numpy()
+    shapes = features.geometry.to_numpy().copy()
+    flip, shift = np.array([-1.0, 1.0]), np.array([2 * center_m[0], 0.0])
+    shapes[is_one] = shapely.transform(shapes[is_one], lambda at: (at * flip + shift).round(_DECIMALS))
+    return features.set_geometry(gpd.GeoSeries(shapes, index=features.index, crs=features.crs))
+
+
+def split_long(features: gpd.GeoDataFrame, *, piece_m: float, least_area_m2: float) -> gpd.GeoDataFrame:
+    """Cut large buildings across their long side into a row of houses; their union stays exactly what it was."""
+    is_large = (features["class"] == "building").to_numpy() & (features.geometry.area.to_numpy() >= least_area_m2)
+    rows = [features[~is_large]]
+    for _, row in features[is_large].iterrows():
+        pieces = _row_of_houses(row.geometry, piece_m)
+        part = pd.DataFrame([row] * len(pieces)).set_geometry(pieces, crs=features.crs)  # type: ignore[operator]
+        rows.append(part)
+    table = gpd.GeoDataFrame(pd.concat(rows, ignore_index=True), geometry="geometry", crs=features.crs)
+    return table.astype(dict(_types(features)))
+
+
+def _row_of_houses(shape: shapely.Geometry, piece_m: float) -> list[shapely.Geometry]:
+    """Cut a polygon by lines across the long side of its smallest rectangle."""
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))[:4]
+    sides = corners[[1, 2]] - corners[[0, 1]]
+    long_first = bool(np.hypot(*sides[0]) >= np.hypot(*sides[1]))
+    along, across = (sides[0], sides[1]) if long_first else (sides[1], sides[0])
+    start = corners[0]  # both sides leave from it: the rectangle's far side is parallel to the near one
+    count = max(1, round(float(np.hypot(*along)) / piece_m))
+    if count == 1:
+        return [shape]
+    margin = 0.5 * across
+    found: list[shapely.Geometry] = []
+    for number in range(count):
+        low, high = start + along * (number / count), start + along * ((number + 1) / count)
+        if number == 0:
+            low = low - along
+        if number == count - 1:
+            high = high + along
+        slab = shapely.Polygon([low - margin, high - margin, high + across + margin, low + across + margin])
+        parts = shapely.get_parts(shapely.intersection(shape, slab))
+        found += [part for part in parts if part.geom_type == "Polygon" and part.area > _LEAST_M]
+    return found
+
+
+def open_gaps(
+    features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, gap_m: float, rng: np.random.Generator
+) -> gpd.GeoDataFrame:
+    """Take one arm off each junction: the road that ends or passes there stops short, `gap_m` beyond the other's edge.
+
+    Parameters
+    ----------
+    features : geopandas.GeoDataFrame
+        A feature table; roads are cut.
+    junctions_m : ndarray of float, shape (N, 2)
+        Easting and northing of the junctions.
+    gap_m : float
+        What stays free between the edges of the two roads.
+    rng : numpy.random.Generator
+        Picks the arm.
+    """
+    shapes = features.geometry.to_numpy().copy()
+    width_m = np.nan_to_num(features["width_m"].to_numpy(dtype=np.float64), nan=4.0)
+    is_road = features["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    for point in junctions_m:
+        place = shapely.Point(point)
+        near = np.flatnonzero(is_road & (shapely.distance(shapes, place) < _AT_M))
+        if len(near) < 2:  # noqa: PLR2004 - two roads make a junction
+            continue
+        picked = int(near[rng.integers(len(near))])
+        others = [index for index in near if index != picked]
+        reach_m = max(width_m[index] for index in others) / 2 + gap_m + width_m[picked] / 2
+        shapes[picked] = shapely.difference(shapes[picked], place.buffer(reach_m))
+    is_left = ~shapely.is_empty(shapes)
+    table = features[is_left]
+    return table.set_geometry(gpd.GeoSeries(shapes[is_left], index=table.index, crs=features.crs))
+
+
+def stagger(
+    features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, offset_m: float, rng: np.random.Generator
+) -> gpd.GeoDataFrame:
+    """Make two T-junctions of each X-junction: one road's further part starts `offset_m` along the other road.
+
+    Parameters
+    ----------
+    features : geopandas.GeoDataFrame
+        A feature table; roads are cut and moved.
+    junctions_m : ndarray of float, shape (N, 2)
+        Easting and northing of the junctions; where no road goes on across another one nothing is done.
+    offset_m : float
+        Between the two new junctions.
+    rng : numpy.random.Generator
+        Picks the road and the way it is moved.
+    """
+    shapes = features.geometry.to_numpy().copy()
+    is_road = features["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    for point in junctions_m:
+        arms = _arms(shapes, np.flatnonzero(is_road), point)
+        pairs = [
+            (one, two)
+            for at, one in enumerate(arms)
+            for two in arms[at + 1 :]
+            if float(np.dot(one.direction, two.direction)) < _OPPOSITE
+        ]
+        if len(pairs) < 2:  # noqa: PLR2004 - two roads that both go on make an X
+            continue
+        order = rng.permutation(len(pairs))
+        moving, other = pairs[order[0]][int(rng.integers(2))], pairs[order[1]][0]
+        shift = offset_m * other.direction
+        shapes[moving.index] = _end_moved(shapes[moving.index], point, moving, shift)
+        shapes[other.index] = _with_vertices(shapes[other.index], [shapely.Point((point + shift).round(_DECIMALS))])
+    return features.set_geometry(gpd.GeoSeries(shapes, index=features.index, crs=features.crs))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Arm:
+    """A road that leaves a junction: which feature, in which direction (a unit vector), and which of its neighbours."""
+
+    index: int
+    direction: NDArray[np.float64]
+    vertex: int
+    step: int
+
+
+def _arms(shapes: NDArray[np.object_], roads: NDArray[np.int64], point: NDArray[np.float64]) -> list[_Arm]:
+    """Arms of a junction that is a vertex of every road that meets there; roads in several parts are left alone."""
+    found = []
+    near = roads[shapely.distance(shapes[roads], shapely.Point(point)) < _AT_M]
+    for index in near.tolist():
+        if shapes[index].geom_type != "LineString":
+            continue
+        at = shapely.get_coordinates(shapes[index])
+        vertex = int(np.argmin(np.hypot(*(at - point).T)))
+        for step in (-1, 1):
+            if 0 <= vertex + step < len(at) and np.hypot(*(at[vertex] - point)) < _AT_M:
+                away = at[vertex + step] - at[vertex]
+                found.append(
+                    _Arm(index=index, direction=away / max(float(np.hypot(*away)), 1e-9), vertex=vertex, step=step)
+                )
+    return found
+
+
+def _end_moved(
+    line: shapely.Geometry, point: NDArray[np.float64], arm: _Arm, shift: NDArray[np.float64]
+) -> shapely.Geometry:
+    """Bend the first metres of an arm to where it begins now; a road that passed the junction is in two parts then."""
+    at = shapely.get_coordinates(line)
+    moved = (point + shift).round(_DECIMALS)
+    length_m = float(np.hypot(*(at[arm.vertex + arm.step] - at[arm.vertex])))
+    bend = [] if length_m <= 1.5 * _BEND_M else [(at[arm.vertex] + _BEND_M * arm.direction).round(_DECIMALS)]
+    if arm.step == 1:
+        parts = [at[: arm.vertex + 1], np.vstack((moved, *bend, at[arm.vertex + 1 :]))]
+    else:
+        parts = [np.vstack((at[: arm.vertex], *bend, moved)), at[arm.vertex :]]
+    lines = [shapely.LineString(part) for part in parts if len(part) > 1]
+    return lines[0] if len(lines) == 1 else shapely.multilinestrings(lines)
+
+
+def level_crossings(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Bring every bridge down to the ground: roads that passed over each other now meet in a junction."""
+    table = features[(features["class"] != "bridge").to_numpy()].copy()
+    table["level"] = np.zeros(len(table), dtype=np.int16)
+    table["is_bridge"] = np.zeros(len(table), dtype=bool)
+    shapes = table.geometry.to_numpy().copy()
+    is_road = table["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    roads = np.flatnonzero(is_road & (shapely.get_dimensions(shapes) == 1))  # a square is a road too, and no line
+    tree = shapely.STRtree(shapes[roads])
+    first, second = tree.query(shapes[roads], predicate="crosses")
+    meeting: dict[int, list[shapely.Geometry]] = {}
+    for one, two in zip(roads[first].tolist(), roads[second].tolist(), strict=True):
+        if one < two:
+            points = shapely.get_parts(shapely.intersection(shapes[one], shapes[two]))
+            points = [shapely.set_precision(point, 10.0**-_DECIMALS) for point in points if point.geom_type == "Point"]
+            meeting.setdefault(one, []).extend(points)
+            meeting.setdefault(two, []).extend(points)
+    for index, points in meeting.items():
+        shapes[index] = _with_vertices(shapes[index], points)
+    return table.set_geometry(gpd.GeoSeries(shapes, index=table.index, crs=features.crs))
+
+
+def _with_vertices(line: shapely.Geometry, points: list[shapely.Geometry]) -> shapely.Geometry:
+    """Add points that lie on a line as vertices of it."""
+    for point in points:
+        parts = []
+        for part in shapely.get_parts(line):
+            along_m = float(shapely.line_locate_point(part, point))
+            at = shapely.get_coordinates(part)
+            lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(at, axis=0).T))))
+            on_it = float(shapely.distance(part, point)) < 0.01  # noqa: PLR2004 - metres
+            if on_it and np.abs(lengths - along_m).min() > 1e-6:  # noqa: PLR2004 - not a vertex yet
+                place = int(np.searchsorted(lengths, along_m))
+                part = shapely.LineString(np.insert(at, place, shapely.get_coordinates(point)[0], axis=0))  # noqa: PLW2901
+            parts.append(part)
+        line = parts[0] if len(parts) == 1 else shapely.multilinestrings(parts)
+    return line

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vectors of a view: lines and outlines in the view's frame, as a table and as features a graph is made of."""
+
+from typing import Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from rasterio.features import shapes as polygons_of
+
+from sasgeo_bench.osm.features import DTYPES, make_features
+from sasgeo_bench.regions.evidence import PRESENT, Evidence, cell_offsets_m
+
+COLUMNS: Final = ("class", "level", "is_bridge", "geometry")
+_DECIMALS: Final = 1  # decimetres: finer than any detector, and far smaller on disk
+_EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere
+
+
+def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.GeoDataFrame:
+    """Gather perceived vectors; coordinates are rounded to a decimetre."""
+    shapes = np.array([row[3] for row in rows], dtype=object)
+    rounded = shapely.transform(shapes, lambda at: at.round(_DECIMALS) + 0.0) if len(rows) else shapes
+    return gpd.GeoDataFrame(
+        {
+            "class": np.array([row[0] for row in rows], dtype=object),
+            "level": np.array([row[1] for row in rows], dtype=np.int16),
+            "is_bridge": np.array([row[2] for row in rows], dtype=bool),
+        },
+        geometry=gpd.GeoSeries(rounded, dtype="geometry"),
+    )
+
+
+def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.GeoDataFrame:
+    """Instances as the mask alone gives them: one for each connected patch of a class.
+
+    What touches is one; vectors made so carry nothing that the mask does not.
+    """
+    mask = (evidence.layer(class_name) == PRESENT).astype(np.uint8)
+    corners = cell_offsets_m(evidence.shape, evidence.cell_size_m)
+    step_m = evidence.cell_size_m
+    west_m, north_m = corners[:, 0].min() - step_m / 2, corners[:, 1].max() + step_m / 2
+    transform = (step_m, 0.0, west_m, 0.0, -step_m, north_m)
+    found = [shapely.geometry.shape(shape) for shape, _ in polygons_of(mask, mask=mask == 1, transform=transform)]
+    return vector_table([(class_name, 0, False, shape) for shape in found])
+
+
+def as_features(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Perceived vectors as a feature table, so that `graph.build_graph` makes a graph of them.
+
+    Examples
+    --------
+    >>> len(as_features(vector_table([])))
+    0
+    """
+    count = len(vectors)
+    columns: dict[str, object] = {
+        "osm_type": ["way"] * count,
+        "osm_id": np.arange(count),
+        "version": np.ones(count, dtype=int),
+        "timestamp": [None] * count,
+        "class": vectors["class"].to_numpy(),
+        "level": vectors["level"].to_numpy(),
+        "is_bridge": vectors["is_bridge"].to_numpy(),
+        "is_tunnel": np.zeros(count, dtype=bool),
+        "is_visible": np.ones(count, dtype=bool),
+        "width_m": _widths(vectors),
+        "geometry": vectors.geometry.to_numpy(),
+    }
+    return make_features({name: columns[name] for name in (*DTYPES, "geometry")}, epsg=_EPSG)
+
+
+def _widths(vectors: gpd.GeoDataFrame) -> NDArray[np.float64]:
+    is_line = shapely.get_dimensions(vectors.geometry.to_numpy()) == 1
+    return np.where(is_line, 4.0, np.nan)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No number of docs/ageing/README.md is there that the tables do not hold."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.ageing.files import read_ageing
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+
+FOLDER = Path(__file__).parents[2] / "docs" / "ageing"
+PLACES = ("liechtenstein", "andorra", "monaco", "dreieich", "faroe")
+REDRAW = "2021-05-05"
+# Place, class, span (of an interval: its first day), column, digits: in the order in which the page names them.
+SAID = [
+    ("liechtenstein", "building", REDRAW, "id_vanished_share", 1),
+    ("liechtenstein", "building", REDRAW, "vanished_share", 1),
+    ("liechtenstein", "building", REDRAW, "redrawn_share", 1),
+    ("liechtenstein", "building", "whole", "id_vanished_share", 1),
+    ("liechtenstein", "building", "whole", "vanished_share", 1),
+    ("andorra", "path_track", "whole", "id_vanished_share", 1),
+    ("andorra", "path_track", "whole", "vanished_share", 1),
+    ("andorra", "field_boundary", "whole", "id_vanished_share", 1),
+    ("andorra", "field_boundary", "whole", "vanished_share", 1),
+    ("liechtenstein", "building", "2013-08-03", "appear_per_year", 2),
+    ("liechtenstein", "building", "2022-12-15", "appear_per_year", 2),
+    ("liechtenstein", "building", "pooled", "appear_per_year", 2),
+    ("monaco", "building", "pooled", "appear_per_year", 2),
+    ("dreieich", "building", "pooled", "appear_per_year", 2),
+    *((place, "building", "pooled", "appeared_untold_share", 1) for place in PLACES),
+    ("max", "building", "pooled", "appeared_catch_up_share", 1),
+    *((place, "building", "pooled", "vanished_world_share", 1) for place in ("liechtenstein", "andorra", "monaco")),
+    ("dreieich", "building", "pooled", "vanished_world_share", 1),
+    ("min", "path_track", "pooled", "appear_per_year", 2),
+    ("max", "path_track", "pooled", "appear_per_year", 2),
+    ("min", "field_boundary", "pooled", "appear_per_year", 2),
+    ("max", "field_boundary", "pooled", "appear_per_year", 2),
+    ("min", "building", "pooled", "vanish_per_year", 2),
+    ("max", "building", "pooled", "vanish_per_year", 2),
+    *(
+        (place, "road_minor", "pooled", "vanished_retagged_share", 1)
+        for place in ("liechtenstein", "andorra", "monaco", "faroe", "dreieich")
+    ),
+    ("andorra-control-edges", "building", "whole", "vanished_share", 1),
+    ("andorra", "building", "whole", "vanished_share", 1),
+    ("andorra-control-edges", "road_minor", "whole", "vanished_share", 1),
+    ("andorra-control-edges", "parking", "whole", "vanished_share", 1),
+    ("andorra-control", "building", "whole", "vanished_share", 1),
+    ("andorra-control", "road_minor", "whole", "vanished_share", 1),
+    ("andorra-control", "parking", "whole", "vanished_share", 1),
+    ("andorra-control", "water", "whole", "vanished_share", 1),
+    ("andorra-control", "waterway", "whole", "appeared_share", 1),
+    ("set by hand", "field_boundary", "", "appear_per_year", 2),
+    ("min", "field_boundary", "pooled", "appear_per_year", 2),
+    ("set by hand", "building", "", "vanish_per_year", 2),
+    ("set by hand", "green", "", "vanish_per_year", 2),
+    ("max", "green", "pooled", "vanish_per_year", 2),
+    ("set by hand", "bridge", "", "vanish_per_year", 2),
+    ("min", "bridge", "pooled", "vanish_per_year", 2),
+    *(
+        ("liechtenstein", "building", span, column, 1)
+        for span in (REDRAW, "whole")
+        for column in ("appeared_number_share", "appeared_share")
+    ),
+    *(
+        (place, "building", "whole", column, 1)
+        for place in ("faroe", "monaco")
+        for column in ("appeared_number_share", "appeared_share")
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return {path.parent.name: read_ageing(path.parent).table for path in FOLDER.glob("*/ageing.parquet")}
+
+
+@pytest.fixture(scope="module")
+def text():
+    return (FOLDER / "README.md").read_text(encoding="utf-8")
+
+
+def value(tables, place, name, span, column):
+    if place == "set by hand":
+        return 100 * getattr(load_taxonomy()[name].persistence, column)
+    if place in ("min", "max"):
+        known = [value(tables, item, name, span, column) for item in PLACES if name in set(tables[item]["class"])]
+        return {"min": min, "max": max}[place](known)
+    rows = tables[place][tables[place]["class"] == name]
+    rows = (
+        rows[(rows["span"] == "interval") & (rows["date_from"] == span)] if "-" in span else rows[rows["span"] == span]
+    )
+    (found,) = rows[column]
+    return 100 * found
+
+
+def test_every_percentage_of_the_findings_is_that_of_the_tables_in_their_order(tables, text):
+    findings = text.split("## What the data say")[1].split("## Using the rates")[0]
+    said = re.findall(r"(?<![\d.])\d+\.\d+(?=\s+%|\s+to\s+\d+\.\d+\s+%)", findings)
+    assert said == [f"{value(tables, *where):.{digits}f}" for *where, digits in SAID]
+
+
+def test_as_many_classes_grow_faster_than_was_set_by_hand_as_the_page_says(tables, text):
+    classes = load_taxonomy().classes
+    slow = [
+        item.name
+        for item in classes
+        if item.persistence.appear_per_year * 100 < value(tables, "min", item.name, "pooled", "appear_per_year")
+    ]
+    assert f"For {len(slow)} of {len(classes)} classes the taxonomy's rate of appearing lies below" in text
+
+
+def test_every_place_stands_on_the_page_as_in_the_summary(text):
+    summary = (FOLDER / "summary.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \w[^|]* \| [\d.,]+ \| \d+ \| \d{4}-[^|]* \| [^|]* \|", summary, flags=re.MULTILINE)
+    assert len(rows) == 7
+    assert [row for row in rows if row in text] == rows[: len(PLACES)]
+
+
+def test_every_column_of_the_tables_is_told_of(tables, text):
+    told = set(re.findall(r"`([a-z0-9_*]+)`", text.split("## What the columns mean")[1].split("##")[0]))
+    patterns = [re.compile(name.replace("*", r"\w*")) for name in told]
+    numbers = [name for name, kind in tables["monaco"].dtypes.items() if kind.kind in "fi" and name != "years"]
+    assert [name for name in numbers if not any(pattern.fullmatch(name) for pattern in patterns)] == []

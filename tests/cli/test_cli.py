@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program as a user meets it: exit codes, one line for a mistake, results on stdout."""
+
+import os
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.cli.program import COMMANDS, help_of
+from sasgeo_bench.config import shipped_dir
+
+PROGRAM = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()"]
+
+
+def small_town(folder: Path, **changes: str) -> Path:
+    text = (shipped_dir("regions") / "town-suburb.toml").read_text()
+    for old, new in ({"size_m = [1024, 1024]": "size_m = [300, 200]"} | changes).items():
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "own.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_process_ends_with_the_exit_code_and_keeps_results_and_messages_apart(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = [
+        subprocess.run([*PROGRAM, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+        for words in (["list-regions"], ["build-region", "vadus"])
+    ]
+    assert [item.returncode for item in ended] == [0, 2]
+    assert "vaduz" in ended[0].stdout
+    assert ended[1].stdout == ""
+    assert "did you mean 'vaduz'" in ended[1].stderr
+    assert len(ended[1].stderr.splitlines()) == 1
+
+
+HELP = """
+import sys
+from sasgeo_bench.cli import main
+try:
+    main()
+finally:
+    assert not {"numpy", "pandas", "sasgeo_bench.regions.build"} & set(sys.modules)
+"""
+
+
+def test_help_names_every_command_and_reads_the_code_of_none():
+    ended = subprocess.run([sys.executable, "-c", HELP, "--help"], capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert ended.returncode == 0, ended.stderr
+    for group, commands in COMMANDS.items():
+        assert group in ended.stdout
+        assert set(commands) <= set(ended.stdout.split())
+
+
+@pytest.mark.parametrize(("name", "file"), [one for group in COMMANDS.values() for one in group.items()])
+def test_every_command_can_be_read_and_has_the_help_that_the_program_shows(program, name, file):
+    code, shown, err = program(name, "--help")
+    assert code == 0, err
+    assert " ".join(help_of(file, name).split()[:5]) in shown
+
+
+def test_the_program_says_its_version(program):
+    assert program("--version")[1] == f"sasgeo-bench {metadata.version('sasgeo-bench')}\n"
+
+
+def test_a_region_is_built_inspected_and_verified(program, tmp_path):
+    own = small_town(tmp_path, **{'id = "town-suburb"': 'id = "own"'})
+    code, _, err = program("build-region", own)
+    assert code == 0, err
+    assert "own: built out/regions/own" in err
+    assert "own: up to date, nothing to do" in program("build-region", own)[2]
+    shown = program("inspect", "own")[1]
+    assert "(c) OpenStreetMap contributors, ODbL" in shown
+    assert "building" in shown
+    assert program("verify", "out/regions/own")[0] == 0
+    (tmp_path / "out/regions/own/preview.png").write_bytes(b"?")
+    code, out, _ = program("verify", "out/regions/own")
+    assert code == 2
+    assert "preview.png" in out
+
+
+def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
+    own = small_town(tmp_path)
+    code, out, err = program("build-region", own, "--dry-run")
+    assert code == 0, err
+    for word in ("reads", "grid", "200 x 300", "writes", "before compression"):
+        assert word in out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["own.toml"]
+
+
+def test_several_regions_are_built_at_once(program, tmp_path):
+    (tmp_path / "mine").mkdir()
+    for name in (names := ("one", "two")):
+        small_town(tmp_path, **{'id = "town-suburb"': f'id = "{name}"'}).rename(tmp_path / "mine" / f"{name}.toml")
+    code, _, err = program("build-region", *names, "--regions", "mine", "--jobs", "2", "--out", "o")
+    assert code == 0, err
+    for name in names:
+        assert (tmp_path / "o/regions" / name / "region.json").is_file()
+
+
+def test_lists_and_findings_go_to_stdout(program):
+    code, listed, err = program("list-regions")
+    assert code == 0, err
+    assert "vaduz" in listed
+    assert "2013-08-03 .. 2025-09-19 (9)" in listed
+    code, healthy, err = program("doctor")
+    assert code == 0, err
+    assert "GDAL, GEOS, PROJ" in healthy
+    assert "liechtenstein-2025-09-19.osm.pbf" in healthy
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("build-region", "vadus"), "did you mean 'vaduz'"),
+        (("build-region", "none.toml"), "no region file none.toml"),
+        (("build-region", "town-grid", "--date", "2014-13-01"), "must be a date"),
+        (("build-region", "town-grid", "--date", "2013-01-01"), "2014-01-01, 2019-01-01, 2025-01-01"),
+        (("build-region", "town-grid", "--regions", "nowhere"), "no folder nowhere"),
+        (("inspect", "vaduz"), "build the region first"),
+        (("verify", "nowhere"), "holds no region.json"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_exit_2(mistake, words, told):
+    assert told in mistake(*words)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("cell_size_m = 1.0", "cell_size_m = 0.0", "cell_size_m must lie between"),
+        ("cell_size_m", "cell_sise_m", "did you mean 'cell_size_m'"),
+        ("size_m = [300, 200]", "size_m = [1e6, 1e6]", "make it smaller"),
+        ('morphology = "suburb"', 'morphology = "village"', "morphology"),
+        ("center_lonlat = [11.65, 48.65]", "center_lonlat = [11.65, 88.65]", "84"),
+    ],
+)
+def test_a_wrong_region_file_gets_one_line_and_exit_2(mistake, old, new, told, tmp_path):
+    path = small_town(tmp_path)
+    path.write_text(path.read_text().replace(old, new))
+    assert told in mistake("build-region", path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extract_names_the_file_its_hash_and_where_to_put_it(mistake, tmp_path):
+    text = (shipped_dir("regions") / "monaco.toml").read_text()
+    own = tmp_path / "own.toml"
+    own.write_text("\n".join(line for line in text.splitlines() if not line.startswith("urls")))
+    told = mistake("build-region", own, "--extracts", "mine")
+    for word in ("monaco-2025-02-15.osm.pbf", "72dc9a65600864fa", "mine", "--extracts"):
+        assert word in told
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_the_right_to_write_is_told(mistake, tmp_path):
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    assert "cannot be written" in mistake("build-region", "town-grid", "--out", "locked")
+
+
+# Interrupts itself 0.05 s of its own processor time after it tells of a graph, so that no load moves the moment; and
+# heeds Ctrl-C, which what is started in the background of a shell does not.
+INTERRUPTED = """
+import signal, sys
+from sasgeo_bench import cli
+
+def tell(text):
+    if "features into a graph" in text:
+        signal.setitimer(signal.ITIMER_PROF, 0.05)
+    return write(text)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
+write, sys.stderr.write = sys.stderr.write, tell
+cli.main()
+"""
+
+
+def test_ctrl_c_leaves_nothing_half_written(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-c", INTERRUPTED, "build-region", "town-suburb", "town-grid"]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert ended.returncode == 130, ended.stderr
+    assert "interrupted" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    left = [path for path in (tmp_path / "out/regions").iterdir() if not path.name.endswith(".lock")]
+    assert all((path / "region.json").is_file() for path in left)
+    assert not any(path.name.startswith(".") for path in left)
+
+
+def test_a_message_without_end_is_cut_in_its_middle(program):
+    code, _, err = program("score", "--predictions", "p", "--name", "a" * 5000)
+    assert code == 2
+    assert len(err) < 2100
+    assert " ... " in err
+    assert err.startswith("sasgeo-bench: --name must hold letters")

@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make-queries`, `list-suites`, `inspect` and `verify` as a user meets them."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import pytest
+
+from sasgeo_bench.config import shipped_dir
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region_spec import read_region_file
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, SUITES
+from sasgeo_bench.tasks.task_files import QUERIES, TASK, TRUTH, TRUTH_OF, read_queries
+
+RIVERSIDE = "town-riverside"
+CLEAN = f"clean/{RIVERSIDE}"
+
+
+@pytest.fixture
+def out(tasks, tmp_path):
+    """A root of one's own, with the tasks in it."""
+    return Path(shutil.copytree(tasks, tmp_path / "out"))
+
+
+def town(folder: Path, name: str, **changes: str) -> Path:
+    text = (shipped_dir("regions") / f"{RIVERSIDE}.toml").read_text()
+    for old, new in {f'id = "{RIVERSIDE}"': f'id = "{name}"', **changes}.items():
+        assert old in text
+        text = text.replace(old, new)
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+def split_file(folder: Path, *names: str, kind: str = "holdout") -> Path:
+    lines = [f'id = "mine"\ntitle = "Mine"\nkind = "{kind}"\nbuffer_m = 0.0']
+    for at, name in enumerate(names):
+        lines.append(f'[[place]]\nname = "{name}"\nregions = ["{name}"]')
+        lines.append(f'part = "{("train", "test")[at % 2]}"' if kind == "holdout" else f'half = "{"ab"[at % 2]}"')
+    path = folder / "split.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+# --- make-queries ---------------------------------------------------------------------------------------------------
+
+
+def test_each_task_gets_one_line_on_stderr_and_stdout_stays_empty(program, own_out):
+    words = ("--suite", "absent", "--suite", "no-priors", "--regions", RIVERSIDE, "--n", "1")
+    code, told, err = program("make-queries", *words, "--out", own_out)
+    assert (code, told) == (0, "")
+    assert [line.split(":")[0] for line in err.splitlines()] == [f"absent on {RIVERSIDE}", f"no-priors on {RIVERSIDE}"]
+    assert f"5 queries at 1 sites in {own_out}/tasks/absent/{RIVERSIDE}" in err.splitlines()[0]
+
+
+def test_regions_are_built_on_the_way_and_two_at_once_give_what_one_after_the_other_does(program, tasks, tmp_path):
+    # Views of a wrong place are taken in the next region of the split: both of them want the grid.
+    words = ("--suite", "absent", "--regions", RIVERSIDE, "--regions", "town-grid", "--n", "1")
+    code, _, err = program("make-queries", *words, "--jobs", "2", "--out", "two")
+    assert code == 0, err
+    for kind, file in (("tasks", QUERIES), ("tasks", TASK), ("truth", TRUTH), ("truth", TRUTH_OF)):
+        path = Path(kind) / "absent" / RIVERSIDE / file
+        assert (tmp_path / "two" / path).read_bytes() == (tasks / path).read_bytes()
+    folders = {str(path.parent.relative_to(tmp_path / "two/tasks")) for path in (tmp_path / "two/tasks").rglob(TASK)}
+    assert folders == {f"absent/{region}" for region in (RIVERSIDE, "town-grid")}
+
+
+def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
+    code, told, err = program("make-queries", "--regions", RIVERSIDE, "--regions", "town-grid", "--dry-run")
+    assert (code, err) == (0, "")
+    assert len(told.splitlines()) == 2 * len(SUITES)
+    count = 8 * len(SUITES["clean"].variants) * len(SUITES["clean"].card.tracks)
+    assert f"clean on {RIVERSIDE}: at most 8 sites, {count} queries, out/tasks/clean/{RIVERSIDE}" in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_region_cannot_carry_can_be_passed_over(program, own_out):
+    words = ("--suite", "grade-separation", "--suite", "absent", "--regions", RIVERSIDE, "--n", "1")
+    code, _, err = program("make-queries", *words, "--skip", "--out", own_out)
+    assert code == 0
+    assert f"grade-separation on {RIVERSIDE}: passed over, {RIVERSIDE} cannot carry suite" in err
+    assert {path.parent.parent.name for path in (own_out / "tasks").rglob(TASK)} == {"absent"}
+
+
+def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
+    words = ("--suite", "growth", "--regions", RIVERSIDE, "--n", "1", "--prior", "r250-known-s10", "--out", own_out)
+    assert program("make-queries", *words)[0] == 0
+    queries = list(read_queries(own_out / "tasks/growth" / RIVERSIDE))
+    assert {(query.prior.radius_m, query.prior.yaw_sigma_deg, query.prior.scale_sigma) for query in queries} == {
+        (250.0, 5.0, 0.1)
+    }
+    assert json.loads((own_out / "tasks/growth" / RIVERSIDE / TASK).read_text())["prior_groups"] == ["r250-known-s10"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--n", "0"), "--n must be at least 1, got 0"),
+        (("--n", "-4"), "--n must be at least 1, got -4"),
+        (("--suite", "claen"), "there is no suite 'claen', did you mean 'clean'? (list-suites shows all)"),
+        (("--suite", "clean", "--suite", "nonsense-suite"), "there is no suite 'nonsense-suite'"),
+        (("--regions", "town-rivrside"), "there is no region 'town-rivrside', did you mean 'town-riverside'"),
+        (("--regions", "none.toml"), "there is no region file none.toml"),
+        (("--split", "crosfit"), "there is no split 'crosfit', did you mean 'crossfit'"),
+        (("--split", "none.toml"), "there is no split file none.toml"),
+        (("--prior", "r500-weak"), "'r500-weak' is no prior group: r100, r250, r500, r2000 or rnone"),
+        (("--prior", "r300-weak-s3"), "'r300-weak-s3' is no prior group"),
+        (("--region-files", "nowhere"), "there is no folder nowhere"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_exit_2_and_nothing_is_written(words, told, mistake, tmp_path):
+    assert told in mistake("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--n", "1", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_split_that_names_an_unknown_region_or_leaves_one_out_gets_one_line(mistake, tmp_path):
+    path = split_file(tmp_path, RIVERSIDE, "atlantis")
+    words = ("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--split", path)
+    assert "split 'mine' names the unknown region 'atlantis': list-regions shows all there are" in mistake(*words)
+    split_file(tmp_path, "town-grid", "town-suburb")
+    assert f"split 'mine' does not speak of region '{RIVERSIDE}'" in mistake(*words)
+    path.write_text(path.read_text().replace("buffer_m", "bufer_m"))
+    assert "did you mean 'buffer_m'" in mistake(*words)
+    assert [item.name for item in tmp_path.iterdir()] == ["split.toml"]
+
+
+def test_what_a_built_region_cannot_do_gets_one_line(mistake, own_out):
+    words = ("make-queries", "--regions", RIVERSIDE, "--out", own_out)
+    assert "900 were asked for: lower --n or pass --up-to" in mistake(*words, "--suite", "absent", "--n", "900")
+    told = mistake(*words, "--suite", "grade-separation", "--n", "1")
+    assert f"{RIVERSIDE} cannot carry suite 'grade-separation': no bridge" in told
+    assert sorted(path.name for path in own_out.iterdir()) == ["regions"]
+
+
+def test_real_ageing_of_a_region_with_one_date_gets_one_line(program, tmp_path):
+    path = town(tmp_path / "own", "mine", **{"size_m = [1024, 1024]": "size_m = [512, 512]"})
+    first = path.read_text().index("[[extract]]")
+    path.write_text(path.read_text()[:first] + path.read_text()[path.read_text().rindex("[[extract]]") :])
+    split = split_file(tmp_path, "mine", "town-grid")
+    code, told, err = program("make-queries", "--suite", "real-age", "--regions", path, "--split", split, "--n", "1")
+    assert (code, told) == (2, "")
+    assert err.splitlines()[-1] == (
+        "sasgeo-bench: mine cannot carry suite 'real-age': "
+        "one date only, real ageing needs an older extract of the same place (--skip passes on to the next suite)"
+    )
+    assert sorted(item.name for item in (tmp_path / "out").iterdir()) == ["regions"]
+
+
+def test_truths_are_never_put_among_the_tasks(mistake, tasks, tmp_path):
+    words = ("make-queries", "--suite", "absent", "--regions", RIVERSIDE, "--n", "1", "--out")
+    (tmp_path / "out/tasks/deep").mkdir(parents=True)
+    (tmp_path / "out/truth").symlink_to(tmp_path / "out/tasks/deep")
+    assert "out/truth lies inside out/tasks, where the queries are: choose another --out" in mistake(*words, "out")
+    assert list((tmp_path / "out/tasks").rglob("*")) == [tmp_path / "out/tasks/deep"]
+    inside = tasks / "tasks" / CLEAN / "more"
+    assert "where the queries are: choose another --out" in mistake(*words, inside)
+    assert not inside.exists()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_an_out_without_the_right_to_write_gets_one_line(mistake, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    words = ("make-queries", "--suite", "absent", "--regions", RIVERSIDE, "--n", "1", "--out", "locked")
+    assert "cannot be written" in mistake(*words)
+
+
+# --- list-suites ----------------------------------------------------------------------------------------------------
+
+
+def test_all_suites_are_listed_with_what_they_separate(program):
+    code, told, err = program("list-suites")
+    assert (code, err) == (0, "")
+    lines = told.splitlines()
+    assert [line.split()[0] for line in lines[1:] if line.strip()] == list(EVERY_SUITE)
+    assert len(SUITES) == 16
+    for name, suite in EVERY_SUITE.items():
+        line = next(line for line in lines if line.startswith(f"{name} "))
+        assert suite.card.title in line
+        assert suite.card.separates in line
+
+
+# --- inspect --------------------------------------------------------------------------------------------------------
+
+
+def test_a_task_is_shown_with_a_sheet_of_the_right_size(program, out):
+    code, told, err = program("inspect", CLEAN, "--rows", "3", "--out", out)
+    assert (code, err) == (0, "")
+    sheet = out / "sheets" / f"clean-{RIVERSIDE}.png"
+    assert f"contact sheet: {sheet}" in told
+    localization = 2 * len(SUITES["clean"].variants)
+    for word in ("Rotation, scale and crop", "ODbL", "map_fingerprint", f"localization {localization}"):
+        assert word in told
+    three = cv2.imread(str(sheet)).shape[0]
+    heights = []
+    for rows in ("1", "2"):
+        program("inspect", CLEAN, "--rows", rows, "--out", out)
+        heights.append(cv2.imread(str(sheet)).shape[0])
+    assert 100 < three - heights[1] == pytest.approx(heights[1] - heights[0], abs=1)
+
+
+def test_one_query_is_shown_by_its_id_and_a_task_by_its_folder(program, out):
+    name = next(read_queries(out / "tasks" / CLEAN)).query_id[:8]
+    code, told, _ = program("inspect", out / "tasks" / CLEAN, "--query", name, "--out", out)
+    assert code == 0
+    sheet = out / "sheets" / f"clean-{RIVERSIDE}-{name}.png"
+    assert str(sheet) in told
+    program("inspect", CLEAN, "--rows", "1", "--out", out)
+    assert cv2.imread(str(sheet)).shape == cv2.imread(str(out / "sheets" / f"clean-{RIVERSIDE}.png")).shape
+
+
+def test_a_split_is_shown_with_its_map(program, tmp_path):
+    code, told, err = program("inspect", "holdout")
+    assert (code, err) == (0, "")
+    assert "nearest blocks of two parts" in told
+    assert "map of parts: out/sheets/split-holdout.png" in told
+    assert cv2.imread(str(tmp_path / "out/sheets/split-holdout.png")).shape[1] == pytest.approx(1380, abs=1)
+
+
+def refused(program, *words):
+    """The one line on stderr, whatever was shown before it."""
+    code, _, err = program(*words)
+    assert code == 2, err
+    assert len(err.strip().splitlines()) == 1, err
+    return err.strip()
+
+
+def test_what_is_wrong_with_a_task_is_told_on_one_line(program, out):
+    show = ("inspect", CLEAN, "--out", out)
+    task, truth, region = out / "tasks" / CLEAN, out / "truth" / CLEAN / TRUTH, out / "regions" / RIVERSIDE
+    assert "holds no query 'zzz'" in refused(program, *show, "--query", "zzz")
+    whole = truth.read_bytes()
+    truth.unlink()
+    assert "truth.parquet cannot be read" in refused(program, *show)
+    truth.write_bytes((out / "truth/absent" / RIVERSIDE / TRUTH).read_bytes())
+    assert "does not hold the truths of" in refused(program, *show)
+    truth.write_bytes(whole)
+    queries = (task / QUERIES).read_bytes()
+    (task / QUERIES).write_bytes(queries[:-200])
+    assert "queries.parquet cannot be read" in refused(program, *show)
+    (task / QUERIES).write_bytes(queries)
+    manifest = json.loads((region / "region.json").read_text())
+    (region / "region.json").write_text(json.dumps(manifest | {"fingerprint": "0" * 64}))
+    assert f"{RIVERSIDE} was built anew since: make the queries again" in refused(program, *show)
+    (region / "region.json").write_text(json.dumps(manifest | {"schema_version": 0}))
+    assert "has schema version 0, this version reads" in refused(program, *show)
+    assert "has schema version 0, this version reads" in refused(program, "verify", CLEAN, "--out", out)
+    assert not (out / "sheets").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{", "is damaged"),
+        ('{"schema_version": 0}', "has schema version 0, this version reads 1: make the queries again"),
+        ('{"schema_version": 1}', "is damaged (task.json: 'task_version' is missing; 'suite'"),
+    ],
+)
+@pytest.mark.parametrize("command", ["inspect", "verify"])
+def test_a_damaged_task_json_gets_one_line(command, text, told, mistake, tmp_path):
+    folder = tmp_path / "out/tasks" / CLEAN
+    folder.mkdir(parents=True)
+    (folder / TASK).write_text(text)
+    assert told in mistake(command, CLEAN)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [("nothing", "holds no region.json"), ("clean/nowhere", "holds no task clean/nowhere; there is")],
+)
+def test_a_target_that_is_nothing_gets_one_line(target, words, mistake):
+    assert words in mistake("inspect", target)
+
+
+# --- verify ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_good_task_is_said_to_be_good_with_and_without_its_truths(program, out):
+    said = "all files are as task.json says, and every query has its truth"
+    assert program("verify", CLEAN, "--out", out) == (0, f"{CLEAN}: {said}\n", "")
+    (out / "truth" / CLEAN / TRUTH).unlink()
+    code, told, _ = program("verify", CLEAN, "--out", out)
+    assert code == 0
+    assert "every query has its truth" not in told
+    assert "its truths are not here" in told
+
+
+def test_faults_of_a_task_are_listed_and_make_exit_2(program, out):
+    data = bytearray((out / "tasks" / CLEAN / QUERIES).read_bytes())
+    data[1000] ^= 1
+    (out / "tasks" / CLEAN / QUERIES).write_bytes(bytes(data))
+    (out / "tasks" / CLEAN / "stray.txt").write_text("?")
+    code, told, err = program("verify", CLEAN, "--out", out)
+    assert (code, err) == (2, "")
+    assert "queries.parquet: " in told
+    assert "SHA-256" in told
+    assert "stray.txt: not part of a task" in told
+
+
+def test_verify_names_truths_of_other_queries(program, out):
+    shutil.copytree(out / "regions", "other/regions")
+    code, _, err = program(
+        *("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--n", "2", "--seed", "0"),
+        *("--prior", "r250-known-s10", "--out", "other"),
+    )
+    assert code == 0, err
+    shutil.rmtree(out / "truth" / CLEAN)
+    shutil.copytree(Path("other/truth") / CLEAN, out / "truth" / CLEAN)
+    code, told, err = program("verify", CLEAN, "--out", out)
+    assert (code, err) == (2, "")
+    assert "truth.json: the truths are of other queries, SHA-256 " in told
+
+
+@pytest.mark.parametrize("name", ["holdout", "crossfit"])
+def test_the_towns_of_the_shipped_splits_share_no_ground(name, program, towns):
+    code, told, err = program("verify", name, "--out", towns)
+    assert code == 0
+    assert told == f"{name}: no two parts share ground, 2 regions searched\n"
+    assert "regions are not built and not searched: " in err
+
+
+def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_path):
+    path = town(tmp_path / "own", "elsewhere", **{"center_lonlat = [12.25, 49.25]": "center_lonlat = [14.05, 51.35]"})
+    build_region(plan_build(read_region_file(path), out=own_out), tell=lambda _: None, with_preview=False)
+    for kind in ("holdout", "crossfit"):
+        split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
+        code, told, err = program("verify", split, "--regions", path.parent, "--out", own_out)
+        assert (code, err) == (2, "1 regions are not built and not searched: town-suburb\n")
+        (line,) = told.splitlines()
+        assert f"{RIVERSIDE}/0-0 and elsewhere/0-0 of different parts hold the same ground: " in line
+        assert int(line.split("ground: ")[1].split()[0]) > 50
+
+
+def test_a_split_of_which_nothing_is_built_gets_one_line(program):
+    code, told, err = program("verify", "holdout")
+    assert (code, told) == (2, "")
+    assert err.splitlines()[-1].endswith("build-region more")

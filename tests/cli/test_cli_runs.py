@@ -1,0 +1,512 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands around matchers as a user meets them: made, listed, checked, run, merged and validated."""
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.matching.plugins import MATCHERS
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.testing import TOWN, check_matcher
+from sasgeo_bench.tasks import task_files
+
+SUITE = "no-priors"
+TASK = Path("out") / "tasks" / SUITE / TOWN
+GOOD = ("run", "--matcher", "faulty:Good", "--tasks", TASK)
+# The control of the runner needs no process of its own, so that these take no time.
+ORACLE = ("run", "--matcher", "oracle_pose", "--tasks", TASK)
+
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
+
+@pytest.fixture
+def out(program, tiny, tmp_path, monkeypatch):
+    """A root of one's own with a small task, in the working folder; the faulty matchers can be imported."""
+    del program  # it goes into the folder
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    return Path(shutil.copytree(tiny.folder, tmp_path / "out"))
+
+
+@pytest.fixture
+def ids(out):
+    return task_files.read_ids(out / "tasks" / SUITE / TOWN)
+
+
+@pytest.fixture
+def mine(ids, tmp_path):
+    """Write predictions to mine.parquet; sound ones unless others are given."""
+
+    def write(predictions=None):
+        answers = [Prediction(query_id=name) for name in ids] if predictions is None else predictions
+        (tmp_path / "mine.parquet").unlink(missing_ok=True)
+        prediction_files.write_part(tmp_path / "parts", answers).rename(tmp_path / "mine.parquet")
+        return Path("mine.parquet")
+
+    return write
+
+
+@pytest.fixture
+def check(program, out, tiny, monkeypatch):
+    """The command check-matcher on the place that is there already."""
+    del out
+    monkeypatch.setattr("sasgeo_bench.cli.matchers.check_matcher", partial(check_matcher, place=tiny))
+    return partial(program, "check-matcher")
+
+
+@pytest.fixture
+def run_folder(program, out, monkeypatch):
+    """Where the control's rows are, in one part, after a run."""
+    del out
+    monkeypatch.setattr("sasgeo_bench.running.answers.PART_S", 3600.0)
+    code, told, err = program(*ORACLE)
+    assert code == 0, err
+    return Path(told.strip())
+
+
+def change_task(**changes):
+    """Change what task.json says; None takes a key away."""
+    path = TASK / "task.json"
+    content = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
+
+
+# --- list-matchers, new-matcher, check-matcher ----------------------------------------------------------------------
+
+
+def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkeypatch) -> None:
+    about = tmp_path / "site" / "x_own-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: x-own\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{MATCHERS}]\nmine = nowhere.to_be:Found\n")
+    monkeypatch.syspath_prepend(str(about.parent))
+    code, told, err = program("list-matchers")
+    assert (code, err) == (0, "")
+    head, *rows = (line.split() for line in told.splitlines() if line)
+    assert head == ["matcher", "package", "class"]
+    assert ["mine", "x-own", "nowhere.to_be:Found"] in rows
+    assert [row[0] for row in rows] == sorted(row[0] for row in rows)
+    assert "oracle_pose" in {row[0] for row in rows}
+
+
+def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, monkeypatch) -> None:
+    pip = tmp_path.parent / f"{tmp_path.name}-bin" / "pip"  # an environment may have been made without one
+    pip.parent.mkdir()
+    pip.touch(mode=0o755)
+    monkeypatch.setattr(sys, "executable", str(pip.with_name("python")))
+    monkeypatch.setenv("PATH", str(pip.parent))
+    code, told, err = program("new-matcher", "my-matcher")
+    assert code == 0
+    assert "submit --card my-matcher/card.toml" in err
+    assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check-matcher my-matcher\n"
+    assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
+    monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named
+    code, told, _ = program("new-matcher", "other", "--into", "deep/er")
+    assert f"next: {pip} install -e deep/er && " in told
+    assert (code, told.split(":")[0]) == (0, "deep/er")
+    assert (tmp_path / "deep" / "er" / "pyproject.toml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("My Matcher",), "lower-case letters, digits, hyphens and underscores"),
+        (("../x",), "lower-case letters, digits, hyphens and underscores"),
+        (("numpy",), "cannot be a package: it is taken"),
+        (("oracle_pose",), "is a matcher of sasgeo-bench itself"),
+        (("mine", "--into", "full"), "full is there already and not empty"),
+        (("mine", "--into", "full/file"), "full/file is there already and not empty"),
+        (("mine", "--into", "full/file/deep"), "full/file/deep cannot be written"),
+    ],
+)
+def test_a_matcher_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("")
+    assert told in mistake("new-matcher", *words)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
+
+
+def test_a_good_matcher_gets_a_table_and_exit_0(check) -> None:
+    code, told, err = check("faulty:Good")
+    assert (code, err) == (0, "")
+    assert told.splitlines()[0].split() == ["check", "outcome", "found"]
+    assert " fail " not in told
+    assert told.count(" pass ") == 13
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("faulty:NoCard", "faulty:NoCard: card is a NoneType, expected a sasgeo_bench.matching.matcher.MatcherCard"),
+        ("raster_uniformm", "there is no matcher 'raster_uniformm', did you mean 'raster_uniform'?"),
+    ],
+)
+def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, spec, words) -> None:
+    code, told, err = check(spec)
+    assert code == 2
+    assert [line for line in told.splitlines() if " fail " in line and words in line]
+    assert err == f"{spec}: 1 checks failed\n"
+
+
+# --- run ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_says_what_is_left_is_cut_off_goes_on_and_is_validated_and_merged(program, out, ids) -> None:
+    code, told, err = program(*GOOD, "--dry-run")
+    assert (code, err) == (0, "")
+    assert "good 1 (" in told
+    assert f"{len(ids)} queries left, 0 done" in told
+    assert not (out / "runs").exists()
+    code, told, err = program(*GOOD, "--limit", "2")
+    assert (code, err) == (0, "good 1: 2 ok\n")
+    folder = Path(told.strip())
+    assert folder.parts[:3] == ("out", "runs", "good")
+    code, told, err = program("validate", "--predictions", folder, "--tasks", TASK)
+    assert (code, err) == (2, f"{folder}: {len(ids) - 2} violations\n")
+    assert all(line.endswith("expected one for every query") for line in told.splitlines())
+    code, told, err = program(*GOOD, "--jobs", "2")
+    assert (code, told, err) == (0, f"{folder}\n", f"good 1: {len(ids) - 2} ok\n")
+    code, told, err = program("validate", "--predictions", folder, "--tasks", TASK)
+    assert (code, told, err) == (0, f"{folder}: answers every query of 1 task, and nothing else\n", "")
+    code, told, err = program("merge", "--runs", folder, "--into", "all.parquet")
+    assert (code, told, err) == (0, f"all.parquet: {len(ids)} predictions\n", "")
+
+
+def test_a_second_run_says_that_nothing_is_left(program, run_folder, ids) -> None:
+    code, told, err = program(*ORACLE)
+    assert (code, told) == (0, f"{run_folder}\n")
+    assert f"{run_folder}: nothing left, {len(ids)} done" in err
+    code, told, _ = program(*ORACLE, "--dry-run")
+    assert f"0 queries left, {len(ids)} done" in told
+
+
+def test_the_shards_of_two_machines_merged_are_the_whole_run(program, run_folder, ids) -> None:
+    folders, counts = [], []
+    for shard in ("1/2", "2/2"):
+        code, told, err = program(*ORACLE, "--shard", shard, "--out", f"machine {shard[0]}")
+        assert code == 0, err
+        folders.append(told.strip())
+        counts.append(len(list(prediction_files.read_predictions(Path(told.strip())))))
+    assert sum(counts) == len(ids)
+    assert min(counts) > 0
+    for files, into in ((folders, "both.parquet"), ([run_folder], "whole.parquet")):
+        program("merge", *(word for file in files for word in ("--runs", file)), "--into", into)
+    both, whole = (
+        [replace(item, latency_s=None, matcher_s=None) for item in prediction_files.read_predictions(Path(name))]
+        for name in ("both.parquet", "whole.parquet")
+    )
+    assert both == whole
+    assert program("validate", "--predictions", "both.parquet", "--tasks", TASK)[0] == 0
+
+
+def test_several_tasks_are_run_and_validated_at_once(program, out) -> None:
+    del out
+    tasks = ("--tasks", TASK, "--tasks", TASK.parent.parent / "clean" / TOWN)
+    code, told, _ = program("run", "--matcher", "oracle_pose", *tasks)
+    folders = told.splitlines()
+    assert (code, len(folders)) == (0, 2)
+    merged = (word for folder in folders for word in ("--runs", folder))
+    assert program("merge", *merged, "--into", "all.parquet")[0] == 0
+    code, told, _ = program("validate", "--predictions", "all.parquet", *tasks)
+    assert (code, told) == (0, "all.parquet: answers every query of 2 tasks, and nothing else\n")
+
+
+def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_folder, ids, monkeypatch) -> None:
+    monkeypatch.setattr("sasgeo_bench.running.plan.MOST_LINES", 1)
+    monkeypatch.setattr("sasgeo_bench.running.runner.MOST_LINES", 0)
+    other = TASK.parent.parent / "clean" / TOWN
+    more = len(task_files.read_ids(other))
+    code, told, _ = program(*ORACLE, "--tasks", other, "--dry-run")
+    assert (code, told.splitlines()[1:]) == (
+        0,
+        [
+            f"  {run_folder}: 0 queries left, {len(ids)} done",
+            f"  1 more tasks: {more} queries left, 0 done",
+            f"  all 2 tasks: {more} queries left, {len(ids)} done",
+        ],
+    )
+    code, _, err = program(*ORACLE, "--tasks", other)
+    assert (code, err.splitlines()[0]) == (0, "oracle_pose: nothing left in 1 of 2 tasks")
+
+
+def test_answers_to_what_a_query_was_are_set_aside_by_validate_and_merge(program, mistake, run_folder, ids) -> None:
+    prediction_files.write_part(run_folder, [Prediction(query_id=ids[0])], asked={ids[0]: "0" * 64})
+    code, told, err = program("validate", "--predictions", run_folder, "--tasks", TASK)
+    assert (code, err) == (0, "")
+    assert told == f"{run_folder}: answers every query of 1 task, 1 answer to other queries set aside\n"
+    code, told, _ = program(*ORACLE, "--dry-run")
+    assert f"0 queries left, {len(ids)} done, 1 answer to other queries set aside" in told
+    words = ("merge", "--runs", run_folder, "--into", "mine.parquet")
+    assert mistake(*words).endswith("name the tasks with --tasks")
+    code, told, _ = program(*words, "--tasks", TASK)
+    assert (code, told) == (0, f"mine.parquet: {len(ids)} predictions\n")
+    assert all(
+        item.candidates or item.query_id != ids[0] for item in prediction_files.read_predictions(Path("mine.parquet"))
+    )
+
+
+@pytest.mark.parametrize("text", ["x", "1", "", "/", "1/", "/2", "-1/2", "1/2/3", "1/2 ", "1.0/2", "one/two", "²/2"])
+def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
+    assert f"--shard must be i/n, as in 1/2, got {text!r}" in mistake(*ORACLE, f"--shard={text}")
+    assert not (out / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--shard", "0/2"), "--shard must be i/n with 1 <= i <= n, got 0/2"),
+        (("--shard", "3/2"), "--shard must be i/n with 1 <= i <= n, got 3/2"),
+        (("--shard", "0/0"), "--shard must be i/n with 1 <= i <= n, got 0/0"),
+        (("--jobs", "0"), "--jobs must be at least 1, got 0"),
+        (("--limit", "-1"), "--limit must be at least 1, got -1"),
+        (("--top-k", "0"), "--top-k must be at least 1, got 0"),
+        (("--match-s", "nan"), "--match-s must be seconds between 0 and 604800, got nan"),
+        (("--prepare-s", "0"), "--prepare-s must be seconds between 0 and 604800, got 0"),
+        (("--memory-mb", "1"), "--memory-mb must lie between 64 and 4000000, got 1"),
+        (("--scratch-mb", "0"), "--scratch-mb must lie between 1 and 4000000, got 0"),
+        (
+            ("--again", "late"),
+            "--again must be one of ok, timeout, crash, invalid, refused, not applicable, got 'late'",
+        ),
+        (("--learn-s", "0"), "--learn-s must be seconds between 0 and 604800, got 0"),
+        (("--most-trained", "0"), "--most-trained must lie between 1 and 2000, got 0"),
+        (("--train", TASK, "--split", "crosfit"), "there is no split 'crosfit', did you mean 'crossfit'"),
+        (("--tasks", "nowhere"), "nowhere holds no task.json: make the queries first"),
+        (("--tasks", "out"), "out holds no task.json: make the queries first"),
+        (("--out", "a-file"), "cannot be written (Not a directory)"),
+        (("--out", "a-file/deep"), "cannot be written (Not a directory)"),
+    ],
+)
+def test_a_run_that_makes_no_sense_gets_one_line_and_nothing_is_written(mistake, out, words, told) -> None:
+    Path("a-file").write_text("")
+    assert told in mistake(*ORACLE, *words)
+    assert not (out / "runs").exists()
+
+
+def test_whoever_learns_from_what_is_asked_gets_one_line_and_nothing_is_written(mistake, out) -> None:
+    told = mistake("run", "--matcher", "faulty:Learns", "--tasks", TASK, "--train", out / "tasks" / "no-priors" / TOWN)
+    assert f"is of region '{TOWN}', and so is {TASK}, which is asked: leave one out" in told
+    assert not (out / "runs").exists()
+
+
+def test_a_matcher_that_does_not_learn_says_so(program, out) -> None:
+    del out
+    code, told, err = program(*ORACLE, "--train", TASK, "--dry-run")
+    assert (code, err) == (0, "")
+    assert told.splitlines()[1] == "  does not learn: what there is to learn from is passed over"
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("raster-uniform", "there is no matcher 'raster-uniform', did you mean 'raster_uniform'?"),
+        ("faulty:NoSuchClass", "has no attribute 'NoSuchClass'"),
+        ("faulty:NoCard", "card is a NoneType"),
+    ],
+)
+def test_a_matcher_that_cannot_be_loaded_gets_one_line_and_nothing_is_written(mistake, out, spec, words) -> None:
+    assert words in mistake("run", "--matcher", spec, "--tasks", TASK)
+    assert not (out / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema_version": 0}, "has schema version 0, this version reads 1: make the queries again"),
+        ({"map_fingerprint": "0" * 64}, "was built anew since the queries of"),
+        ({"region": "elsewhere"}, "elsewhere holds no region.json: build the region first"),
+        ({"region": "../../.."}, "is damaged (task.json: 'region'"),
+        ({"files": None}, "is damaged (task.json: 'files' is missing)"),
+    ],
+)
+def test_a_task_that_cannot_be_asked_gets_one_line(mistake, out, changes, words) -> None:
+    change_task(**changes)
+    assert words in mistake(*ORACLE)
+    assert not (out / "runs").exists()
+
+
+def test_a_truncated_task_gets_one_line(mistake, out) -> None:
+    queries = TASK / task_files.QUERIES
+    queries.write_bytes(queries.read_bytes()[:-100])
+    assert "queries.parquet is not what task.json says" in mistake(*ORACLE)
+    (TASK / task_files.TASK).write_text("{")
+    assert "task.json is damaged (" in mistake(*ORACLE)
+    assert not (out / "runs").exists()
+
+
+def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run_folder) -> None:
+    (part,) = prediction_files.parts_of(run_folder)
+    whole = part.read_bytes()
+    part.write_bytes(whole[:-50])
+    assert f"{part} cannot be read (" in mistake(*ORACLE)
+    part.write_bytes(whole)
+    shutil.copy(TASK / task_files.QUERIES, run_folder / "part-9.parquet")
+    assert "part-9.parquet holds no predictions: move it out of the run's folder" in mistake(*ORACLE)
+    (run_folder / "part-9.parquet").unlink()
+    about = run_folder / prediction_files.RUN
+    sound = prediction_files.read_run(run_folder)
+    for text in ("{", "[]", "null", '"run"'):
+        about.write_text(text)
+        told = mistake(*ORACLE)
+        assert "run.json is damaged" in told
+        assert told.endswith("remove it and run again, the parts beside it are kept")
+    about.write_text("{}")
+    assert "holds answers of None, not of" in mistake(*ORACLE)
+    about.write_text(json.dumps(sound | {"cpu_s": "long"}))
+    rows = pq.read_table(part)
+    pq.write_table(rows.slice(1), part)
+    assert "run.json is damaged (cpu_s is no number)" in mistake(*ORACLE)
+    about.unlink()
+    pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
+    told = mistake(*ORACLE)
+    assert f"{run_folder} holds answers of an older version, and not to the queries that" in told
+    assert told.endswith("move it away and run again")
+    about.mkdir()
+    part.unlink()
+    assert f"{run_folder} cannot be written (" in mistake(*ORACLE)
+
+
+def test_a_file_where_rows_would_go_gets_one_line(mistake, run_folder) -> None:
+    shutil.rmtree(run_folder)
+    run_folder.write_text("mine")
+    assert f"{run_folder} cannot be written (" in mistake(*ORACLE)
+    assert run_folder.read_text() == "mine"
+
+
+# --- merge ----------------------------------------------------------------------------------------------------------
+
+
+def test_runs_of_two_versions_of_a_matcher_are_not_merged(mistake, run_folder) -> None:
+    other = Path(shutil.copytree(run_folder, "other"))
+    about = prediction_files.read_run(other)
+    prediction_files.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"version": "0"}})
+    told = mistake("merge", "--runs", run_folder, "--runs", other, "--into", "both.parquet")
+    assert "other holds answers of oracle_pose 0 (000000000000)" in told
+    assert "two matchers, versions or settings are never mixed" in told
+    assert not Path("both.parquet").exists()
+
+
+def test_what_cannot_be_merged_gets_one_line_and_nothing_is_written(mistake, mine, out) -> None:
+    del out
+    Path("notes.txt").write_text("hello")
+    rows = mine()
+    for file, words in (
+        ("nowhere", "nowhere holds no predictions: run a matcher first, or name a predictions file"),
+        ("notes.txt", "notes.txt cannot be read ("),
+        (TASK / task_files.QUERIES, "holds no predictions (candidates: found list"),
+        (TASK / task_files.TASK, "cannot be read ("),
+        (TASK, "holds no predictions"),
+    ):
+        assert words in mistake("merge", "--runs", rows, "--runs", file, "--into", "new.parquet")
+    for into, words in (
+        ("notes.txt", "notes.txt is no predictions file and would be lost: name another one"),
+        ("out", "out is no predictions file and would be lost: name another one"),
+        (TASK / task_files.QUERIES, "is no predictions file and would be lost"),
+        ("notes.txt/new.parquet", "notes.txt/new.parquet cannot be written ("),
+    ):
+        assert words in mistake("merge", "--runs", rows, "--into", into)
+    assert Path("notes.txt").read_text() == "hello"
+    assert sorted(path.name for path in Path().glob("*.parquet*")) == ["mine.parquet"]
+
+
+def test_a_file_can_be_merged_into_itself_and_again(program, mine, ids) -> None:
+    path = mine([Prediction(query_id=name) for name in reversed(ids)])
+    for _ in range(2):
+        assert program("merge", "--runs", path, "--into", path)[0] == 0
+        assert pq.read_table(path)["query_id"].to_pylist() == sorted(ids)
+
+
+# --- validate -------------------------------------------------------------------------------------------------------
+
+
+def test_missing_double_and_foreign_rows_get_a_line_each_and_exit_2(program, mine, ids) -> None:
+    names = [*ids[1:], ids[1], "feedfeed"]
+    count = len(ids)
+    path = mine([Prediction(query_id=name) for name in names])
+    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    assert (code, err) == (2, "mine.parquet: 3 violations\n")
+    found = f"{ids[1]} again (mine.parquet, row 0)"
+    assert told.splitlines() == [
+        f"mine.parquet, row {count - 1}, query_id: found {found}, expected each query once",
+        f"mine.parquet, row {count}, query_id: found 'feedfeed', expected the id of a query of the tasks",
+        f"mine.parquet, query_id: found no row for {ids[0]}, expected one for every query",
+    ]
+
+
+def test_of_many_queries_without_a_row_some_are_named_and_the_rest_counted(program, mine, ids, monkeypatch) -> None:
+    monkeypatch.setattr("sasgeo_bench.cli.submissions.MOST_MISSING", 2)
+    path = mine([Prediction(query_id=ids[0])])
+    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    assert (code, err) == (2, f"mine.parquet: {len(ids) - 1} violations\n")
+    *named, last = told.splitlines()
+    assert [line.split()[6].rstrip(",") for line in named] == ids[1:3]
+    assert last.startswith(f"mine.parquet, query_id: found no row for {len(ids) - 3} more quer")
+
+
+def test_a_column_that_is_missing_is_told_once_and_not_for_every_query(program, mine) -> None:
+    path = mine()
+    pq.write_table(pq.read_table(path).drop_columns(["latency_s", "query_id"]), path)
+    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    assert (code, err) == (2, "mine.parquet: 2 violations\n")
+    assert told.splitlines() == [
+        "mine.parquet, query_id: found nothing, expected a column of string",
+        "mine.parquet, latency_s: found nothing, expected a column of double",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("version", "words"), [(0, "has task version 0, this version reads"), (None, "'task_version' is missing")]
+)
+def test_predictions_for_a_task_of_another_version_are_not_validated(mistake, mine, version, words) -> None:
+    path = mine()
+    change_task(task_version=version)
+    told = mistake("validate", "--predictions", path, "--tasks", TASK)
+    assert words in told
+    assert told.endswith("make the queries again")
+
+
+def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
+    path, name = mine(), "x" * 300
+    for words in (
+        ("score", "--predictions", name),
+        ("validate", "--predictions", name, "--tasks", TASK),
+        ("validate", "--predictions", path, "--tasks", name),
+        ("leaderboard", f"{name}.toml"),
+    ):
+        told = mistake(*words)
+        assert "File name too long; check the path, your rights and the free space: xxx" in told
+    assert "--truth names nowhere, where there is no folder" in mistake(
+        "score", "--predictions", path, "--truth", "nowhere"
+    )
+    assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
+
+
+def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) -> None:
+    other = Path(shutil.copytree(run_folder, run_folder.parents[3] / "other" / "x" / SUITE / TOWN))
+    about = prediction_files.read_run(other)
+    prediction_files.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"name": "other"}})
+    told = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
+    assert told.endswith("two matchers, versions or settings are never mixed, name the folder of one")
+
+
+def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:
+    path = mine()
+    words = ("validate", "--predictions")
+    assert "nowhere holds no task.json: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
+    assert "nowhere holds no predictions" in mistake(*words, "nowhere", "--tasks", TASK)
+    assert "holds no predictions" in mistake(*words, TASK, "--tasks", TASK)
+    path.write_bytes(path.read_bytes()[:-100])
+    assert "mine.parquet cannot be read (" in mistake(*words, path, "--tasks", TASK)
+    path.write_text("query_id,candidates\n")
+    assert "mine.parquet cannot be read (" in mistake(*words, path, "--tasks", TASK)
+    path.write_bytes(b"")
+    assert "mine.parquet cannot be read (" in mistake(*words, path, "--tasks", TASK)
+    queries = TASK / task_files.QUERIES
+    queries.write_bytes(queries.read_bytes()[:-100])
+    assert "queries.parquet cannot be read (" in mistake(*words, path, "--tasks", TASK)

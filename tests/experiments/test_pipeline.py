@@ -1,0 +1,509 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pipeline draws, runs and scores; a second time it does only what is not up to date."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from sasgeo_bench.config import parse_toml
+from sasgeo_bench.errors import ConfigError, MatchError
+from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.leaderboard.pipeline_spec import (
+    PipelineFile,
+    find_pipeline_file,
+    list_pipeline_files,
+    read_pipeline_file,
+)
+from sasgeo_bench.tasks import build as tasks
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import ensure_tasks, made_tasks
+from tests.threaded import threaded
+
+pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings")
+
+TEXT = """
+id = "small"
+title = "Small"
+split = "crossfit"
+regions = ["town-suburb"]
+matchers = ["random", "prior_centre"]
+
+[[task]]
+suites = ["clean"]
+sites = 1
+
+[[contrast]]
+name = "nothing"
+first = "random"
+second = "prior_centre"
+suites = ["clean"]
+"""
+
+MIRRORED = """
+[[contrast]]
+name = "mirrored"
+first = "prior_centre"
+second = "random"
+suites = ["clean"]
+"""
+
+
+def small(**changes):
+    text = TEXT
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    return parse_toml(text, PipelineFile, source="small.toml")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
+    out = lay_towns(tmp_path_factory.mktemp("pipeline") / "out", "town-suburb")
+    plan = plan_pipeline(small(), out=out, tell=lambda _: None)
+    told = plan.to_text().splitlines()
+    assert told[1:3] == [
+        "  queries: 0 of 1 task up to date, 1 to be drawn (1 not there yet)",
+        "    to be drawn: clean on town-suburb",
+    ]
+    assert told[3] == "  controls: 0 of 1 task up to date, 1 to be drawn (1 not there yet)"
+    assert "  run: 4 matchers, 0 answered, 0 to ask" in told
+    assert "    fft_vote (controls alone): 0 answered, 0 to ask, and what is drawn; 0 answered there before" in told
+    lines = []
+    with threaded():
+        return plan, run_pipeline(plan, tell=lines.append), lines
+
+
+def test_a_pipeline_ends_with_a_board(made):
+    plan, board, lines = made
+    count = len(task_files.read_ids(plan.out / "tasks" / "clean" / "town-suburb"))
+    controls = len(task_files.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls"))
+    assert f"random: {count + controls} queries to ask, 0 answered before" in lines
+    assert f"fft_vote: {controls} queries to ask, 0 answered before" in lines
+    assert {entry.name for entry in board.entries} == {"random", "prior_centre", "oracle_pose"}
+    assert [item.name for item in board.findings] == ["nothing"]
+    assert (plan.out / "boards" / "small" / "leaderboard.parquet").is_file()
+    assert "Registered contrasts" in (plan.out / "boards" / "small" / "leaderboard.md").read_text(encoding="utf-8")
+
+
+def test_every_board_has_controls_and_figures_without_them(made):
+    plan, board, _ = made
+    assert {item.matcher for item in board.verdicts} == {"random", "prior_centre", "oracle_pose", "fft_vote"}
+    assert all(item.holds for item in board.verdicts)
+    assert set(board.table["suite"]) == {"clean", "all suites"}
+    assert "fft_vote" not in set(board.table["matcher"])
+    folder = plan.out / "boards" / "small"
+    about = json.loads((folder / "board.json").read_text(encoding="utf-8"))
+    assert about["pipeline"] == {"id": "small", "sha256": plan.spec.sha256}
+    assert len(pd.read_parquet(folder / "controls.parquet")) == len(board.verdicts)
+    text = (folder / "leaderboard.md").read_text(encoding="utf-8")
+    assert f"- Controls: all {len(board.verdicts)} held." in text
+    assert "## Controls" in text
+
+
+def test_the_command_ends_with_the_board_and_what_to_do_next(made, program, monkeypatch, tmp_path):
+    _, board, _ = made
+    monkeypatch.setattr("sasgeo_bench.cli.boards.run_pipeline", lambda *_, **__: board)
+    (tmp_path / "small.toml").write_text(TEXT, encoding="utf-8")
+    code, told, err = program("leaderboard", "small.toml")
+    assert code == 0, err
+    assert told.splitlines()[-1] == str(Path("out") / "boards" / "small")
+    assert err.splitlines()[-1].startswith("next: sasgeo-bench leaderboard small.toml --matcher NAME adds one of yours")
+
+
+def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
+    plan, board, _ = made
+    queries = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"
+    before = queries.stat().st_mtime_ns
+    lines = []
+    again = run_pipeline(plan, tell=lines.append)
+    assert queries.stat().st_mtime_ns == before
+    assert [line.split(",")[0] for line in lines if "to ask" in line] == [
+        f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
+    ]
+    assert again.table.equals(board.table)
+    told = plan.to_text()
+    assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in told
+    count = len(board.scores["random"]) + len(
+        task_files.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+    )
+    assert f"    random: {count} answered, 0 to ask\n" in told
+    assert "to be drawn" not in told
+
+
+def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_coming(made):
+    plan, board, _ = made
+    changes = {'id = "small"': 'id = "other"\nseed = 1', "sites = 1": "sites = 2"}
+    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    told = other.to_text()
+    assert "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with another seed)\n" in told
+    count = len(board.scores["random"]) + len(
+        task_files.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+    )
+    assert f"    random: 0 answered, 0 to ask, and what is drawn; {count} answered there before\n" in told
+    assert "answers where they are: those to the same queries count again, the others are set aside\n" in told
+    run_pipeline(other, tell=lambda _: None)
+    assert "1 drawn with sites = 2, now 3" in _more_sites(other).to_text()
+    lines = []
+    again = run_pipeline(plan, tell=lines.append)
+    assert [line for line in lines if "queries to ask" in line and ": 0 queries" not in line] == []
+    for name, frame in board.scores.items():
+        assert again.scores[name].equals(frame)
+
+
+def _more_sites(plan):
+    (task,) = plan.spec.task
+    spec = plan.spec.model_copy(update={"task": [task.model_copy(update={"sites": 3})]})
+    return plan_pipeline(spec, out=plan.out, tell=lambda _: None)
+
+
+def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
+    request = made[0].requests[0]
+    folders = made_tasks(request)
+    found = iter((None, folders))
+    monkeypatch.setattr(tasks, "made_tasks", lambda _: next(found))
+    monkeypatch.setattr(tasks, "_make_tasks", None)
+    assert ensure_tasks(request, tell=lambda _: None) == folders
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"sites = 1": "sites = 2"}, {"crossfit": "holdout"}, {"title": "seed = 1\ntitle"}],
+)
+def test_what_changes_queries_has_them_drawn_anew(made, changes):
+    plan, _, _ = made
+    assert made_tasks(plan.requests[0]) is not None
+    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    assert made_tasks(other.requests[0]) is None
+
+
+def test_a_task_that_was_touched_is_not_up_to_date(made):
+    plan, _, _ = made
+    path = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"
+    data = path.read_bytes()
+    try:
+        path.write_bytes(data + b"x")
+        assert made_tasks(plan.requests[0]) is None
+    finally:
+        path.write_bytes(data)
+    assert made_tasks(plan.requests[0]) is not None
+
+
+def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
+    plan, _, _ = made
+    path = plan.out / "truth" / "clean" / "town-suburb" / task_files.TRUTH
+    path.rename(tmp_path / task_files.TRUTH)
+    try:
+        assert made_tasks(plan.requests[0]) is None
+    finally:
+        (tmp_path / task_files.TRUTH).rename(path)
+    assert made_tasks(plan.requests[0]) is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"title": "titel"}, "unknown key 'titel', did you mean 'title'"),
+        ({'second = "prior_centre"': 'second = "nobody"'}, "contrast 'nothing' names the unknown matcher 'nobody'"),
+        (
+            {'matchers = ["random", "prior_centre"]': 'matchers = ["random", "random"]'},
+            "matcher 'random' is listed twice",
+        ),
+        ({"sites = 1": "sites = 0"}, "greater than or equal to 1"),
+        ({"sites = 1": "sites = -1"}, "greater than or equal to 1, got -1"),
+        ({"sites = 1": "sites = 1000000000"}, "less than or equal to 10000"),
+        ({'suites = ["clean"]\nsites': "suites = []\nsites"}, "at least 1 item"),
+        ({'suites = ["clean"]\nsites': 'suites = ["clean", "clean"]\nsites'}, "suite 'clean' is listed twice"),
+        ({'id = "small"': f'id = "{"x" * 300}"'}, "'id': String should match pattern"),
+        ({'id = "small"': 'id = "../../small"'}, "'id': String should match pattern"),
+        ({'second = "prior_centre"': 'second = "random"'}, "contrast 'nothing' holds 'random' against itself"),
+        ({"[[contrast]]": MIRRORED + "[[contrast]]"}, "contrasts 'mirrored' and 'nothing' compare the same"),
+        ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
+        ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
+        ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
+        ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
+        (
+            {'second = "prior_centre"': 'second = "prior_centre"\nmetric = "aurc"'},
+            "unknown matcher x rejector 'random'",
+        ),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(changes, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        small(**changes)
+    assert "\n" not in str(error.value)
+
+
+PAPER = """
+id = "few"
+title = "Few"
+matchers = ["random", "oracle_pose"]
+
+[paper]
+seeds = [42, 43]
+trials = 3
+
+[[contrast]]
+name = "nothing"
+first = "random"
+second = "oracle_pose"
+suites = ["paper-poc"]
+track = "retrieval"
+"""
+
+
+def test_the_paper_needs_no_split_no_region_and_no_task_and_has_its_own_defaults():
+    spec = parse_toml(PAPER, PipelineFile, source="few.toml")
+    assert (spec.split, spec.regions, spec.task) == (None, [], [])
+    text = PAPER.replace("seeds = [42, 43]\n", "").replace("trials = 3\n", "")
+    paper = parse_toml(text, PipelineFile, source="few.toml").paper
+    assert (paper.seeds, paper.trials) == ([42], 220)
+
+
+def test_the_paper_and_suites_may_stand_in_one_file():
+    text = TEXT.replace("[[task]]", "[paper]\n\n[[task]]").replace('["clean"]\n', '["clean", "paper-poc"]\n')
+    text = text.replace('suites = ["clean", "paper-poc"]\nsites', 'suites = ["clean"]\nsites')
+    spec = parse_toml(text, PipelineFile, source="both.toml")
+    assert spec.contrast[0].suites == ["clean", "paper-poc"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[42, 43]", "[42, 42]", "seed '42' is listed twice"),
+        ("[42, 43]", "[-1]", "greater than or equal to 0"),
+        ("[42, 43]", "[]", "at least 1 item"),
+        ("trials = 3", "trials = 0", "greater than or equal to 1"),
+        ("trials = 3", "trails = 3", "unknown key 'paper.trails', did you mean 'trials'"),
+        ('["paper-poc"]', '["paper-pock"]', "names the suite 'paper-pock', which is not drawn"),
+        ('track = "retrieval"', "", "the paper's trials are retrieval"),
+        ("[paper]", 'rejectors = ["margin"]\n[paper]', "rejectors are fitted on the calibration places of a split"),
+        ("[paper]", 'split = "crossfit"\n[paper]', "for \\[\\[task\\]\\], and there is none: leave them out"),
+        ("[paper]\nseeds = [42, 43]\ntrials = 3\n", "", "'task' is missing"),
+        ("[paper]", '[[task]]\nsuites = ["clean"]\nsites = 1\n\n[paper]', "'split' is missing"),
+    ],
+)
+def test_a_wrong_file_of_the_paper_is_refused_in_one_line(old, new, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        parse_toml(PAPER.replace(old, new), PipelineFile, source="few.toml")
+    assert "\n" not in str(error.value)
+
+
+LEARNING = """
+id = "taught"
+title = "Taught"
+split = "crossfit"
+regions = ["town-suburb", "town-agricultural"]
+matchers = ["learners:Counts", "learners:Oracle", "prior_centre"]
+
+[[task]]
+suites = ["clean"]
+sites = 1
+
+[learning]
+suites = ["clean"]
+most = 5
+oracles = ["learners:Oracle"]
+"""
+
+
+@pytest.mark.usefixtures("few_controls")
+def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(tmp_path, monkeypatch, lay_towns):
+    lay_towns(tmp_path, "town-suburb", "town-agricultural")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "running"))
+    plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
+    board = run_pipeline(plan, tell=lambda _: None)
+    assert {item.diagnostics["pairs"] for item in board.predictions["counts"].values()} == {5.0}
+    about = json.loads((tmp_path / "boards" / "taught" / "board.json").read_text(encoding="utf-8"))
+    learned = {entry["name"]: entry["learned"] for entry in about["entries"]}
+    assert learned["prior_centre"] == []
+    assert {tuple(one["trained_on"]): one["asked"] for one in learned["counts"]} == {
+        ("town-agricultural",): ["clean/town-suburb", "controls/town-suburb+controls"],
+        ("town-suburb",): ["clean/town-agricultural"],
+    }
+    assert {tuple(one["trained_on"]): one["asked"] for one in learned["oracle_counts"]} == {
+        ("town-suburb",): ["clean/town-suburb", "controls/town-suburb+controls"],
+        ("town-agricultural",): ["clean/town-agricultural"],
+    }
+    assert board.table.loc[board.table["matcher"] == "oracle_counts", "is_control"].all()
+    text = (tmp_path / "boards" / "taught" / "leaderboard.md").read_text(encoding="utf-8")
+    assert "learnt from 5 queries of 1 place (town-suburb)." in text
+    told = plan.to_text().splitlines()
+    assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in told
+    assert "    learners:Oracle: from the half itself, never ranked" in told
+    assert "      half a: has learnt from 5 queries of 1 place (town-agricultural)" in told
+    assert "      half b: has learnt from 5 queries of 1 place (town-suburb)" in told
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('["clean"]\nmost', '["season"]\nmost', "learning names the suite 'season', which no"),
+        ('["clean"]\nmost', '["controls"]\nmost', "learning names the suite 'controls', which no"),
+        ('["clean"]\nmost', '["clean", "clean"]\nmost', "suite to learn from 'clean' is listed twice"),
+        ("most = 5", "most = 0", "greater than or equal to 1"),
+        (
+            'oracles = ["learners:Oracle"]',
+            'oracles = ["oracle_x"]',
+            "learning names the oracle 'oracle_x', which is not among 'matchers'",
+        ),
+        ('"crossfit"', '"holdout"', "needs halves, and split 'holdout' is a hold-out: name a cross-fit, or leave"),
+    ],
+)
+def test_learning_that_makes_no_sense_is_refused_in_one_line(tmp_path, old, new, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        plan_pipeline(
+            parse_toml(LEARNING.replace(old, new), PipelineFile, source="taught.toml"),
+            out=tmp_path,
+            tell=lambda _: None,
+        )
+    assert "\n" not in str(error.value)
+
+
+def test_an_oracle_with_a_contestants_name_is_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "running"))
+    text = LEARNING.replace('["learners:Oracle"]', '["learners:Counts"]')
+    plan = plan_pipeline(parse_toml(text, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
+    with pytest.raises(ConfigError, match="the names of oracles begin with oracle_, so that no board ranks them"):
+        plan.to_text()
+
+
+def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
+    spec = small()
+    assert "learning" in spec.model_dump()
+    newer = {"learning": True, "task": {"__all__": {"views_cells", "kinds", "tracks"}}}
+    assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude=newer).encode()).hexdigest()
+    chosen = small(**{"sites = 1": "sites = 1\nviews_cells = [192]"})
+    assert chosen.sha256 != spec.sha256
+
+
+def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp_path):
+    for old, new in (("claen", "clean"), ("town-suburbia", "town-suburb"), ("crosfit", "crossfit")):
+        spec = parse_toml(TEXT.replace(f'"{new}"', f'"{old}"'), PipelineFile, source="small.toml")
+        with pytest.raises(ConfigError, match=f"did you mean '{new}'"):
+            plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_choice_that_leaves_nothing_names_the_pipeline_and_the_task(tmp_path):
+    spec = small(**{"sites = 1": "sites = 1\nviews_cells = [191]"})
+    with pytest.raises(
+        ConfigError, match=r"^pipeline 'small', \[\[task\]\] 1 of 1: suite 'clean' has nothing of views_cells 191"
+    ):
+        plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+
+
+@pytest.mark.parametrize(("old", "new"), [("random", "randon"), ("prior_centre", "prior_center")])
+def test_a_matcher_that_nobody_has_is_refused_before_anything_is_made(tmp_path, old, new):
+    spec = parse_toml(TEXT.replace(f'"{old}"', f'"{new}"'), PipelineFile, source="small.toml")
+    with pytest.raises(MatchError, match=f"there is no matcher '{new}', did you mean '{old}'"):
+        plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", sorted(list_pipeline_files()))
+def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
+    spec = read_pipeline_file(find_pipeline_file(name))
+    assert spec.id == name
+    plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
+    assert plan.requests or plan.spec.paper is not None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "may_differ"),
+    [
+        ("towns", "leaderboard", {"id", "title", "regions"}),
+        ("paper-poc", "paper-poc-20", {"id", "title", "paper"}),
+    ],
+)
+def test_a_rehearsal_asks_what_the_experiment_asks(small, large, may_differ):
+    one, other = (read_pipeline_file(find_pipeline_file(name)).model_dump() for name in (small, large))
+    for said in (one, other):
+        for item in said["task"]:
+            item.pop("sites")
+    assert {name for name in one if one[name] != other[name]} <= may_differ
+    assert one["contrast"]
+
+
+def with_tasks(*tasks, **changes):
+    spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random", "fft_vote"]}
+    return PipelineFile.model_validate(spec | {"task": list(tasks)} | changes)
+
+
+def test_matchers_of_a_task_are_asked_there_alone():
+    both = {"suites": ["clean"], "sites": 2}
+    one = {"suites": ["alias"], "sites": 2, "matchers": ["fft_vote"]}
+    spec = with_tasks(both, one)
+    assert spec.suites_of("random") == {"clean"}
+    assert spec.suites_of("fft_vote") == {"clean", "alias"}
+
+
+@pytest.mark.parametrize(
+    ("tasks", "changes", "fault"),
+    [
+        ([{"suites": ["clean"], "sites": 2, "matchers": ["nobody"]}], {}, "asks 'nobody'"),
+        ([{"suites": ["clean"], "sites": 2, "matchers": ["random"]}], {}, "'fft_vote' is asked on no suite"),
+        (
+            [
+                {"suites": ["clean"], "sites": 2},
+                {"suites": ["alias"], "sites": 2, "matchers": ["random"]},
+            ],
+            {"contrast": [{"name": "one", "first": "fft_vote", "second": "random", "suites": ["clean", "alias"]}]},
+            "'fft_vote', which is not asked on 'alias'",
+        ),
+    ],
+)
+def test_matchers_of_a_task_that_nobody_asks_are_refused(tasks, changes, fault):
+    with pytest.raises(ValueError, match=fault):
+        with_tasks(*tasks, **changes)
+
+
+BROKEN = """
+class Broken:
+    def __init__(self):
+        raise ValueError("no weights here")
+"""
+
+
+def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, monkeypatch):
+    (tmp_path / "broken_here.py").write_text(BROKEN, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plan, board, _ = made
+    spec = plan.spec.model_copy(
+        update={
+            "id": "beside",
+            "matchers": ["broken_here:Broken", *plan.spec.matchers],
+            "contrast": [item.model_copy(update={"second": "broken_here:Broken"}) for item in plan.spec.contrast],
+        }
+    )
+    other = plan_pipeline(spec, out=plan.out, tell=lambda _: None)
+    assert "    broken_here:Broken: cannot be asked (broken_here:Broken: cannot be made (" in other.to_text()
+    lines = []
+    beside = run_pipeline(other, tell=lines.append)
+    figures, before = (item[item["unit"] == "1"].reset_index(drop=True) for item in (beside.table, board.table))
+    assert figures.equals(before)  # what the runs took, in seconds and bytes, other tests add to
+    assert list(beside.failures.found) == ["broken_here:Broken"]
+    assert "no weights here" in beside.failures.found["broken_here:Broken"]
+    assert [item.verdict for item in beside.findings] == ["not decided: broken_here:Broken failed"]
+    assert any(line.startswith("broken_here:Broken failed: ") for line in lines)
+    assert json.loads((plan.out / "boards" / "beside" / "board.json").read_text())["failed"] == beside.failures.found
+
+
+def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch):
+    plan, board, _ = made
+    work = pipeline.plan_run
+
+    def broken(request):
+        if request.spec == "random":
+            message = "a mistake of ours"
+            raise KeyError(message)
+        return work(request)
+
+    monkeypatch.setattr(pipeline, "plan_run", broken)
+    beside = run_pipeline(plan, tell=lambda _: None)
+    assert set(beside.scores) == set(board.scores) - {"random"}
+    assert [item.verdict for item in beside.findings] == ["not decided: random failed"]
+    assert "in broken" in (plan.out / "boards" / "small.failures.log").read_text(encoding="utf-8")

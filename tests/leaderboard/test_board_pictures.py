@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a board and of single queries: small, the same each time, and of what they say they are of."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.board_pictures import (
+    CASE_BYTES,
+    MOST_BYTES,
+    REGION_BYTES,
+    SUITE_BYTES,
+    pictures_extra,
+    words_of,
+)
+from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
+from sasgeo_bench.leaderboard.case_plot import case_pixels
+from sasgeo_bench.leaderboard.picture import fitted
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.tasks import task_files
+
+HASH = "0123456789ab"
+ASKED = (("absent", "town-riverside"), ("alias", "town-grid+alias"))
+
+
+def answer(query, truth, number):
+    """Every third place is found, every third one missed by 300 m, and the others are withheld."""
+    near, far = (
+        replace(truth.pose, easting_m=truth.pose.easting_m + off_m)
+        if truth.pose
+        else Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+        for off_m in (3.0, 300.0)
+    )
+    if query.candidates:
+        near = far = query.candidates[0]
+    poses = ((near, 2.5), (far, 1.25)) if number % 3 == 0 else ((far, 2.5), (near, -1.0))
+    return Prediction(
+        query_id=query.query_id,
+        candidates=() if number % 3 == 1 else poses,
+        confidence=0.5,
+        diagnostics={"margin_nats": 1.25, "odd": float(number)},
+        latency_s=0.1,
+    )
+
+
+@pytest.fixture(scope="module")
+def root(tasks, tmp_path_factory):
+    """A root with runs of its own beside tasks, truths and maps that others share."""
+    out = tmp_path_factory.mktemp("pictures") / "out"
+    out.mkdir()
+    for kind in ("tasks", "truth", "regions"):
+        (out / kind).symlink_to(tasks / kind)
+    for suite, region in ASKED:
+        folder = out / "runs" / "mine" / HASH / suite / region
+        task = out / "tasks" / suite / region
+        truths = {truth.query_id: truth for truth in task_files.read_truths(out / "truth" / suite / region)}
+        answers = [answer(query, truths[query.query_id], at) for at, query in enumerate(task_files.read_queries(task))]
+        prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
+        about = {"matcher": {"name": "mine", "version": "1"}, "hash": HASH, "suite": suite, "region": region}
+        sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
+        prediction_files.write_run(folder, about | {"queries_sha256": sha256})
+    return out
+
+
+@pytest.fixture(scope="module")
+def made(root, tmp_path_factory):
+    """A board with its pictures, what was told, and the board in memory."""
+    lines, kept = [], []
+
+    def pictures(board):
+        kept.append(board)
+        return pictures_extra(board, tell=lines.append, root=root)
+
+    folder = tmp_path_factory.mktemp("made") / "board"
+    request = ScoreRequest(predictions=[root / "runs"], root=root, board=folder, draws=100, extras=(pictures,))
+    make_board(request, tell=lambda _: None)
+    return folder, lines, kept[0]
+
+
+def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
+    folder, lines, _ = made
+    said = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))
+    assert said["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+    assert [one["region"] for one in said["regions"]] == ["town-grid", "town-riverside"]
+    assert [one["suite"] for one in said["suites"]] == ["absent", "alias"]
+    listed = {one["file"]: kind for kind in ("regions", "suites", "cases") for one in said[kind]}
+    files = {path.relative_to(folder / "pictures").as_posix() for path in (folder / "pictures").rglob("*.webp")}
+    assert files == set(listed)
+    most = {"regions": REGION_BYTES, "suites": SUITE_BYTES, "cases": CASE_BYTES}
+    sizes = {name: (folder / "pictures" / name).stat().st_size for name in files}
+    assert all(size <= most[listed[name]] for name, size in sizes.items())
+    assert sum(sizes.values()) <= MOST_BYTES
+    assert all(cv2.imread(str(folder / "pictures" / name)) is not None for name in files)
+    assert lines[-1].startswith(f"pictures: 2 of regions, 2 of suites, {len(said['cases'])} of cases, ")
+
+
+def test_each_case_says_what_it_is_of_in_plain_numbers_and_words(made):
+    folder, _, board = made
+    cases = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))["cases"]
+    assert {"absent accepted", "aliased"} <= {one["failure"] for one in cases}
+    for one in cases:
+        assert set(one) == {*("query_id", "matcher", "failure", "file", "suite", "region", "kind", "alt", "said")}
+        assert all(isinstance(value, str | float) for value in one["said"].values())
+        row = board.scores["mine"].set_index("query_id").loc[one["query_id"]]
+        assert (row["suite"], row["region"], row["kind"]) == (one["suite"], one["region"], one["kind"])
+        assert bool(row["is_present"]) == (one["failure"] != "absent accepted")
+    (wrong,) = [one for one in cases if one["failure"] != "absent accepted" and one["suite"] == "absent"][:1]
+    error_m = board.scores["mine"].set_index("query_id").loc[wrong["query_id"], "position_error_m"]
+    assert wrong["said"].get("error_m", np.inf) == pytest.approx(error_m)
+
+
+def test_without_cases_no_truth_is_shown(made, root):
+    _, _, board = made
+    files = pictures_extra(board, tell=lambda _: None, root=root, has_cases=False).pictures
+    assert {name.partition("/")[0] for name in files} == {"pictures.json", "regions", "suites"}
+    assert json.loads(files["pictures.json"])["cases"] == []
+
+
+def test_a_board_is_written_without_the_pictures_that_cannot_be_drawn(made, root, tmp_path):
+    _, _, board = made
+    (tmp_path / "tasks").symlink_to(root / "tasks")
+    lines = []
+    assert pictures_extra(board, tell=lines.append, root=tmp_path).pictures == {}
+    assert any("holds no region.json: build the region first" in line for line in lines)
+    assert lines[-1] == "pictures: 0 of regions, 0 of suites, 0 of cases, 0.00 MB"
+
+
+def case_at(root, suite, region, number=0, **changes):
+    task = root / "tasks" / suite / region
+    truths = {truth.query_id: truth for truth in task_files.read_truths(root / "truth" / suite / region)}
+    query = list(task_files.read_queries(task))[number]
+    truth = truths[query.query_id]
+    said = {"prediction": answer(query, truth, 0), "failure": "other", **changes}
+    return Case(matcher="mine", query=query, truth=truth, **said), task_files.read_task(task)
+
+
+@pytest.mark.parametrize("prediction", [None, Prediction(query_id="x", status="timeout"), "answer"])
+@pytest.mark.parametrize("asked", [*ASKED, ("no-priors", "town-riverside")])
+def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, asked, prediction):
+    changes = {} if prediction == "answer" else {"prediction": prediction}
+    said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
+    case, about = case_at(root, *asked, **said, **changes)
+    first, again = (case_pixels(read_picture(case, root / "regions" / asked[1], about)) for _ in range(2))
+    assert first.dtype == np.uint8
+    np.testing.assert_array_equal(first, again)
+    assert fitted(first, CASE_BYTES) == fitted(again, CASE_BYTES)
+    text = "\n".join(read_picture(case, root / "regions" / asked[1], about).said)
+    assert "P(false) sure: 0.25, accepted" in text
+    assert "margin (an order, no probability): 0.5\n" in text
+    assert ("margin_nats: 1.25 nat" in text) == (prediction == "answer")
+
+
+def test_what_orders_answers_alone_is_told_apart_from_a_probability():
+    rows = pd.DataFrame({"query_id": ["q"], "p_right": [0.25], "accepted_0.05": [True], "is_answered": [True]})
+    words = {
+        ("mine", "margin"): rows.assign(is_calibrated=False).set_index("query_id"),
+        ("mine", "own"): rows.set_index("query_id"),
+    }
+    said = words_of(words, "mine", "q")
+    assert (said["orders"], said["p_false"]) == ({"margin": 0.75}, {"own": 0.75})
+    assert said["accepted"] == {"margin": True, "own": True}
+
+
+def test_the_map_of_a_case_holds_both_places(root):
+    case, about = case_at(root, "absent", "town-riverside")
+    picture = read_picture(case, root / "regions" / "town-riverside", about)
+    for pose in (case.truth.pose, case.fix):
+        if pose is not None:
+            assert picture.part.west_m <= pose.easting_m <= picture.part.east_m
+            assert picture.part.south_m <= pose.northing_m <= picture.part.north_m
+    np.testing.assert_array_equal(picture.at_true is None, case.truth.pose is None)
+
+
+def test_what_is_not_known_of_a_case_is_not_said(root):
+    case, _ = case_at(root, "absent", "town-riverside", prediction=None)
+    said = said_of(case)
+    assert said["status"] == "missing"
+    assert not {"error_m", "confidence", "score_margin"} & set(said)
+    with_nan = Prediction(query_id=case.query.query_id, diagnostics={"odd": float("inf")})
+    assert "told_odd" not in said_of(replace(case, prediction=with_nan))
+    assert said_of(replace(case, prediction=with_nan))["status"] == "withheld"
+
+
+def test_a_picture_that_fits_in_no_quality_is_made_smaller():
+    noise = np.random.default_rng(1).integers(0, 255, (200, 200, 3), dtype=np.uint8)
+    worst = len(cv2.imencode(".webp", noise, [cv2.IMWRITE_WEBP_QUALITY, 10])[1])
+    found = cv2.imdecode(np.frombuffer(fitted(noise, worst - 1), np.uint8), cv2.IMREAD_COLOR)
+    assert found.shape == (150, 150, 3)
+
+
+def test_a_picture_that_fits_in_no_quality_and_size_is_refused():
+    noise = np.random.default_rng(1).integers(0, 255, (200, 200, 3), dtype=np.uint8)
+    with pytest.raises(StoreError, match="a picture of 200 x 200 pixels does not fit into 100 bytes"):
+        fitted(noise, 100)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_inspect_counts_the_failures_of_a_run_and_draws_any_of_its_queries(root, program, tmp_path):
+    run = root / "runs" / "mine" / HASH
+    code, text, err = program("inspect", run)
+    assert code == 0, err
+    assert "absent accepted" in text
+    assert re.search(r"failures in \d+ queries, \d+ of them under stress", text)
+    assert not (tmp_path / "out").exists()
+    query = task_files.read_ids(root / "tasks" / "alias" / "town-grid+alias")[2]
+    code, text, err = program("inspect", run, "--query", query[:10], "--out", tmp_path / "mine")
+    assert code == 0, err
+    path = Path(text.removeprefix("picture: ").strip())
+    assert path == tmp_path / "mine" / "sheets" / f"mine-{query}.png"
+    assert cv2.imread(str(path)).shape[2] == 3
+    one = path.read_bytes()
+    assert program("inspect", run / "alias" / "town-grid+alias", "--query", query, "--out", tmp_path / "mine")[0] == 0
+    assert path.read_bytes() == one
+
+
+def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_path):
+    run = root / "runs" / "mine" / HASH
+
+    def fault(*words):
+        code, _, err = program("inspect", *words)
+        assert code == 2, err
+        assert "\n" not in err.strip().splitlines()[-1]
+        return err
+
+    assert "was asked no query 'zz'; 'inspect " in fault(run, "--query", "zz")
+    assert "lists some that went wrong" in fault(run, "--query", "zz")
+    known = task_files.read_ids(root / "tasks" / "alias" / "town-grid+alias")[0]
+    assert f"did you mean {known}?" in fault(run, "--query", known[:-1] + "z")
+    assert "--query is empty: name the beginning of an id" in fault(run, "--query", "")
+    assert "draws a query of a task or a run" in fault("crossfit", "--query", known)
+    assert "queries begin with" in fault(run, "--query", next(_beginnings(root)))
+    out = shutil.copytree(root, tmp_path / "out", symlinks=True)
+    for kind in ("tasks", "truth"):
+        (out / kind).unlink()
+        shutil.copytree(root / kind, out / kind)
+    mine = out / "runs" / "mine" / HASH / "alias" / "town-grid+alias"
+    query = task_files.read_ids(out / "tasks" / "alias" / "town-grid+alias")[0]
+    rows = dict.fromkeys(task_files.read_ids(out / "tasks" / "alias" / "town-grid+alias"), "f" * 64)
+    old = prediction_files.read_answers(
+        mine, task_files.read_asked(out / "tasks" / "alias" / "town-grid+alias")
+    ).found.values()
+    for part in prediction_files.parts_of(mine):
+        part.unlink()
+    prediction_files.write_part(mine, list(old), asked=rows)
+    assert "was drawn anew since" in fault(mine, "--query", query)
+    shutil.rmtree(out / "truth" / "alias")
+    assert "holds no truths of" in fault(mine, "--query", query)
+    shutil.rmtree(out / "tasks" / "alias")
+    assert "holds no task.json: make the queries first" in fault(mine)
+    (out / "regions").unlink()
+    there = task_files.read_ids(out / "tasks" / "absent" / "town-riverside")[0]
+    assert "holds no region.json: build the region first" in fault(out / "runs" / "mine" / HASH, "--query", there)
+
+
+def _beginnings(root):
+    """First letters that several ids share."""
+    names = [name for asked in ASKED for name in task_files.read_ids(root / "tasks" / asked[0] / asked[1])]
+    return (name[0] for name in names if sum(other[0] == name[0] for other in names) > 1)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stored results: they are of the file that is registered, small, and the page about them says what they say."""
+
+import json
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
+from sasgeo_bench.publishing.archive import stored_settings
+from sasgeo_bench.publishing.archive_file import MOST_BYTES
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+BOARDS = sorted(folder.name for folder in RESULTS.glob("*/") if folder.is_dir())
+PROGRAM = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.DOTALL)
+ROW = re.compile(r"^\|(?!---).*\|$", re.MULTILINE)
+
+pytestmark = pytest.mark.skipif(not BOARDS, reason="no results are stored yet")
+
+
+def test_there_are_results_of_the_registered_experiment():
+    assert "leaderboard" in BOARDS
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_results_are_of_the_pipeline_as_it_is_registered(name):
+    spec = read_pipeline_file(find_pipeline_file(name))
+    assert stored_settings([RESULTS / name]).pipeline == {"id": name, "sha256": spec.sha256}
+    said = json.loads((RESULTS / name / "board.json").read_text(encoding="utf-8"))
+    assert {entry["name"] for entry in said["entries"]} >= set(spec.matchers) - {"oracle_pose"}
+
+
+def test_results_are_small():
+    assert sum(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < len(BOARDS) * MOST_BYTES
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_all_controls_held(name):
+    assert pd.read_parquet(RESULTS / name / "controls.parquet")["holds"].all()
+
+
+def test_every_row_of_a_table_on_the_page_stands_on_a_board():
+    boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
+    rows = ROW.findall((RESULTS / "README.md").read_text(encoding="utf-8"))
+    assert len(rows) > len(BOARDS)
+    assert [row for row in rows if row not in boards] == []
+
+
+def test_every_program_on_the_page_prints_what_the_page_says(monkeypatch, capsys):
+    monkeypatch.chdir(RESULTS.parents[1])
+    found = PROGRAM.findall((RESULTS / "README.md").read_text(encoding="utf-8"))
+    assert len(found) > 1
+    for program, said in found:
+        exec(program, {})  # noqa: S102 - of our own page
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == said.splitlines()

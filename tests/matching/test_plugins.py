@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plugins are found by name or by module:Class; a clash is told, and whatever is wrong with one fits in a line."""
+
+import importlib
+import sys
+import warnings
+from importlib.metadata import distribution
+
+import pytest
+
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.matcher import MatcherCard
+from sasgeo_bench.matching.plugins import (
+    BUILT_IN,
+    MATCHERS,
+    check_card_name,
+    check_names,
+    list_entry_points,
+    load_matcher,
+)
+
+SOUND = """
+from sasgeo_bench.matching.matcher import WITHHELD, MatcherCard
+
+SAID = {"version": "1", "title": "T", "source": "original", "ours": "all", "licence": "MIT"}
+
+
+class Sound:
+    card = MatcherCard(name="sound", tracks=("localization",), **SAID)
+
+    def prepare(self, region, learned):
+        pass
+
+    def match(self, query, *, top_k):
+        return WITHHELD
+"""
+FAULTY = f"""{SOUND}
+
+class Raises(Sound):
+    def __init__(self):
+        raise RuntimeError("no weights here:\\n  fetch them first")
+
+
+class WantsMore(Sound):
+    def __init__(self, weights):
+        self.weights = weights
+
+
+class Leaves(Sound):
+    def __init__(self):
+        raise SystemExit(0)
+
+
+class CannotTell(Sound):
+    def __init__(self):
+        class Mute(Exception):
+            def __str__(self):
+                raise RuntimeError
+
+        raise Mute
+
+
+class CardRaises(Sound):
+    @property
+    def card(self):
+        raise SystemExit(0)
+
+
+class NoVerbs:
+    card = Sound.card
+
+
+class NoMatch:
+    card = Sound.card
+    prepare = Sound.prepare
+
+
+class MatchIsNoVerb(Sound):
+    match = "here"
+
+
+class NoCard:
+    prepare = Sound.prepare
+    match = Sound.match
+
+
+class CardIsADict(Sound):
+    card = {{"name": "sound"}}
+
+
+class NoLicence(Sound):
+    def __init__(self):
+        self.card = MatcherCard(name="mine", tracks=("localization",), **(SAID | {{"licence": ""}}))
+
+
+a_number = 3
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Put a distribution with entry points and modules on the import path, in front of all others."""
+    modules = set(sys.modules)
+
+    def put(name: str, points: dict[str, str], **sources: str) -> None:
+        folder = tmp_path / name
+        about = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+        about.mkdir(parents=True)
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        lines = [f"[{MATCHERS}]", *(f"{point} = {value}" for point, value in points.items())]
+        (about / "entry_points.txt").write_text("\n".join(lines) + "\n")
+        for module, text in sources.items():
+            (folder / f"{module}.py").write_text(text)
+        monkeypatch.syspath_prepend(str(folder))
+        assert distribution(name).metadata["Name"] == name
+
+    yield put
+    for module in set(sys.modules) - modules:
+        del sys.modules[module]
+    importlib.invalidate_caches()
+
+
+@pytest.fixture
+def own(install):
+    """A package of faulty matchers, in module `mine`; the baselines, whatever is installed, are one sound matcher."""
+    install(BUILT_IN, {"raster_uniform": "built_in:Sound"}, built_in=SOUND)
+    return lambda **points: install("x-own", points, mine=FAULTY)
+
+
+def refusal(spec: str) -> str:
+    """The one line that a matcher is refused with."""
+    with pytest.raises(MatchError) as refused:
+        load_matcher(spec)
+    text = str(refused.value)
+    assert "\n" not in text
+    return text
+
+
+# --- by name --------------------------------------------------------------------------------------------------------
+
+
+def test_a_matcher_is_made_by_its_name_and_listed_with_where_it_comes_from(own) -> None:
+    own(mine="mine:Sound", another="mine:Sound")
+    made = load_matcher("mine")
+    assert (type(made).__module__, type(made).__name__) == ("mine", "Sound")
+    assert isinstance(made.card, MatcherCard)
+    points = list_entry_points()
+    assert {"mine": "x-own", "another": "x-own", "raster_uniform": BUILT_IN}.items() <= {
+        name: point.dist.name for name, point in points.items()
+    }.items()
+    assert list(points) == sorted(points)
+
+
+@pytest.mark.parametrize("ours", ["sasgeo-bench", BUILT_IN])
+def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, ours) -> None:
+    # By name alone the outsider would come first, by the place on the import path too.
+    install(ours, {"shared": "built_in:Sound"}, built_in=SOUND)
+    install("an-outsider", {"shared": "outside:Sound"}, outside=SOUND)
+    with pytest.warns(UserWarning, match="two plugins are named 'shared'") as told:
+        points = list_entry_points()
+    assert points["shared"].value == "built_in:Sound"
+    (said,) = (str(item.message) for item in told)
+    assert f"{ours} is used, an-outsider (outside:Sound) is not" in said
+    with pytest.warns(UserWarning, match="two plugins"):
+        assert type(load_matcher("shared")).__module__ == "built_in"
+
+
+@pytest.mark.parametrize("order", [("b-second", "a-first"), ("a-first", "b-second")])
+def test_of_two_outsiders_with_one_name_neither_is_used_and_one_line_names_both(install, order) -> None:
+    for name in order:
+        module = name.replace("-", "_")
+        install(name, {"mine": f"{module}:Sound"}, **{module: SOUND})
+    install("x-own", {"other": "other:Sound"}, other=SOUND)
+    words = "two plugins are named 'mine': a-first (a_first:Sound) and b-second (b_second:Sound), so neither is used"
+    warnings.simplefilter("ignore")
+    assert refusal("mine").startswith(words)
+    with pytest.raises(MatchError, match="two plugins are named 'mine'"):
+        check_names(matchers=["mine"])
+    assert type(load_matcher("other")).__module__ == "other"  # which costs nobody else
+    assert type(load_matcher("b_second:Sound")).__module__ == "b_second"
+
+
+@pytest.mark.parametrize("name", ["fft_vote", "oracle_pose", "sasgeo"])
+def test_a_matcher_of_others_whose_card_bears_a_shipped_name_is_refused(name) -> None:
+    for spec in ("mine:Matcher", "sasgeo_bench_mine:Matcher", "mine"):
+        with pytest.raises(
+            MatchError, match=f"^{spec}: its card is named '{name}', as a matcher that ships: rename it$"
+        ):
+            check_card_name(spec, name)
+    check_card_name("mine:Matcher", "mine")
+    check_card_name("sasgeo_baselines.fft_vote:FftVote", "fft_vote")
+    check_card_name("fft_vote", "fft_vote")
+
+
+def test_every_one_of_three_that_loses_is_told(install) -> None:
+    for name in ("a-first", "b-second", "c-third"):
+        install(name, {"mine": f"{name[0]}:Sound"})
+    with pytest.warns(UserWarning, match="two plugins") as told:
+        assert list_entry_points()["mine"].value == "a:Sound"
+    assert ["b-second" in str(item.message) for item in told] == [True, False]
+    assert ["c-third" in str(item.message) for item in told] == [False, True]
+
+
+def test_one_matcher_that_two_packages_name_alike_is_no_clash(install) -> None:
+    install("a-first", {"mine": "shared:Sound"}, shared=SOUND)
+    install("b-second", {"mine": "shared:Sound"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert list_entry_points()["mine"].dist.name == "a-first"
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("no_such_module:Sound", "cannot be imported (ModuleNotFoundError: No module named 'no_such_module')"),
+        ("mine:NoSuchClass", "cannot be imported (AttributeError: module 'mine' has no attribute 'NoSuchClass')"),
+        ("broken:Sound", "cannot be imported (SyntaxError: "),
+        ("raises:Sound", "cannot be imported (OSError: weights.bin is missing)"),
+        ("this is : no value!", "cannot be imported ("),
+        ("mine", "cannot be made (TypeError: 'module' object is not callable)"),
+        ("mine:a_number", "cannot be made (TypeError: 'int' object is not callable)"),
+        ("mine:Raises", "cannot be made (RuntimeError: no weights here: fetch them first)"),
+        ("leaves:Sound", "cannot be imported (SystemExit: 0)"),
+        ("mine:Leaves", "cannot be made (SystemExit: 0)"),
+        ("mine:CannotTell", "cannot be made (Mute)"),
+        ("mine:CardRaises", "its card and verbs cannot be read (SystemExit: 0)"),
+        ("mine:WantsMore", "cannot be made (TypeError: "),
+        ("mine:NoVerbs", "NoVerbs is not a matcher, it has no prepare and no match"),
+        ("mine:NoMatch", "NoMatch is not a matcher, it has no match"),
+        ("mine:MatchIsNoVerb", "MatchIsNoVerb is not a matcher, it has no match"),
+        ("mine:NoCard", "card is a NoneType, expected a sasgeo_bench.matching.matcher.MatcherCard"),
+        ("mine:CardIsADict", "card is a dict, expected a sasgeo_bench.matching.matcher.MatcherCard"),
+        ("mine:NoLicence", "cannot be made (MatchError: card: licence is empty, say it in one line)"),
+    ],
+)
+def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, words) -> None:
+    own(wrong=value, right="mine:Sound")
+    install(
+        "z-broken",
+        {},
+        broken="def (",
+        raises='raise OSError("weights.bin is\\n missing")',
+        leaves="raise SystemExit(0)",
+    )
+    told = refusal("wrong")
+    assert told.startswith("wrong: ")
+    assert words in told
+    if "imported" in words:
+        assert f"{value} of x-own" in told
+    # One that is broken costs the others nothing.
+    assert load_matcher("right").card.name == "sound"
+    assert "wrong" in list_entry_points()
+
+
+@pytest.mark.parametrize("name", ["rastr_uniform", "raster-uniform", "raster_uniforms"])
+def test_a_misspelt_name_gets_a_proposal(own, name) -> None:
+    own()
+    told = refusal(name)
+    assert f"there is no matcher {name!r}, did you mean 'raster_uniform'?" in told
+    assert "list-matchers" in told
+
+
+@pytest.mark.parametrize("name", ["", "something-else-altogether", "../x", "two\nlines"])
+def test_a_name_like_no_other_gets_none(own, name) -> None:
+    own()
+    told = refusal(name)
+    assert f"there is no matcher {name!r}" in told
+    assert "did you mean" not in told
+    assert "module:Class" in told
+
+
+# --- module:Class ---------------------------------------------------------------------------------------------------
+
+
+def test_a_class_of_a_module_needs_no_entry_point(own) -> None:
+    own()
+    assert type(load_matcher("mine:Sound")).__name__ == "Sound"
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("no_such_module:Sound", "No module named 'no_such_module'"),
+        ("mine.inner:Sound", "No module named 'mine.inner'"),
+        ("mine:NoSuchClass", "module 'mine' has no attribute 'NoSuchClass'"),
+        ("mine:sound", "module 'mine' has no attribute 'sound'"),
+        (":", "cannot be imported"),
+        ("mine:", "module 'mine' has no attribute ''"),
+        (":Sound", "cannot be imported"),
+        ("mine:Sound:Sound", "cannot be imported"),
+        ("mine:Sound.inner", "cannot be imported"),
+        (".mine:Sound", "cannot be imported"),
+        ("../mine:Sound", "cannot be imported"),
+        ("mine.py:Sound", "cannot be imported"),
+        ("mine:Raises", "cannot be made (RuntimeError: no weights here: fetch them first)"),
+        ("mine:Leaves", "cannot be made (SystemExit: 0)"),
+        ("mine:NoCard", "card is a NoneType"),
+        ("mine:NoVerbs", "it has no prepare and no match"),
+        ("json:dumps", "cannot be made"),
+    ],
+)
+def test_what_is_wrong_with_a_module_or_a_class_is_told_in_one_line(own, spec, words) -> None:
+    own()
+    told = refusal(spec)
+    assert told.startswith(f"{spec}: ")
+    assert words in told
+
+
+@pytest.mark.parametrize("kind", ["matcher", "rejector"])
+def test_names_are_checked_without_an_import(kind):
+    check_names(**{f"{kind}s": ["no_such_module:Class"]})
+    with pytest.raises(MatchError, match=f"there is no {kind} 'nobody'"):
+        check_names(**{f"{kind}s": ["nobody"]})

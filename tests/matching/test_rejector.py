@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The door of rejectors: what is no rejector, and what is no probability, is refused in one line."""
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.bounds import one_line
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.plugins import load_rejector
+from sasgeo_bench.matching.rejector import Rejector, RejectorCard, check_p_false
+from sasgeo_bench.matching.results import Prediction
+
+SAID = {"name": "half", "version": "1", "title": "Half", "source": "original", "ours": "all", "licence": "MIT"}
+
+
+class Half:
+    """Says one half of everything."""
+
+    card = RejectorCard(**SAID)
+
+    def fit(self, predictions, is_false):
+        assert len(predictions) == len(is_false)
+
+    def p_false(self, predictions):
+        return np.full(len(predictions), 0.5)
+
+
+class NoVerbs:
+    card = RejectorCard(**SAID)
+
+
+class NoCard:
+    card = None
+
+    def fit(self, predictions, is_false): ...
+
+    def p_false(self, predictions): ...
+
+
+class Raises:
+    def __init__(self):
+        message = "first line\nsecond line"
+        raise ValueError(message)
+
+
+def test_a_rejector_is_found_by_module_and_class():
+    rejector = load_rejector(f"{__name__}:Half")
+    assert isinstance(rejector, Rejector)
+    rejector.fit([Prediction(query_id="a")], np.array([True]))
+    assert check_p_false(rejector.p_false([Prediction(query_id="a")]), 1).tolist() == [0.5]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("NoVerbs", "NoVerbs is not a rejector, it has no fit and no p_false"),
+        ("NoCard", "card is a NoneType, expected a sasgeo_bench.matching.rejector.RejectorCard"),
+        ("Raises", "cannot be made .*ValueError: first line second line"),
+        ("Missing", "cannot be imported"),
+    ],
+)
+def test_what_is_no_rejector_is_refused(name, words):
+    with pytest.raises(MatchError, match=words):
+        load_rejector(f"{__name__}:{name}")
+
+
+def test_an_unknown_name_says_where_the_names_are():
+    with pytest.raises(MatchError, match=r"there is no rejector 'halv'.*list-rejectors shows all"):
+        load_rejector("halv")
+
+
+@pytest.mark.parametrize(("field", "value"), [("licence", " "), ("source", ""), ("name", "Half"), ("name", "a b")])
+def test_a_card_that_does_not_say_enough_is_refused(field, value):
+    with pytest.raises(MatchError, match=f"card: {field}"):
+        RejectorCard(**(SAID | {field: value}))
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        ([0.5], r"shape \(1,\), expected \(2,\)"),
+        ([[0.5, 0.5]], r"shape \(1, 2\), expected \(2,\)"),
+        ([0.5, 1.5], "1.5 in place 1, expected 0..1"),
+        ([-0.1, 0.5], "-0.1 in place 0"),
+        ([0.5, float("nan")], "nan in place 1"),
+        (None, r"shape \(\), expected \(2,\)"),
+        (["a", "b"], "returned list, expected 2 numbers"),
+    ],
+)
+def test_what_is_no_probability_is_refused_with_found_and_expected(found, words):
+    with pytest.raises(MatchError, match=words):
+        check_p_false(found, 2)
+
+
+@pytest.mark.parametrize("said", ["two\nlines", "\x1b[31mred", "x" * 4001])
+def test_a_card_is_one_printable_line(said):
+    with pytest.raises(MatchError, match="card: title must be one line of at most 4000 printable characters"):
+        RejectorCard(**(SAID | {"title": said}))
+
+
+def test_a_message_cannot_steer_a_terminal():
+    assert one_line("\x1b[2Jgone\a\nnext") == "?[2Jgone? next"

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mapped area: estimated from the data, bounded by the header, overruled by the region file."""
+
+import numpy as np
+import pytest
+import shapely
+
+from sasgeo_bench.osm.coverage import choose_coverage, estimate_coverage
+
+M_PER_DEG = 111_320.0
+COS_LATITUDE = float(np.cos(np.radians(47.0)))
+
+
+def lonlat_of(metres):
+    """Metres around 9 E, 47 N -> longitude and latitude."""
+    east, north = np.asarray(metres, dtype=float).T
+    return np.column_stack((9.0 + east / M_PER_DEG / COS_LATITUDE, 47.0 + north / M_PER_DEG))
+
+
+def metres_of(geometry):
+    return shapely.transform(geometry, lambda at: (at - [9.0, 47.0]) * [M_PER_DEG * COS_LATITUDE, M_PER_DEG])
+
+
+def scattered(shape, count=6000, seed=1):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-6000, 6000, (count * 3, 2))
+    return lonlat_of(points[shapely.contains_xy(shape, points)])
+
+
+COUNTRY = shapely.Polygon([(-4000, -3000), (3000, -4000), (4500, 1000), (0, 4000), (-4500, 2000)])
+
+
+def test_the_estimate_follows_an_outline_within_two_cells():
+    found = metres_of(estimate_coverage(scattered(COUNTRY)))
+    assert shapely.contains(found, shapely.buffer(COUNTRY, -300))
+    assert shapely.contains(shapely.buffer(COUNTRY, 300), found)
+
+
+def test_a_lake_within_is_covered_and_a_road_kept_whole_beyond_the_edge_is_not():
+    lake = shapely.Point(0, 0).buffer(1200)
+    road = lonlat_of([(4000 + step, 500) for step in range(0, 4000, 40)])
+    found = metres_of(estimate_coverage(np.concatenate((scattered(COUNTRY - lake), road))))
+    assert shapely.contains_xy(found, 0, 0)
+    assert not shapely.contains_xy(found, 7000, 500)
+
+
+def test_leftovers_of_relations_far_away_are_cut_off():
+    island = lonlat_of([(20_000 + 40 * step, 40 * step) for step in range(5)])
+    found = estimate_coverage(np.concatenate((scattered(COUNTRY), island)))
+    assert metres_of(found).bounds[2] < 6000
+
+
+def test_an_extract_cut_by_a_box_has_the_box_of_its_header():
+    square = shapely.box(-4000, -4000, 4000, 4000)
+    west, south = lonlat_of([(-4000, -4000)])[0]
+    east, north = lonlat_of([(4000, 4000)])[0]
+    area, source = choose_coverage(scattered(square), stated=None, header_box=(west, south, east, north))
+    assert source == "header box"
+    assert area.bounds == pytest.approx((west, south, east, north))
+
+
+def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
+    triangle = shapely.Polygon([(-4000, -4000), (4000, -4000), (4000, 4000)])
+    west, south = lonlat_of([(-4000, -4000)])[0]
+    east, north = lonlat_of([(4000, 4000)])[0]
+    area, source = choose_coverage(scattered(triangle), stated=None, header_box=(west, south, east, north))
+    assert source == "estimated"
+    assert not shapely.contains_xy(metres_of(area), -2500, 2500)
+    assert shapely.contains(shapely.box(west, south, east, north), area)
+
+
+def test_what_the_region_file_states_overrules_all():
+    stated = shapely.box(9, 47, 9.01, 47.01)
+    assert choose_coverage(scattered(COUNTRY), stated=stated, header_box=(8, 46, 10, 48)) == (stated, "region file")
+
+
+def test_no_data_covers_nothing():
+    assert estimate_coverage(np.zeros((0, 2))).is_empty

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines that close: walls, hedges, railways and waterways around something are outlines of it, not areas."""
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.layers import PRESENT, burn_layers, make_paint
+
+GRID = Grid(epsg=32632, west_m=499_900.0, north_m=5_205_400.0, cell_size_m=1.0, rows=400, cols=400)
+SIDE_M, HOLE_M = 100.0, 20.0
+
+LINE_VALUES = [
+    (rule.key, value, rule.widths[value], item.name, rule.key == "highway")
+    for item in load_taxonomy().classes
+    for rule in item.rules
+    if rule.geometry == "line" and rule.key != "bridge"
+    for value in (next(iter(rule.widths)), "city_wall", "retaining_wall")
+    if value in rule.widths
+]
+
+
+def square(tmp_path, tags, *, as_relation):
+    """A square of 100 m with a yard of 20 m, as a closed way (the outer ring alone) or as a multipolygon."""
+    rings = [(-SIDE_M / 2, SIDE_M / 2), (-HOLE_M / 2, HOLE_M / 2)]
+    nodes, ways = [], []
+    for ring, (low, high) in enumerate(rings):
+        for corner, (x, y) in enumerate(((low, low), (high, low), (high, high), (low, high))):
+            place = f'lat="{47 + y / 111_175:.7f}" lon="{9.001 + x / 76_030:.7f}"'
+            nodes.append(f'<node id="{4 * ring + corner + 1}" version="1" {place}/>')
+        refs = "".join(f'<nd ref="{4 * ring + corner + 1}"/>' for corner in (0, 1, 2, 3, 0))
+        own = "" if as_relation or ring else "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        ways.append(f'<way id="{ring + 1}" version="1">{refs}{own}</way>')
+    said = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in ({"type": "multipolygon"} | tags).items())
+    members = '<member type="way" ref="1" role="outer"/><member type="way" ref="2" role="inner"/>'
+    relation = f'<relation id="1" version="1">{members}{said}</relation>' if as_relation else ""
+    path = tmp_path / "square.osm"
+    box = "<bounds minlat='46.99' minlon='8.99' maxlat='47.01' maxlon='9.01'/>"
+    path.write_text(f"<osm version='0.6'>{box}" + "\n".join([*nodes, *ways, relation]) + "</osm>")
+    return path
+
+
+def drawn_m2(tmp_path, tags, name, *, as_relation):
+    reading = read_extract(square(tmp_path, tags, as_relation=as_relation), GRID, stated_coverage=None)
+    return float(reading.features.geometry.area[reading.features["class"] == name].sum()), reading
+
+
+@pytest.mark.parametrize(("key", "value", "width_m", "name", "is_filled"), LINE_VALUES)
+@pytest.mark.parametrize("as_relation", [False, True], ids=["closed way", "multipolygon"])
+def test_a_line_that_closes_is_filled_where_it_says_so_and_squares_are(
+    key, value, width_m, name, is_filled, as_relation, tmp_path
+):
+    solid_m2 = SIDE_M**2 - as_relation * HOLE_M**2
+    area_m2, reading = drawn_m2(tmp_path, {key: value}, name, as_relation=as_relation)
+    assert area_m2 == pytest.approx(solid_m2 if is_filled and as_relation else 0.0, rel=0.01)
+    if not area_m2:
+        ring_m = 4 * SIDE_M + as_relation * 4 * HOLE_M
+        (line,) = reading.features[reading.features["class"] == name].itertuples()
+        assert line.geometry.length == pytest.approx(ring_m, rel=0.01)
+        assert line.width_m == pytest.approx(width_m)
+    filled_m2, _ = drawn_m2(tmp_path, {key: value, "area": "yes"}, name, as_relation=as_relation)
+    assert filled_m2 == pytest.approx(solid_m2, rel=0.01)
+
+
+@pytest.mark.parametrize("as_relation", [False, True], ids=["closed way", "multipolygon"])
+@pytest.mark.parametrize(
+    ("tags", "width_m"),
+    [
+        ({"barrier": "city_wall", "width": "6"}, 6.0),
+        ({"barrier": "retaining_wall", "width": "1.5 m"}, 1.5),
+        ({"barrier": "hedge", "width": "6"}, 1.5),
+        ({"barrier": "fence", "width": "6"}, 0.5),
+        ({"natural": "tree_row", "width": "9"}, 4.0),
+    ],
+)
+def test_walls_of_a_town_and_of_terraces_keep_a_stated_width(tags, width_m, as_relation, tmp_path):
+    reading = read_extract(square(tmp_path, tags, as_relation=as_relation), GRID)
+    assert reading.features["width_m"].tolist() == [pytest.approx(width_m)]
+
+
+def test_a_fortress_whose_wall_is_a_multipolygon_is_no_solid_block(tmp_path):
+    reading = read_extract(square(tmp_path, {"barrier": "city_wall"}, as_relation=True), GRID)
+    names = load_taxonomy().names
+    cells = burn_layers(make_paint(reading.features, names, reading.coverage), GRID)[names.index("field_boundary")]
+    assert 0 < (cells == PRESENT).sum() < 1200
+
+
+def test_a_fenced_relation_is_an_area_and_a_fence(tmp_path):
+    tags = {"landuse": "meadow", "barrier": "fence"}
+    found = read_extract(square(tmp_path, tags, as_relation=True), GRID).features
+    assert sorted(found["class"]) == ["field_boundary", "green"]
+    assert found.set_index("class").loc["field_boundary", "width_m"] == np.float32(0.5)

@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading: Toytown counted by hand, every format, every damage, and real extracts against a second small reader."""
+
+import bz2
+import datetime as dt
+import gzip
+import random
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+
+import numpy as np
+import osmium
+import pandas as pd
+import pytest
+import shapely
+from osmium.osm.mutable import Node, Way
+
+from sasgeo_bench.errors import CoverageError, ExtractError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.features import fingerprint
+from sasgeo_bench.osm.mapped import project
+from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.scan import reaches
+from sasgeo_bench.osm.snapshot import open_snapshot
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+
+
+@pytest.fixture(scope="module")
+def reading(toytown, toygrid):
+    return read_extract(toytown, toygrid)
+
+
+def row(reading, osm_id, name):
+    table = reading.features
+    found = table[(table["osm_id"] == osm_id) & (table["class"] == name)]
+    assert len(found) == 1
+    return found.iloc[0]
+
+
+def test_the_classes_are_those_counted_by_hand(reading):
+    assert reading.features["class"].value_counts().to_dict() == {
+        "road_major": 2,
+        "road_minor": 5,
+        "path_track": 3,
+        "railway": 1,
+        "building": 7,
+        "water": 1,
+        "waterway": 3,
+        "coastline": 1,
+        "green": 2,
+        "farmland": 1,
+        "field_boundary": 4,
+        "bridge": 2,
+        "parking": 2,
+    }
+    assert set(reading.features["class"]) == set(load_taxonomy().names)
+
+
+def test_what_is_not_used_is_counted_by_reason(reading):
+    assert reading.drops == {
+        "open way with the area key 'building', anywhere in the extract": 1,
+        "no rule for highway=proposed": 1,
+        "no rule for highway=services": 1,
+        "no rule for railway=abandoned": 1,
+        "no rule for building=no": 1,
+        "no rule for landuse=residential": 1,
+        "area=no on an area class": 1,
+        "way with fewer than two different nodes": 1,
+        "building relation whose outline is a building itself": 1,
+        "relation with no closed ring left": 1,
+    }
+
+
+def test_what_lies_below_ground_is_kept_but_not_visible(reading):
+    hidden = reading.features.loc[~reading.features["is_visible"], "osm_id"]
+    assert sorted(hidden) == [104, 115, 122, 137, 140]
+    assert reading.hidden == {
+        "tunnel=yes": 1,
+        "tunnel=culvert": 1,
+        "layer < 0": 1,
+        "location=underground": 1,
+        "parking=underground": 1,
+    }
+    assert row(reading, 104, "road_minor")["is_tunnel"]
+    assert not row(reading, 140, "path_track")["is_tunnel"]
+
+
+def test_widths_come_from_tags_where_they_say_something(reading):
+    widths = {osm_id: float(row(reading, osm_id, name)["width_m"]) for osm_id, name in (
+        (101, "road_major"), (102, "road_minor"), (102, "bridge"), (103, "road_minor"), (105, "road_minor"),
+        (106, "path_track"), (113, "waterway"), (134, "field_boundary"),
+    )}  # fmt: skip
+    assert widths == {101: 6.5, 102: 6.5, 103: 5.5, 105: 3.5, 106: 4.5, 113: 12.0, 134: 1.5}
+
+
+def test_a_bridge_keeps_its_layer(reading):
+    for name in ("road_minor", "bridge"):
+        found = row(reading, 102, name)
+        assert found["is_bridge"]
+        assert found["level"] == 1
+
+
+def test_a_roundabout_is_a_line_and_a_square_an_area(reading):
+    assert row(reading, 107, "road_major").geometry.geom_type == "LineString"
+    assert row(reading, 108, "road_minor").geometry.geom_type == "Polygon"
+    assert np.isnan(row(reading, 108, "road_minor")["width_m"])
+
+
+def test_a_hole_is_a_hole(reading):
+    assert abs(row(reading, 301, "green").geometry.area - 4400) < 10
+
+
+def test_a_fenced_meadow_is_an_area_and_a_fence(reading):
+    assert row(reading, 131, "green").geometry.geom_type == "Polygon"
+    assert row(reading, 131, "field_boundary")["width_m"] == 0.5
+    assert row(reading, 132, "field_boundary")["width_m"] == 1.0
+
+
+def test_what_misses_nodes_or_members_is_mended_and_counted(reading):
+    assert reading.notes == {
+        "way with nodes missing: the rest was kept": 2,
+        "closed way broken or cut at the clip edge: its closed rings were kept": 1,
+        "relation broken or cut at the clip edge: its closed rings were kept": 1,
+    }
+    assert abs(row(reading, 125, "building").geometry.area - 60) < 1
+    assert abs(row(reading, 302, "building").geometry.area - 1600) < 5
+    assert abs(row(reading, 128, "path_track").geometry.length - 30) < 0.2
+
+
+def test_a_building_relation_counts_once(reading):
+    assert row(reading, 303, "building")["osm_type"] == "relation"
+    assert 304 not in set(reading.features["osm_id"])
+    assert row(reading, 205, "building")["osm_type"] == "way"
+
+
+def test_versions_and_times_are_kept_and_missing_ones_are_nat(reading):
+    assert row(reading, 101, "road_major")["version"] == 2
+    assert row(reading, 101, "road_major")["timestamp"] == pd.Timestamp("2021-05-06T07:08:09Z")
+    assert pd.isna(row(reading, 126, "building")["timestamp"])
+
+
+def test_two_ways_with_a_common_node_have_exactly_equal_coordinates(reading):
+    ends = row(reading, 102, "road_minor").geometry.coords[-1], row(reading, 103, "road_minor").geometry.coords[0]
+    assert ends[0] == ends[1]
+
+
+def to_pbf(source, target):
+    with osmium.SimpleWriter(str(target)) as writer:
+        for item in osmium.FileProcessor(str(source)):
+            writer.add(item)
+    return target
+
+
+def test_every_format_gives_the_same_features(toytown, toygrid, reading, tmp_path):
+    text = toytown.read_bytes()
+    (tmp_path / "t.osm.gz").write_bytes(gzip.compress(text))
+    (tmp_path / "t.osm.bz2").write_bytes(bz2.compress(text))
+    (tmp_path / "misnamed.osm.pbf").write_bytes(gzip.compress(text))
+    to_pbf(toytown, tmp_path / "t.osm.pbf")
+    for path in sorted(tmp_path.iterdir()):
+        again = read_extract(path, toygrid)
+        pd.testing.assert_frame_equal(again.features, reading.features)
+        assert again.drops == reading.drops
+
+
+def test_the_order_of_elements_does_not_matter(toytown, toygrid, reading, tmp_path):
+    tree = ET.parse(toytown)  # noqa: S314 - our own file
+    root = tree.getroot()
+    elements = [item for item in root if item.tag in ("node", "way", "relation")]
+    for item in elements:
+        root.remove(item)
+    random.Random(5).shuffle(elements)  # noqa: S311 - an order, not a secret
+    root.extend(elements)
+    tree.write(tmp_path / "shuffled.osm")
+    again = read_extract(tmp_path / "shuffled.osm", toygrid)
+    pd.testing.assert_frame_equal(again.features, reading.features)
+    assert "out of order" in again.warnings[0]
+
+
+def test_a_grid_elsewhere_is_refused_with_what_is_covered(toytown):
+    far = Grid(epsg=32632, west_m=600_000.0, north_m=5_205_800.0, cell_size_m=1.0, rows=100, cols=100)
+    with pytest.raises(CoverageError, match=r"outside toytown\.osm, which covers \[9\.0000"):
+        read_extract(toytown, far)
+
+
+def test_a_grid_with_nothing_in_it_is_refused(toytown):
+    empty = Grid(epsg=32632, west_m=500_070.0, north_m=5_205_480.0, cell_size_m=1.0, rows=5, cols=5)
+    with pytest.raises(CoverageError, match="no element of any class"):
+        read_extract(toytown, empty)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.osm.pbf", b"hello, this is text", "holds no OSM data"),
+        ("a.osm.pbf", b"", "is empty"),
+        ("a.txt", b"x", "of no known format"),
+        ("a.osm", b"<osm version='0.6'><node id='1' lat='0' lon='0'/>", "cannot be read"),
+        ("a.osm.pbf", b"\x00\x00\x00\x0d\n\tOSMHeader junk", "cannot be read"),
+    ],
+)
+def test_a_file_that_is_no_extract_is_told_in_one_line(name, content, words, toygrid, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ExtractError, match=words) as caught:
+        read_extract(tmp_path / name, toygrid)
+    assert "\n" not in str(caught.value)
+    assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9, 0.99])
+def test_a_file_cut_short_is_told(share, toytown, toygrid, tmp_path):
+    content = to_pbf(toytown, tmp_path / "whole.osm.pbf").read_bytes()
+    (tmp_path / "cut.osm.pbf").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ExtractError, match=r"cut\.osm\.pbf cannot be read"):
+        read_extract(tmp_path / "cut.osm.pbf", toygrid)
+
+
+def write_history(path):
+    """A road that appears in 2015, is moved in 2017 and deleted in 2019, and a house that stays."""
+    day = {year: dt.datetime(year, 6, 1, tzinfo=dt.UTC) for year in range(2010, 2021)}
+    with osmium.SimpleWriter(str(path)) as writer:
+        for number, (x, y) in enumerate([(0, 0), (9, 0), (9, 9), (0, 9), (50, 0), (90, 0)], start=1):
+            place = (9.0 + x * 1e-5, 47.0 + y * 1e-5)
+            writer.add_node(Node(id=number, version=1, visible=True, timestamp=day[2010], location=place))
+            if number == 6:
+                moved = (place[0] + 1e-3, place[1])
+                writer.add_node(Node(id=6, version=2, visible=True, timestamp=day[2017], location=moved))
+        house = {"building": "yes"}
+        writer.add_way(Way(id=1, version=1, visible=True, timestamp=day[2010], nodes=[1, 2, 3, 4, 1], tags=house))
+        road = {"highway": "residential"}
+        writer.add_way(Way(id=2, version=1, visible=True, timestamp=day[2015], nodes=[5, 6], tags=road))
+        writer.add_way(Way(id=2, version=2, visible=False, timestamp=day[2019], nodes=[], tags={}))
+
+
+@pytest.mark.parametrize(("year", "roads"), [(2012, 0), (2016, 1), (2018, 1), (2020, 0)])
+def test_a_history_is_read_as_it_was_on_a_day(year, roads, tmp_path):
+    path = tmp_path / "h.osh.pbf"
+    write_history(path)
+    grid = Grid(epsg=32632, west_m=499_900.0, north_m=5_205_800.0, cell_size_m=1.0, rows=1200, cols=700)
+    found = read_extract(path, grid, at=dt.date(year, 1, 1)).features
+    assert (found["class"] == "road_minor").sum() == roads
+    assert (found["class"] == "building").sum() == 1
+    if roads:
+        moved_m = 76 if year > 2017 else 0
+        assert abs(found[found["class"] == "road_minor"].geometry.length.iloc[0] - 30.4 - moved_m) < 1
+
+
+def test_a_history_without_a_day_is_refused(tmp_path):
+    write_history(tmp_path / "h.osh.pbf")
+    with pytest.raises(ExtractError, match="say the date"), open_snapshot(tmp_path / "h.osh.pbf"):
+        pass
+
+
+def test_only_what_certainly_lies_outside_is_passed_over():
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        points = rng.uniform(-1, 1, (int(rng.integers(2, 60)), 2))
+        west, south = rng.uniform(-2, 1, 2)
+        box = (west, south, west + rng.uniform(0, 1), south + rng.uniform(0, 1))
+        line = shapely.linestrings(points)
+        ring = shapely.MultiPolygon([shapely.Polygon(points)]) if len(points) > 3 else shapely.Point(9, 9)
+        for shape in (line, ring):
+            if shapely.box(*shapely.bounds(shape)).intersects(shapely.box(*box)):
+                assert reaches(bytes(shapely.to_wkb(shape)), box)
+    far = (5.0, 5.0, 6.0, 6.0)
+    assert not reaches(bytes(shapely.to_wkb(shapely.linestrings([(0, 0), (1, 1)]))), far)
+
+
+class Counting(osmium.SimpleHandler):
+    """A second reader with plain handlers: which objects carry which class, by the tags alone."""
+
+    MAJOR = {
+        f"{kind}{end}" for kind in ("motorway", "trunk", "primary", "secondary", "tertiary") for end in ("", "_link")
+    }
+    NOT_BUILT = {"no", "none", "entrance", "proposed", "construction", "demolished", "razed", "collapsed"}
+
+    def __init__(self):
+        super().__init__()
+        self.found = Counter()
+
+    def way(self, way):
+        tags, is_filled = way.tags, way.is_closed() and way.tags.get("area") == "yes"
+        if not all(node.location.valid() for node in way.nodes) or len({node.ref for node in way.nodes}) < 2:
+            return
+        if tags.get("highway") in self.MAJOR and not is_filled:
+            self.found["road_major"] += 1
+        if tags.get("railway") in (
+            "rail",
+            "tram",
+            "light_rail",
+            "subway",
+            "narrow_gauge",
+            "funicular",
+            "monorail",
+            "preserved",
+        ):
+            self.found["railway"] += 1
+        if tags.get("waterway") in ("river", "canal", "stream", "drain", "ditch", "tidal_channel") and not is_filled:
+            self.found["waterway"] += 1
+
+    def area(self, area):
+        if area.tags.get("building", "no") not in self.NOT_BUILT and area.num_rings()[0] > 0:
+            self.found["building"] += 1
+
+
+REAL = {
+    "liechtenstein-2025-09-19.osm.pbf": 32632,
+    "monaco-2015-04-27.osm.pbf": 32632,
+    "oakland-2016-07-13.osm.bz2": 32610,
+    "prague-2020-01-05.osm.pbf": 32633,
+    "porto-2020-07-20.osm.pbf": 32629,
+}
+
+
+def world_grid(path, epsg):
+    """One grid of huge cells over a whole extract."""
+    lonlat = [
+        (item.lon, item.lat) for item in osmium.FileProcessor(str(path), osmium.osm.NODE) if item.location.valid()
+    ]
+    points = shapely.get_coordinates(project(shapely.multipoints(lonlat), epsg))
+    return Grid.from_bounds(*(points.min(axis=0) - 9), *(points.max(axis=0) + 9), cell_size_m=100.0, epsg=epsg)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", sorted(REAL))
+def test_counts_agree_with_a_second_reader(name, real_extracts):
+    path = real_extracts / name
+    counting = Counting()
+    counting.apply_file(str(path), locations=True)
+    reading = read_extract(path, world_grid(path, REAL[name]))
+    found = reading.features["class"].value_counts()
+    mended = sum(reading.notes.values())
+    relations = reading.features["osm_type"].eq("relation").sum()
+    for class_name, count in counting.found.items():
+        extra = found.get(class_name, 0) - count
+        # Ours may have more, never less: what the plain reader must give up (nodes missing, relations to be mended).
+        assert 0 <= extra <= mended + relations * (class_name == "building"), (class_name, extra)
+        if not mended:
+            assert extra <= 3
+
+
+@pytest.mark.real
+def test_a_real_file_out_of_order_is_read_whole(real_extracts):
+    path = real_extracts / "dreieich-2013-07-19.osm.pbf"
+    grid = Grid.around(478_100.0, 5_538_400.0, size_m=(5000.0, 4000.0), cell_size_m=10.0, epsg=32632)
+    reading = read_extract(path, grid)
+    assert "out of order" in reading.warnings[0]
+    assert (reading.features["class"] == "building").sum() == 310
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_a_real_history_grows_over_the_years(real_extracts):
+    path = real_extracts / "andorra-2017-02-19.osh.pbf"
+    grid = Grid.around(378_700.0, 4_707_000.0, size_m=(4000.0, 4000.0), cell_size_m=10.0, epsg=32631)
+    counts = [len(read_extract(path, grid, at=dt.date(year, 1, 1)).features) for year in (2012, 2017)]
+    assert 100 < counts[0] < counts[1]
+
+
+def test_the_same_features_have_one_fingerprint_in_any_order(reading):
+    shuffled = reading.features.sample(frac=1.0, random_state=1)
+    assert fingerprint(shuffled) == fingerprint(reading.features)
+    assert re.fullmatch("[0-9a-f]{64}", fingerprint(shuffled))
+    assert fingerprint(reading.features.iloc[1:]) != fingerprint(reading.features)

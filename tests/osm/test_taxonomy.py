@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The taxonomy: exact values only, one label a class, and a file whose faults are told."""
+
+import pytest
+
+from sasgeo_bench.config import parse_toml
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.osm.taxonomy import Rule, Taxonomy, classify, load_taxonomy
+
+WANTED = {
+    *("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline"),
+    *("green", "farmland", "field_boundary", "bridge"),
+}
+ONE_CLASS = """
+[[class]]
+id = {id}
+name = "{name}"
+title = "A class"
+kind = "area"
+colour = "#101010"
+persistence = {{ prior = 0.5, vanish_per_year = 0.0, appear_per_year = 0.0 }}
+rules = [{{ key = "building", geometry = "area", values = ["yes"] }}]
+"""
+
+
+def line_classes(**tags):
+    return [label.class_name for label in classify(tags, load_taxonomy()).line]
+
+
+def area_classes(**tags):
+    return [label.class_name for label in classify(tags, load_taxonomy()).area]
+
+
+def test_every_class_that_the_benchmark_promises_is_there():
+    assert set(load_taxonomy().names) >= WANTED
+
+
+@pytest.mark.parametrize(
+    ("tags", "wanted"),
+    [
+        ({"highway": "motorway_link"}, ["road_major"]),
+        ({"highway": "residential"}, ["road_minor"]),
+        ({"highway": "footway"}, ["path_track"]),
+        ({"highway": "primary", "bridge": "viaduct"}, ["road_major", "bridge"]),
+        ({"railway": "rail"}, ["railway"]),
+        ({"waterway": "stream"}, ["waterway"]),
+        ({"natural": "coastline"}, ["coastline"]),
+        ({"barrier": "hedge"}, ["field_boundary"]),
+    ],
+)
+def test_lines_get_the_class_their_tags_say(tags, wanted):
+    assert line_classes(**tags) == wanted
+
+
+def test_a_value_is_matched_whole():
+    assert line_classes(highway="primary_") == []
+    assert line_classes(highway="xprimary") == []
+    assert line_classes(bridge="no", highway="primary") == ["road_major"]
+    assert area_classes(building="no") == []
+    assert area_classes(building="anything else") == ["building"]
+
+
+def test_what_no_rule_knows_is_named():
+    assert classify({"railway": "razed", "name": "x"}, load_taxonomy()).unknown == ("railway=razed",)
+
+
+def test_no_value_of_a_key_makes_two_classes_by_line_rules():
+    taxonomy = load_taxonomy()
+    seen = {}
+    for item in taxonomy.classes:
+        for rule in item.rules:
+            for value in (*rule.values, *rule.widths):
+                if rule.geometry == "line" and value != "*":
+                    assert seen.setdefault((rule.key, value), item.name) == item.name
+
+
+def test_a_rule_needs_values_or_widths():
+    with pytest.raises(ValueError, match="either values or widths"):
+        Rule(key="highway", geometry="line")
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (ONE_CLASS.format(id=1, name="a"), "count up from 0"),
+        (ONE_CLASS.format(id=0, name="a") + ONE_CLASS.format(id=1, name="a"), "unique"),
+        (ONE_CLASS.format(id=0, name="Big"), "name"),
+    ],
+)
+def test_a_taxonomy_with_a_fault_is_refused(text, fault):
+    with pytest.raises(ConfigError, match=fault):
+        parse_toml(text, Taxonomy, source="taxonomy.toml")

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of a site: every page has its own name, ties are told, what is registered is said in words."""
+
+import re
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.ageing.ratebook_file import load_ratebook
+from sasgeo_bench.publishing.site_board import Book, contrasts_of, group_table, places_of, sections_of
+from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
+from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
+from sasgeo_bench.publishing.site_source import SiteSource, Spot
+from sasgeo_bench.publishing.site_table import file_stem, page_names, ties_of
+from sasgeo_bench.publishing.site_words import MEANINGS
+from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame
+from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame
+from tests.handmade import HOSTILE, MARKUP, about_of, asked, card_of, entry_of, many_rows
+
+FINDING = Finding(
+    name="age",
+    first="graph",
+    second="raster",
+    metric="primary",
+    n=120,
+    blocks=40,
+    first_value=0.7,
+    second_value=0.6,
+    difference=0.1,
+    lo=0.04,
+    hi=0.16,
+    first_only=20,
+    second_only=8,
+    p_exact=0.01,
+    p_clustered=0.01,
+    p_holm=0.02,
+    detectable=0.05,
+    min_effect=0.03,
+    verdict="graph is better",
+)
+KEY = ("real-age", "localization", "r500-weak-s3")
+
+
+def source(table=None, findings=(), entries=(), **changes):
+    board = many_rows(6) if table is None else table
+    about = about_of([entry_of(name, **said) for name, said in dict(entries).items()])
+    made = SiteSource(name="mine", title="Mine", about=about, board=board, rates=load_ratebook())
+    return replace(made, contrasts=contrast_frame(findings), **changes)
+
+
+@given(st.lists(st.text(max_size=80), unique=True, max_size=12))
+def test_every_name_has_a_page_of_its_own_that_any_file_system_takes(names):
+    pages = page_names("matcher", names)
+    assert list(pages) == names
+    assert len({page.lower() for page in pages.values()}) == len(names)
+    for page in pages.values():
+        assert re.fullmatch(r"[a-z0-9-]{1,90}\.html", page)
+
+
+@given(st.lists(st.tuples(st.integers(1, 8), st.integers(0, 3)), max_size=8))
+def test_ties_hold_all_whose_ranks_overlap_and_nobody_else(ranks):
+    rows = [
+        {"matcher": f"m{at}", "rank_best": best, "rank_worst": best + more} for at, (best, more) in enumerate(ranks)
+    ]
+    tie_of = {name: number for number, tie in enumerate(ties_of(rows)) for name in tie.names}
+    for one in rows:
+        others = [other for other in rows if other is not one]
+        shares = [
+            other
+            for other in others
+            if one["rank_best"] <= other["rank_worst"] and other["rank_best"] <= one["rank_worst"]
+        ]
+        assert (one["matcher"] in tie_of) == bool(shares)
+        assert all(tie_of[other["matcher"]] == tie_of[one["matcher"]] for other in shares)
+
+
+def test_controls_and_those_without_a_rank_are_in_no_tie():
+    rows = [
+        {"matcher": "random", "rank_best": 1, "rank_worst": 2},
+        {"matcher": "a", "rank_best": pd.NA, "rank_worst": pd.NA},
+        {"matcher": "b", "rank_best": 1, "rank_worst": 2},
+    ]
+    assert ties_of(rows) == ()
+
+
+def test_a_table_is_sorted_by_its_figure_and_says_who_is_tied():
+    book = Book.of(source())
+    (section,) = sections_of(book)
+    texts = [[cell.text for cell in row.cells] for row in section.table.rows]
+    assert [row[0] for row in texts] == [HOSTILE, MARKUP, *(f"matcher-{at:03d}" for at in range(4))]
+    assert texts[0][1:3] == ["1.000 [0.900, 1.000]", "1-4"]
+    assert section.table.rows[0].cells[2].marks[0].text == "tie"
+    assert section.table.notes[0].startswith(f"Tied: {HOSTILE}, {MARKUP}, matcher-000")
+    assert section.table.notes[0].endswith("share ranks 1 to 6.")
+    assert {column.name for column in section.table.columns} <= MEANINGS.keys()
+
+
+def test_prior_groups_and_tracks_are_never_in_one_table():
+    other = many_rows(6).assign(prior_group="rnone-unknown-s15")
+    table = pd.concat([many_rows(6), other], ignore_index=True)
+    sections = sections_of(Book.of(source(table)))
+    assert [item.prior_group for item in sections] == ["r500-weak-s3", "rnone-unknown-s15"]
+    assert [len(item.table.rows) for item in sections] == [6, 6]
+    assert len({item.table.name for item in sections}) == 2
+
+
+def test_who_is_set_apart_stands_in_a_table_below_with_the_reason():
+    said = {"matcher-000": {"set_apart": "trained on the test place vaduz"}, "matcher-001": {}, "elsewhere": {}}
+    (section,) = sections_of(Book.of(source(entries=said)))
+    assert "matcher-000" not in [row.cells[0].text for row in section.table.rows]
+    assert [row.cells[0].text for row in section.apart.rows] == ["matcher-000"]
+    assert section.apart.notes == ("matcher-000: trained on the test place vaduz.",)
+    assert section.table.notes[-1] == "Not on this table, for not asked here: elsewhere."
+
+
+def test_a_matcher_that_cannot_has_words_and_no_figure():
+    table = many_rows(3)
+    table.loc[0, "is_applicable"] = False
+    table.loc[0, ["value", "lo", "hi"]] = float("nan")
+    table.loc[0, ["rank_best", "rank_worst"]] = pd.NA
+    shown = group_table(Book.of(source(table)), KEY, [HOSTILE, MARKUP])
+    assert [[cell.text for cell in row.cells[1:3]] for row in shown.rows] == [
+        ["0.667 [0.567, 0.767]", "1-3"],
+        ["not applicable", "-"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "outcome", "headline"),
+    [
+        ({}, "decided", "graph is better than raster"),
+        (
+            {"verdict": "raster is better, by less than would matter"},
+            "decided, small",
+            "raster is better than graph, by less than would matter",
+        ),
+        (
+            {"verdict": "null: any difference is smaller than would matter"},
+            "null",
+            "graph against raster: any difference is smaller than would matter",
+        ),
+        (
+            {"verdict": "not decided: 2 blocks, at least 6 are needed"},
+            "not decided",
+            "graph against raster: 2 blocks, at least 6 are needed",
+        ),
+        ({"verdict": "not tested: no query", "n": 0}, "not decided", "graph against raster: no query"),
+    ],
+)
+def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, outcome, headline):
+    (told,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
+    assert (told.outcome, told.headline) == (outcome, headline)
+    if "n" not in changes:
+        assert told.sentence.startswith("Difference 0.100 [0.040, 0.160] in the share of queries that are right")
+        assert told.facts[:3] == ("adjusted p 0.020 (Holm, 1 contrast)", "n = 120 queries", "40 blocks")
+    else:
+        assert told.sentence == "No query of this board counts for it."
+
+
+def test_what_is_decided_stands_first():
+    verdicts = (
+        "not decided: 2 blocks, at least 6 are needed",
+        "null: no difference shown",
+        "graph is better, by less than would matter",
+        "graph is better",
+    )
+    findings = [replace(FINDING, name=f"c{at}", verdict=verdict) for at, verdict in enumerate(verdicts)]
+    assert [told.name for told in contrasts_of(source(findings=findings))] == ["c3", "c2", "c1", "c0"]
+
+
+def test_places_of_a_contrast_are_counted_where_the_scored_rows_are_those_that_were_tested():
+    contrast = Contrast(name="real", first="graph", second="raster", suites=("real-age",))
+    scored = pd.concat([asked(0.5).assign(matcher=name) for name in ("graph", "raster")], ignore_index=True)
+    assert places_of(contrast, scored, 80) == 2  # every other query is a control, so every other place
+    assert places_of(contrast, scored, 79) == 0
+    assert places_of(contrast, pd.DataFrame(), 80) == 0
+
+
+def test_places_lie_in_the_middle_of_their_regions_and_unknown_ones_nowhere():
+    spots = {
+        name: Spot(region=name, title=name, longitude_deg=lon, latitude_deg=47.0, scenes=("urban",))
+        for name, lon in (("vaduz", 9.0), ("eschen", 10.0), ("unasked", 50.0))
+    }
+    parts = {"vaduz": ("liechtenstein", "a"), "eschen": ("liechtenstein", "a")}
+    about = {"tasks": [{"region": name} for name in ("vaduz@2015-07-27", "eschen+alias", "mine")]}
+    (place,) = places_on_map(about, spots, parts)
+    assert (place.number, place.name, place.part, place.longitude_deg) == (1, "liechtenstein", "a", 9.5)
+    assert list(regions_of(about)) == ["eschen", "mine", "vaduz"]
+
+
+def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path):
+    spots = {
+        name: Spot(region=name, title=name, longitude_deg=lon, latitude_deg=lat, scenes=(), is_made_up=name == "town")
+        for name, lon, lat in (("vaduz", 9.5, 47.1), ("town", 11.0, 48.0), ("oakland", -122.0, 37.8))
+    }
+    parts = {"vaduz": ("liechtenstein", "a"), "oakland": ("oakland", "b")}
+    places = places_on_map({"tasks": [{"region": name} for name in spots]}, spots, parts)
+    draw_places(tmp_path / "places.svg", places)
+    draw_rates(tmp_path / "rates.svg", load_ratebook())
+    texts = {
+        name: re.findall(r"<text[^>]*>([^<]*)", (tmp_path / name).read_text()) for name in ("places.svg", "rates.svg")
+    }
+    assert {"1", "2", "3", "half a", "half b", "no part", "all places (n = 3)", "those in Europe (n = 2)"} <= {
+        *texts["places.svg"]
+    }
+    assert {"Liechtenstein", "building", "vanishes, of the older map", "0.1"} <= {*texts["rates.svg"]}
+    for found in texts.values():
+        assert "Data: (c) OpenStreetMap contributors, ODbL" in found
+
+
+def test_words_of_files_are_plain():
+    assert file_stem("board", *KEY) == "board-real-age-localization-r500-weak-s3"
+    assert file_stem("../..", "..") == "page"
+
+
+def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
+    rows = [
+        Falsifier(contrast=FINDING.name, suite="all", kind="all", finding=replace(FINDING, n=80, blocks=9)),
+        Falsifier(contrast="other", suite="all", kind="all", finding=FINDING),
+    ]
+    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame(rows)))
+    assert told.unstressed.startswith("Without the stress, where they should not differ: ")
+    assert "(n = 80, 9 blocks). What it gains there is not owed" in told.unstressed
+    assert told.outcome == "cause open"
+    (silent,) = contrasts_of(source(findings=[FINDING]))
+    assert silent.unstressed == ""
+    none = replace(rows[0], finding=replace(FINDING, lo=-0.1))
+    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame([none])))
+    assert "no gain shown" in told.unstressed
+    assert "not owed" not in told.unstressed
+    assert told.outcome == "decided"
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("none", "no place that its card names"),
+        ([], "no place that its card names"),
+        (["porto", "monaco"], "porto, monaco"),
+        ({"a": ["munich"], "b": "none"}, "half a: munich; half b: no place that its card names"),
+    ],
+)
+def test_places_that_a_card_names_are_words_and_not_letters(said, words):
+    card = card_of("graph", trained_on=said)
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"card": card}})
+    (page,) = matchers_of(given, Book.of(given))
+    assert page.trained == words
+
+
+def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
+    rows = {"suite": KEY[0], "track": KEY[1], "prior_group": KEY[2], "matcher": "graph", "status": "ok"}
+    rows |= {
+        "role": ["control", "stress", "stress"],
+        "kind": ["control", "S1", "S2"],
+        "is_present": [True, True, False],
+    }
+    scores = pd.DataFrame(rows)
+    scores.loc[2, "status"] = "timeout"
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {}}, scores=scores)
+    (section,) = sections_of(Book.of(given))
+    assert section.counted == "S1"
+    assert section.table.notes == (
+        "One alone is ranked.",
+        "Without a sound answer, which is a miss: graph 1 (timeout).",
+    )
+
+
+def test_what_a_matcher_was_taught_is_told_by_region_for_tasks_are_hundreds():
+    learned = {"file": "a.json", "trained_on": ["porto"], "pairs": 24}
+    learned["asked"] = ["alias/vaduz+alias", "clean/vaduz", "real-age/eschen@2015-07-27"]
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"learned": [learned]}})
+    (page,) = matchers_of(given, Book.of(given))
+    assert page.taught == ("Learnt from 24 queries of porto; asked so in 3 tasks on eschen, vaduz.",)

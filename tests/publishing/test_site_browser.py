@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A published site in a real browser: sorting, filtering, keys, narrow screens, and nothing asked of another host."""
+
+import json
+import threading
+import time
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import quote
+
+import pytest
+
+from sasgeo_bench.publishing.build import publish
+from tests.browser import PATIENCE_S, browser, find_chromium
+from tests.handmade import HOSTILE, MARKUP, SHARES, card_of, full_board, put_pictures
+
+CHROMIUM = find_chromium()
+WIDE = 1280  # px: no table is cut off on a screen of this width
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium on this machine (.ci/install-chromium installs Debian's)"
+)
+FIRST = "document.querySelector('section.group:not([hidden]) tbody tr th').innerText"
+NAMES = (
+    "[...document.querySelector('section.group table').querySelectorAll('tbody th a')].map((one) => one.textContent)"
+)
+SHOWN = "[...document.querySelectorAll('section.group:not([hidden])')].map((one) => one.dataset.suite)"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A site with everything, under a sub-path with a space in it."""
+    folder = tmp_path_factory.mktemp("browser")
+    shares = SHARES | {HOSTILE: 0.5}
+    cards = {HOSTILE: {"card": card_of(HOSTILE, title=MARKUP, limits=MARKUP)}, "far": {"set_apart": "a reason"}}
+    full_board(folder / "mine", shares=shares, changes=cards)
+    put_pictures(folder / "mine", failures=("aliased", "aliased", "occluded"))
+    return publish(folder / "mine", folder / "a host" / "site", tell=lambda _: None).folder
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with browser(CHROMIUM, tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def page(tab):
+    """The tab as it is at first: wide, light, scripts on."""
+    tab.width(1280)
+    tab.prefer("light")
+    tab.scripts(are_on=True)
+    return tab
+
+
+def address(site, name="index.html"):
+    return (site / name).as_uri()
+
+
+def until(page, script):
+    """Wait for something that a script or a key brings about."""
+    end = time.monotonic() + PATIENCE_S
+    while not page.value(script):
+        assert time.monotonic() < end, script
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("width", [WIDE, 320])
+def test_no_page_asks_another_host_nor_the_console_nor_scrolls_sideways(page, site, width):
+    page.width(width)
+    for path in sorted(site.glob("*.html")):
+        page.open(address(site, path.name))
+        assert page.faults == [], path.name
+        assert all(url.startswith((f"{site.as_uri()}/", "data:,")) for url in page.asked), page.asked
+        assert page.value("document.documentElement.scrollWidth") <= width, path.name
+        cut = "[...document.querySelectorAll('.tablebox')].filter((one) => one.scrollWidth > one.clientWidth).length"
+        assert width < WIDE or page.value(cut) == 0, path.name
+        assert page.value("document.title").endswith("mine")
+
+
+def test_pictures_are_there(page, site):
+    for name in ("figures.html", "failures.html", "regions.html", "suite-real-age.html", "ageing.html"):
+        page.open(address(site, name))
+        page.value("document.querySelectorAll('img').forEach((one) => { one.loading = 'eager'; })")
+        until(page, "[...document.images].every((one) => one.complete)")
+        assert (
+            page.value("[...document.images].filter((one) => !one.closest('[hidden]') && !one.naturalWidth).length")
+            == 0
+        )
+
+
+def test_a_press_on_a_column_sorts_by_it_and_says_so(page, site):
+    page.open(address(site))
+    best_first = page.value(NAMES)
+    assert best_first[:2] == ["graph", "raster"]
+    head = "document.querySelectorAll('section.group')[0].querySelectorAll('thead th')"
+    page.value(f"{head}[1].querySelector('button').click()")
+    assert page.value(NAMES) == best_first[::-1]
+    assert page.value(f"[...{head}].map((one) => one.getAttribute('aria-sort'))")[:3] == ["none", "ascending", "none"]
+    page.value(f"{head}[0].querySelector('button').click()")
+    assert page.value(NAMES) == sorted(best_first)
+    # Who has no rank stays last, whichever way is sorted.
+    for _ in range(2):
+        page.value(f"{head}[2].querySelector('button').click()")
+        assert page.value(NAMES)[-1] == "random"
+
+
+def test_filters_show_what_was_asked_for_and_a_link_to_what_is_hidden_shows_it(page, site):
+    page.open(address(site))
+    assert page.value(SHOWN) == ["occlusion", "occlusion", "real-age", "real-age"]
+    choose = "((name, value) => {{ const one = document.querySelector(`select[name=${{name}}]`); one.value = value;"
+    choose = choose.replace("{{", "{").replace("}}", "}")
+    choose += " one.dispatchEvent(new Event('change', {bubbles: true})); })"
+    page.value(f"{choose}('suite', 'occlusion')")
+    page.value(f"{choose}('track', 'retrieval')")
+    assert page.value(SHOWN) == ["occlusion"]
+    assert page.value("document.querySelector('output').textContent") == "1 of 4 tables shown"
+    page.value(f"{choose}('prior', 'rnone-unknown-s15')")
+    assert page.value(SHOWN) == []
+    page.value("location.hash = document.querySelector('section.group h3').id")
+    until(page, f"{SHOWN}.length === 4")
+
+
+def test_ties_are_told_beside_the_ranks_and_below_the_table(page, site):
+    page.open(address(site))
+    rows = page.value(
+        "[...document.querySelectorAll('section.group')[0].querySelectorAll('tr.tied')].map((one) => one.innerText)"
+    )
+    assert len(rows) == 2
+    assert all("1-2" in row and "tie" in row for row in rows)
+    notes = page.value(
+        "[...document.querySelectorAll('section.group')[0].querySelectorAll('.note')].map((one) => one.innerText)"
+    )
+    assert "Tied: graph, raster share ranks 1 to 2." in notes
+
+
+def test_the_keyboard_alone_reads_sorts_and_turns(page, site):
+    page.open(address(site))
+    page.press("Tab")
+    assert page.value("document.activeElement.className") == "skip"
+    page.press("Enter")
+    until(page, "document.activeElement.id === 'main'")
+    for _ in range(60):
+        page.press("Tab")
+        if page.value("document.activeElement.textContent") == "success_25m":
+            break
+    assert page.value("getComputedStyle(document.activeElement.nextElementSibling).visibility") == "visible"
+    assert page.value(
+        "document.activeElement.getAttribute('aria-describedby') === document.activeElement.nextElementSibling.id"
+    )
+    page.press("Escape")
+    assert page.value("getComputedStyle(document.activeElement.nextElementSibling).visibility") == "hidden"
+    page.press("Enter")
+    until(page, "document.activeElement.closest('th').getAttribute('aria-sort') === 'ascending'")
+
+
+def test_a_tip_is_shown_whole_under_the_pointer(page, site):
+    page.open(address(site))
+    page.hover("section.group thead th:nth-child(3) button")
+    tip = "document.querySelector('section.group thead th:nth-child(3) .tip')"
+    until(page, f"getComputedStyle({tip}).visibility === 'visible'")
+    box = page.value(
+        f"(() => {{ const box = {tip}.getBoundingClientRect(); return [box.left, box.right, box.top, innerWidth]; }})()"
+    )
+    assert 0 <= box[0] < box[1] <= box[3]
+    # Nothing lies over it, and no box that scrolls cuts it off.
+    assert page.value(
+        f"(() => {{ const box = {tip}.getBoundingClientRect();"
+        f" return {tip}.contains(document.elementFromPoint(box.left + 12, box.top + 8)); }})()"
+    )
+
+
+def test_failures_turn_by_key_and_by_link(page, site):
+    page.open(address(site, "failures.html"))
+    shown = "[...document.querySelectorAll('article.case:not([hidden])')].map((one) => one.id)"
+    assert page.value(shown) == ["case-1"]
+    page.press("ArrowRight")
+    until(page, f"{shown}[0] === 'case-2'")
+    assert page.value("document.activeElement.id") == "case-2"
+    page.value("document.querySelector('#case-2 a[rel=next]').click()")
+    until(page, f"{shown}[0] === 'case-3'")
+    page.press("ArrowRight")  # the last one stays
+    page.press("ArrowLeft")
+    until(page, f"{shown}[0] === 'case-2'")
+    assert page.value(
+        "[...document.querySelectorAll('main > section:not([hidden]) h2')].map((one) => one.textContent)"
+    ) == ["aliased"]
+
+
+def test_without_scripts_everything_can_be_read_and_nothing_pretends_to_work(page, site):
+    page.scripts(are_on=False)
+    page.open(address(site))
+    # The protocol still evaluates; the page's own script has not run.
+    assert page.value("document.documentElement.className") == ""
+    assert page.value("getComputedStyle(document.querySelector('form.filter')).display") == "none"
+    assert page.value("document.querySelectorAll('section.group').length") == 4
+    page.open(address(site, "failures.html"))
+    assert page.value("[...document.querySelectorAll('article.case')].every((one) => one.offsetHeight > 0)")
+    page.scripts(are_on=True)
+
+
+def test_names_with_markup_are_text_in_the_browser_too(page, site):
+    page.open(address(site))
+    assert HOSTILE in page.value(NAMES)
+    assert page.value("document.scripts.length") == 1
+    page.open(address(site, "matcher-script-alert-1-script.html"))
+    assert HOSTILE in page.value("document.querySelector('h1').innerText")
+    assert MARKUP in page.value("document.querySelector('dl').innerText")
+    assert page.value("document.images.length") == 0
+
+
+CONTRASTS = """
+(() => {
+  const part = (text) => text.match(/[\\d.]+/g).slice(0, 3).map((one) => { const x = one / 255;
+    return x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4; });
+  const light = (text) => { const [r, g, b] = part(text); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const ground = (one) => { for (; one; one = one.parentElement) { const found = getComputedStyle(one).backgroundColor;
+    if (!/, 0\\)$|transparent/.test(found)) return found; } return "rgb(255, 255, 255)"; };
+  const said = [...document.querySelectorAll("main *, header *, footer *")].filter((one) =>
+    [...one.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim()));
+  return Math.min(...said.map((one) => { const pair = [light(getComputedStyle(one).color), light(ground(one))].sort();
+    const [low, high] = pair[0] < pair[1] ? pair : pair.reverse(); return (high + 0.05) / (low + 0.05); }));
+})()
+"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_text_stands_out_enough_in_light_and_dark(page, site, scheme):
+    page.prefer(scheme)
+    grounds = set()
+    for name in ("index.html", "matcher-graph.html", "failures.html", "method.html"):
+        page.open(address(site, name))
+        assert page.value(CONTRASTS) >= 4.5, name
+        grounds.add(page.value("getComputedStyle(document.body).backgroundColor"))
+    assert grounds == {"rgb(255, 255, 255)" if scheme == "light" else "rgb(21, 24, 28)"}
+
+
+@pytest.fixture
+def host(site):
+    """Address of the site on a plain host, under a sub-path."""
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            """Say nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=site.parents[1]))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/{quote(site.relative_to(site.parents[1]).as_posix())}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_on_a_host_under_a_sub_path_pages_open_and_files_are_downloaded_whole(page, site, host, tmp_path):
+    page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    page.open(f"{host}/index.html")
+    assert page.faults == []
+    assert all(url.startswith((f"{host}/", "data:,")) for url in page.asked), page.asked
+    names = ("leaderboard.parquet", "leaderboard.csv", "leaderboard.tex")
+    for name in names:
+        selector = f'a[href="files/{name}"]'
+        page.value(f"document.querySelector({json.dumps(selector)}).click()")
+        want = (site / "files" / name).read_bytes()
+        end = time.monotonic() + PATIENCE_S
+        while not (tmp_path / name).is_file() or (tmp_path / name).read_bytes() != want:
+            assert time.monotonic() < end, name
+            time.sleep(0.05)
+    assert {path.name for path in tmp_path.iterdir()} == set(names)

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a region file to a region directory, on embedded towns and, where they are, on real extracts."""
+
+import datetime as dt
+import errno
+import json
+import multiprocessing
+import shutil
+from pathlib import Path
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+import shapely
+from shapely import affinity
+
+from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError, StoreError
+from sasgeo_bench.osm.features import DTYPES, fingerprint, make_features
+from sasgeo_bench.osm.read import Reading
+from sasgeo_bench.regions import build
+from sasgeo_bench.regions.build import build_made, build_region, plan_build
+from sasgeo_bench.regions.layers import OUTSIDE
+from sasgeo_bench.regions.region_files import differing_files, read_manifest, read_region
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+
+TOWNS = ("town-grid", "town-old-town", "town-suburb", "town-industrial", "town-riverside", "town-agricultural")
+FILES = {"region.json", "layers.tif", "features.parquet", "nodes.parquet", "edges.parquet", "preview.png"}
+
+
+def spec_of(name: str, **changes: object):
+    return read_region_file(list_region_files()[name]).model_copy(update=changes)
+
+
+def small(name: str = "town-suburb", **changes: object):
+    return spec_of(name, **({"size_m": (200.0, 150.0)} | changes))
+
+
+def built(out: Path, spec, **options: object):
+    plan = plan_build(spec, out=out, **options)
+    return plan, build_region(plan, tell=lambda _: None)
+
+
+@pytest.mark.parametrize("town", TOWNS)
+def test_a_town_becomes_a_whole_region(town, tmp_path):
+    plan, manifest = built(tmp_path, spec_of(town))
+    assert {path.name for path in plan.folder.iterdir()} == FILES
+    assert differing_files(plan.folder) == []
+    region = read_region(plan.folder)
+    assert region.layers.shape == (len(region.classes), *region.grid.shape)
+    assert set(np.unique(region.layers)) <= {0, 1, OUTSIDE}
+    assert fingerprint(region.features) == manifest.fingerprint
+    assert manifest.counts == {name: int((region.features["class"] == name).sum()) for name in region.classes}
+    assert (region.layer("building") == 1).any()
+    assert {"intersection", "building"} <= set(region.graph.nodes["kind"])
+
+
+def test_what_lies_beyond_the_town_is_unknown_not_absent(tmp_path):
+    _, manifest = built(tmp_path, spec_of("town-industrial"))
+    region = read_region(tmp_path / "regions" / "town-industrial")
+    outside = (region.layers == OUTSIDE).all(axis=0)
+    assert 0.18 < outside.mean() < 0.24  # the town is 2048 m wide, the region 2304 m
+    assert abs(1 - outside.mean() - manifest.coverage.share) < 0.002
+    assert ((region.layers == OUTSIDE).any(axis=0) == outside).all()
+
+
+def test_every_file_carries_the_attribution(tmp_path):
+    plan, manifest = built(tmp_path, small())
+    words = "(c) OpenStreetMap contributors, ODbL"
+    assert manifest.attribution == words
+    with rasterio.open(plan.folder / "layers.tif") as layers:
+        assert words in layers.tags().values()
+    assert words.encode() in (plan.folder / "preview.png").read_bytes()
+    for name in ("features", "nodes", "edges"):
+        assert words.encode() in (plan.folder / f"{name}.parquet").read_bytes()
+
+
+def test_the_tables_open_with_pandas_and_geopandas_alone(tmp_path):
+    plan, manifest = built(tmp_path, small())
+    features = gpd.read_parquet(plan.folder / "features.parquet")
+    assert features.crs.to_epsg() == manifest.epsg
+    edges = pd.read_parquet(plan.folder / "edges.parquet")
+    nodes = gpd.read_parquet(plan.folder / "nodes.parquet")
+    assert edges["source"].isin(nodes["id"]).all()
+
+
+def test_a_second_build_is_skipped_and_says_so(tmp_path):
+    plan, _ = built(tmp_path, small())
+    stamp = (plan.folder / "region.json").stat().st_mtime_ns
+    told: list[str] = []
+    build_region(plan_build(small(), out=tmp_path), tell=told.append)
+    assert told == ["town-suburb: up to date, nothing to do"]
+    assert (plan.folder / "region.json").stat().st_mtime_ns == stamp
+
+
+def test_a_changed_region_file_or_a_lost_layer_is_built_again(tmp_path):
+    plan, _ = built(tmp_path, small())
+    assert not plan_build(small(cell_size_m=2.0), out=tmp_path).is_current
+    assert plan_build(small(), out=tmp_path).is_current
+    (plan.folder / "layers.tif").unlink()
+    assert not plan_build(small(), out=tmp_path).is_current
+
+
+def test_the_same_inputs_give_the_same_bytes(tmp_path):
+    first, _ = built(tmp_path / "a", small())
+    second, _ = built(tmp_path / "b", small())
+    for name in FILES:
+        assert (first.folder / name).read_bytes() == (second.folder / name).read_bytes(), name
+
+
+def test_an_older_date_has_a_folder_of_its_own(tmp_path):
+    old, _ = built(tmp_path, small(), date=dt.date(2014, 1, 1))
+    new, _ = built(tmp_path, small(), date=dt.date(2025, 1, 1))
+    assert (old.folder.name, new.folder.name) == ("town-suburb@2014-01-01", "town-suburb")
+    assert read_manifest(old.folder).fingerprint != read_manifest(new.folder).fingerprint
+
+
+def test_a_date_that_is_none_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="there are 2014-01-01"):
+        plan_build(small(), out=tmp_path, date=dt.date(2000, 1, 1))
+
+
+def test_halving_the_cell_changes_what_is_drawn_by_little(tmp_path):
+    areas = []
+    for cell_size_m in (1.0, 0.5):
+        built(tmp_path, small(cell_size_m=cell_size_m))
+        layers = read_region(tmp_path / "regions" / "town-suburb").layers
+        areas.append((layers == 1).sum(axis=(1, 2)) * cell_size_m**2)
+    coarse, fine = areas
+    drawn = fine > 200
+    assert drawn.sum() >= 2
+    np.testing.assert_allclose(coarse[drawn], fine[drawn], rtol=0.05)
+
+
+def test_a_failure_on_the_way_leaves_the_old_region_as_it_was(tmp_path, monkeypatch):
+    plan, manifest = built(tmp_path, small())
+
+    def no_space(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(build, "write_layers", no_space)
+    with pytest.raises(StoreError, match="No space left on device"):
+        built(tmp_path, small(cell_size_m=2.0))
+    assert read_manifest(plan.folder) == manifest
+    assert differing_files(plan.folder) == []
+    assert [path.name for path in plan.folder.parent.iterdir() if ".partial" in path.name] == []
+
+
+def test_an_interrupt_leaves_nothing_half_written(tmp_path, monkeypatch):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "build_graph", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        built(tmp_path, small())
+    assert [path.name for path in (tmp_path / "regions").iterdir() if not path.name.endswith(".lock")] == []
+
+
+def test_a_build_killed_between_its_two_renames_is_taken_up(tmp_path):
+    plan, _ = built(tmp_path, small())
+    plan.folder.rename(plan.folder.parent / ".town-suburb.replaced")
+    (plan.folder.parent / ".town-suburb.partial").mkdir()
+    built(tmp_path, small(cell_size_m=2.0))
+    assert read_manifest(plan.folder).cell_size_m == 2.0
+    assert sorted(path.name for path in plan.folder.parent.iterdir()) == [".town-suburb.lock", "town-suburb"]
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "regions").write_text("a file where a folder should be")
+    with pytest.raises(StoreError, match="cannot be written"):
+        built(tmp_path, small())
+
+
+def test_bounds_beyond_the_extract_say_what_it_covers(tmp_path):
+    far = small(center_lonlat=(11.65, 48.65), extract=spec_of("town-grid").extract)
+    plan = plan_build(far, out=tmp_path)
+    moved = far.model_copy(update={"center_lonlat": (11.8, 48.65)})
+    shifted = plan_build(moved, out=tmp_path)
+    with pytest.raises(CoverageError, match="lie outside town-grid"):
+        # The town is made around its own centre, the grid lies eleven kilometres east of it.
+        build_region(
+            type(plan)(**{name: getattr(plan, name) for name in plan.__slots__} | {"grid": shifted.grid}),
+            tell=lambda _: None,
+        )
+    assert not plan.folder.exists()
+
+
+def test_a_manifest_of_another_schema_is_refused_and_built_again(tmp_path):
+    plan, _ = built(tmp_path, small())
+    path = plan.folder / "region.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"schema_version": 0}))
+    with pytest.raises(StoreError, match="schema version 0"):
+        read_manifest(plan.folder)
+    _, manifest = built(tmp_path, small())
+    assert manifest.schema_version == 1
+
+
+def test_a_manifest_without_a_file_of_a_region_is_refused(tmp_path):
+    plan, _ = built(tmp_path, small())
+    path = plan.folder / "region.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"files": {}}))
+    with pytest.raises(StoreError, match=r"is damaged \(its files lack layers.tif\): build the region again"):
+        read_manifest(plan.folder)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": 1}', "[" * 100_000])
+def test_a_damaged_manifest_is_told_in_one_line(content, tmp_path):
+    (tmp_path / "region.json").write_text(content)
+    with pytest.raises(StoreError, match="build the region again") as caught:
+        read_manifest(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_verify_names_what_differs(tmp_path):
+    plan, _ = built(tmp_path, small())
+    with (plan.folder / "edges.parquet").open("r+b") as file:
+        file.write(b"XXXX")
+    (plan.folder / "nodes.parquet").unlink()
+    (plan.folder / "stray.txt").write_text("?")
+    (plan.folder / "preview.png").write_bytes(b"short")
+    found = "\n".join(differing_files(plan.folder))
+    for words in ("edges.parquet: SHA-256", "nodes.parquet: missing", "stray.txt: not in", "preview.png: 5 bytes"):
+        assert words in found
+
+
+def _build_in_process(out: str) -> None:
+    build_region(plan_build(small(), out=Path(out)), tell=lambda _: None)
+
+
+def test_two_builds_of_one_region_at_once_both_end_well(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    pair = [context.Process(target=_build_in_process, args=(str(tmp_path),)) for _ in range(2)]
+    for process in pair:
+        process.start()
+    for process in pair:
+        process.join()
+    assert [process.exitcode for process in pair] == [0, 0]
+    assert differing_files(tmp_path / "regions" / "town-suburb") == []
+
+
+def generated(*houses: shapely.Polygon) -> Reading:
+    """Houses that come from no extract, in the place of what is read from one."""
+    row = {name: [0] * len(houses) for name in DTYPES} | {"osm_type": "way", "class": "building", "is_visible": True}
+    row |= {"osm_id": range(len(houses)), "timestamp": [None] * len(houses), "width_m": np.nan, "geometry": houses}
+    return Reading(
+        features=make_features(row, epsg=small().grid().epsg),
+        coverage=shapely.box(*small().grid().bounds_m),
+        coverage_source="region file",
+        osm_timestamp=None,
+        drops={},
+        hidden={},
+        notes={},
+        warnings=("made up",),
+    )
+
+
+def test_what_was_generated_becomes_a_region_that_says_so_and_is_built_once(tmp_path):
+    west_m, south_m, *_ = small().grid().bounds_m
+    flat, tall = shapely.box(0, 4, 20, 6), shapely.box(9, 0, 11, 10)  # of one centroid, and so of one fingerprint
+    flat, tall = (affinity.translate(house, west_m + 10, south_m + 10) for house in (flat, tall))
+    folder = build_made(small(), generated(flat), out=tmp_path, tell=lambda _: None)
+    assert differing_files(folder) == []
+    manifest = read_manifest(folder)
+    assert (manifest.extract.bytes, manifest.warnings, manifest.counts["building"]) == (0, ("made up",), 1)
+    assert (read_region(folder).layer("building") == 1).sum() == 40
+    stamp = (folder / "region.json").stat().st_mtime_ns
+    build_made(small(), generated(flat), out=tmp_path, tell=lambda _: None)
+    assert (folder / "region.json").stat().st_mtime_ns == stamp
+    build_made(small(), generated(tall), out=tmp_path, tell=lambda _: None)
+    assert (read_region(folder).layer("building") == 1).sum() == 20
+
+
+@pytest.mark.real
+def test_vaduz_builds_from_the_real_extract(real_extracts, tmp_path):
+    plan, manifest = built(tmp_path, spec_of("vaduz"), extract_folders=[real_extracts])
+    assert differing_files(plan.folder) == []
+    assert manifest.counts["building"] > 2500
+    assert manifest.counts["railway"] > 0
+    assert 0.8 < manifest.coverage.share < 0.95  # the south-west lies in Switzerland
+    assert manifest.extract.osm_timestamp.date() == dt.date(2025, 9, 19)
+
+
+@pytest.mark.real
+def test_an_extract_changed_by_one_byte_is_refused(real_extracts, tmp_path):
+    name = "dreieich-2022-10-16.osm.pbf"
+    content = bytearray((real_extracts / name).read_bytes())
+    content[-1] ^= 1
+    (tmp_path / name).write_bytes(content)
+    spec = spec_of("dreieich")
+    offline = spec.model_copy(update={"extract": [item.model_copy(update={"urls": ()}) for item in spec.extract]})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("SASGEO_EXTRACTS", raising=False)
+        with pytest.raises(ExtractError, match="none of those accepted"):
+            plan_build(offline, out=tmp_path, extract_folders=[tmp_path])
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(list_region_files()))
+def test_every_shipped_region_builds_at_every_date(name, real_extracts, tmp_path):
+    spec = spec_of(name)
+    for extract in spec.extract:
+        plan, manifest = built(tmp_path, spec, date=extract.date, extract_folders=[real_extracts])
+        assert manifest.coverage.share > 0.2
+        assert sum(manifest.counts.values()) > 20
+        shutil.rmtree(plan.folder)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layer file: what was burnt is what is read, in a cloud-optimized layout."""
+
+import struct
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.regions import layer_file
+from sasgeo_bench.regions.layer_file import overview_factors, read_layers, read_overview, write_layers
+from sasgeo_bench.regions.layers import OUTSIDE, Paint, burn_layers
+
+CLASSES = ("building", "water", "bridge")
+GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_200_000.0, cell_size_m=2.0, rows=2300, cols=4700)
+
+
+def paint() -> Paint:
+    west, south, east, north = GRID.bounds_m
+    rng = np.random.default_rng(1)
+    houses = [
+        shapely.box(x, y, x + 31, y + 23)
+        for x, y in zip(rng.uniform(west, east, 400), rng.uniform(south, north, 400), strict=True)
+    ]
+    lake = shapely.Point((west + east) / 2, (south + north) / 2).buffer(1500)
+    areas = [np.array(houses, dtype=object), np.array([lake], dtype=object), np.array([], dtype=object)]
+    mapped = shapely.box(west, south, east - 1000, north)
+    return Paint(
+        classes=CLASSES,
+        areas=tuple(shapely.orient_polygons(shapes) for shapes in areas),
+        coverage=shapely.orient_polygons(np.array([mapped], dtype=object)),
+    )
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("layers") / "layers.tif"
+    drawn = paint()
+    write_layers(path, GRID, CLASSES, lambda _: lambda window: burn_layers(drawn, window))
+    return path
+
+
+def test_what_is_read_is_what_was_burnt(written):
+    assert (read_layers(written) == burn_layers(paint(), GRID)).all()
+
+
+def test_a_window_is_read_alone(written):
+    whole = burn_layers(paint(), GRID)
+    assert (read_layers(written, window=(100, 200, 50, 60)) == whole[:, 100:150, 200:260]).all()
+
+
+def test_layers_cannot_be_changed_by_the_reader(written):
+    with pytest.raises(ValueError, match="read-only"):
+        read_layers(written, window=(0, 0, 9, 9))[0, 0, 0] = 1
+
+
+def test_the_file_says_what_it_holds(written):
+    with rasterio.open(written) as source:
+        assert source.descriptions == CLASSES
+        assert source.nodata == OUTSIDE
+        assert source.crs.to_epsg() == 32632
+        assert tuple(source.transform)[:6] == GRID.transform
+        assert source.overviews(1) == [4, 16]
+        assert source.tags()["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+        assert source.block_shapes[0] == (512, 512)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_an_overview_is_the_same_map_at_a_coarser_cell(level, written):
+    grid = GRID.coarsen((4, 16)[level])
+    with rasterio.open(written, overview_level=level) as source:
+        assert (source.read() == burn_layers(paint(), grid)).all()
+
+
+def tile_offsets(path):
+    """First stored tile of each level, finest first, and where the last header ends: read from the TIFF itself."""
+    content = path.read_bytes()
+    assert content[:4] == b"II*\x00"
+    (position,) = struct.unpack_from("<I", content, 4)
+    firsts, headers = [], []
+    while position:
+        headers.append(position)
+        (count,) = struct.unpack_from("<H", content, position)
+        for entry in range(count):
+            tag, kind, number, value = struct.unpack_from("<HHII", content, position + 2 + 12 * entry)
+            if tag == 324:  # TileOffsets
+                assert kind == 4
+                offsets = struct.unpack_from(f"<{number}I", content, value) if number > 1 else (value,)
+                firsts.append(min(offset for offset in offsets if offset))
+        (position,) = struct.unpack_from("<I", content, position + 2 + 12 * count)
+    return firsts, max(headers)
+
+
+def test_the_layout_is_that_of_a_cloud_optimized_file(written):
+    firsts, last_header = tile_offsets(written)
+    assert len(firsts) == 3
+    assert firsts == sorted(firsts, reverse=True)  # smallest overview first, full raster last
+    assert last_header < min(firsts)
+
+
+def test_the_overview_for_a_picture_is_the_finest_that_fits(written):
+    assert read_overview(written, longest_cells=1200).shape == (3, 575, 1175)
+    assert read_overview(written, longest_cells=100).shape == (3, 144, 294)
+    assert read_overview(written, longest_cells=9000).shape == (3, 2300, 4700)
+
+
+def test_a_small_raster_needs_no_overview():
+    small = Grid(epsg=32632, west_m=0.0, north_m=0.0, cell_size_m=1.0, rows=512, cols=1024)
+    assert overview_factors(small) == ()
+
+
+def test_a_file_that_cannot_be_written_or_read_is_told(tmp_path):
+    with pytest.raises(StoreError, match="cannot be written"):
+        write_layers(
+            tmp_path / "none" / "layers.tif", GRID, CLASSES, lambda _: lambda window: burn_layers(paint(), window)
+        )
+    (tmp_path / "layers.tif").write_bytes(b"no raster")
+    with pytest.raises(StoreError, match="cannot be read"):
+        read_layers(tmp_path / "layers.tif")
+
+
+def test_memory_of_a_window_does_not_grow_with_the_raster():
+    largest = max(window.rows * window.cols for _, _, window in GRID.windows(layer_file.WINDOW_CELLS))
+    assert largest <= layer_file.WINDOW_CELLS**2

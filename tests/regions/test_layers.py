@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Burning: the cells GDAL would burn, lines as wide as they are, and nothing absent beyond what is mapped."""
+
+import geopandas as gpd
+import numpy as np
+import pytest
+import rasterio.features
+import shapely
+from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.features import DTYPES, make_features
+from sasgeo_bench.regions.layers import OUTSIDE, burn, burn_layers, make_paint
+
+GRID = Grid(epsg=32632, west_m=0.0, north_m=40.0, cell_size_m=1.0, rows=40, cols=50)
+EVERYWHERE = shapely.box(-1e6, -1e6, 1e6, 1e6)
+
+
+def table(*rows: tuple[str, shapely.Geometry, float], **columns: object) -> gpd.GeoDataFrame:
+    given_rows: dict[str, object] = {
+        "osm_type": ["way"] * len(rows),
+        "osm_id": list(range(len(rows))),
+        "version": [1] * len(rows),
+        "timestamp": [None] * len(rows),
+        "class": [name for name, *_ in rows],
+        "level": [0] * len(rows),
+        "is_bridge": [False] * len(rows),
+        "is_tunnel": [False] * len(rows),
+        "is_visible": [True] * len(rows),
+        "width_m": [width_m for *_, width_m in rows],
+        "geometry": [shape for _, shape, _ in rows],
+    }
+    return make_features({name: (given_rows | columns)[name] for name in (*DTYPES, "geometry")}, epsg=32632)
+
+
+@st.composite
+def stars(draw):
+    """A polygon around a point, some with a hole, vertices off the cell centres."""
+    count = draw(st.integers(3, 12))
+    centre = np.array([draw(st.floats(-10, 60)), draw(st.floats(-10, 50))])
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    reach = np.array([draw(st.floats(1.5, 25)) for _ in range(count)])
+    ring = centre + reach[:, None] * np.column_stack((np.cos(angles), np.sin(angles)))
+    hole = [centre + 0.4 * (ring - centre)] if draw(st.booleans()) else []
+    shape = shapely.Polygon(ring + 0.0137, [inner + 0.0137 for inner in hole])
+    return shapely.orient_polygons(shape)
+
+
+@given(st.lists(stars(), min_size=1, max_size=6))
+def test_burning_marks_exactly_the_cells_that_gdal_marks(shapes):
+    ours = burn(np.array(shapes, dtype=object), GRID)
+    theirs = rasterio.features.rasterize(shapes, out_shape=GRID.shape, transform=Affine(*GRID.transform)) == 1
+    assert (ours == theirs).all()
+
+
+@given(shapes=st.lists(stars(), min_size=1, max_size=4), row=st.integers(0, 30), col=st.integers(0, 40))
+def test_a_window_holds_the_same_cells_as_the_whole(shapes, row, col):
+    whole = burn(np.array(shapes, dtype=object), GRID)
+    part = burn(np.array(shapes, dtype=object), GRID.window(row, col, 10, 10))
+    assert (part == whole[row : row + 10, col : col + 10]).all()
+
+
+@given(stars())
+def test_the_burnt_area_is_within_the_cells_along_the_edge(shape):
+    grid = GRID.window(-60, -60, 160, 170)
+    area_m2 = burn(np.array([shape], dtype=object), grid).sum()
+    edge_m = shape.length
+    assert abs(area_m2 - shape.area) <= edge_m * np.sqrt(2) + 1
+
+
+@given(st.lists(stars(), min_size=1, max_size=3))
+def test_burning_and_vectorizing_and_burning_again_changes_no_cell(shapes):
+    cells = burn(np.array(shapes, dtype=object), GRID)
+    found = [
+        shapely.orient_polygons(shapely.geometry.shape(shape))
+        for shape, _ in rasterio.features.shapes(cells.astype(np.uint8), mask=cells, transform=Affine(*GRID.transform))
+    ]
+    assert sum(shape.area for shape in found) == cells.sum()
+    again = burn(np.array(found, dtype=object), GRID) if found else np.zeros(GRID.shape, dtype=bool)
+    assert (again == cells).all()
+
+
+def test_no_polygon_marks_no_cell():
+    assert not burn(np.array([], dtype=object), GRID).any()
+
+
+@pytest.mark.parametrize("cell_size_m", [2.0, 1.0, 0.5, 0.25])
+def test_a_road_is_as_wide_as_tagged_at_every_cell_size(cell_size_m):
+    road = table(("road_major", shapely.LineString([(100.3, 100.1), (900.2, 500.4)]), 7.5))
+    cells = round(1000 / cell_size_m)
+    grid = Grid(epsg=32632, west_m=0.0, north_m=1000.0, cell_size_m=cell_size_m, rows=cells, cols=cells)
+    burnt_m2 = (burn_layers(make_paint(road, ("road_major",), EVERYWHERE), grid) == 1).sum() * cell_size_m**2
+    length_m = road.geometry.length.iloc[0]
+    assert abs(burnt_m2 / length_m - 7.5) < 0.05 * 7.5
+
+
+def test_several_classes_may_hold_in_one_cell():
+    both = table(("water", shapely.box(0, 0, 50, 40), np.nan), ("bridge", shapely.LineString([(0, 20), (50, 20)]), 6.0))
+    water, bridge = burn_layers(make_paint(both, ("water", "bridge"), EVERYWHERE), GRID)
+    assert ((water == 1) & (bridge == 1)).sum() == 6 * 50
+
+
+def test_what_is_not_visible_is_not_burnt():
+    tunnel = table(("road_major", shapely.LineString([(0, 20), (50, 20)]), 6.0), is_visible=[False])
+    assert not burn_layers(make_paint(tunnel, ("road_major",), EVERYWHERE), GRID).any()
+
+
+def test_beyond_the_mapped_area_every_class_is_unknown():
+    road = table(("road_major", shapely.LineString([(0, 20), (50, 20)]), 6.0))
+    layers = burn_layers(make_paint(road, ("road_major", "water"), shapely.box(0, 0, 25, 40)), GRID)
+    assert (layers[:, :, 25:] == OUTSIDE).all()
+    assert not (layers[:, :, :25] == OUTSIDE).any()
+    assert (layers[0, :, :25] == 1).sum() == 6 * 25
+
+
+def test_overviews_do_not_break_thin_lines():
+    path = table(("path_track", shapely.LineString([(0, 3.3), (50, 37.1)]), 0.3))
+    coarse = GRID.coarsen(4)
+    thin = burn_layers(make_paint(path, ("path_track",), EVERYWHERE), coarse)[0]
+    wide = burn_layers(make_paint(path, ("path_track",), EVERYWHERE, least_width_m=4.0), coarse)[0]
+    assert (wide == 1).any(axis=0).all()
+    assert not (thin == 1).any(axis=0).all()

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a region file may say, and what is told where it may not."""
+
+import datetime as dt
+
+import pytest
+
+from sasgeo_bench.config import parse_toml
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.regions.region_spec import RegionFile
+
+EXTRACT = f'[[extract]]\nfile = "a.osm.pbf"\ndate = 2020-01-01\nsha256 = ["{"0" * 64}"]\n'
+
+
+def text(place: str = "center_lonlat = [9.0, 47.0]\nsize_m = [100, 100]", *, cell: str = "1.0", more: str = "") -> str:
+    head = f'id = "mine"\ntitle = "Mine"\nscenes = ["urban"]\n{place}\ncell_size_m = {cell}\n{more}\n'
+    return head + EXTRACT
+
+
+def read(content: str) -> RegionFile:
+    return parse_toml(content, RegionFile, source="mine.toml")
+
+
+def fault(content: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        read(content)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_centre_and_a_size_make_a_grid_of_that_size_around_it():
+    grid = read(text()).grid()
+    assert grid.epsg == 32632
+    assert grid.shape == (100, 100)
+    assert abs(grid.west_m + 50 - 500_000) < 1
+
+
+def test_bounds_make_a_grid_that_covers_them():
+    grid = read(text("bounds_lonlat = [9.0, 47.0, 9.01, 47.01]")).grid()
+    west, south, east, north = grid.bounds_m
+    assert 750 < east - west < 780
+    assert 1100 < north - south < 1125
+
+
+def test_southern_places_get_a_southern_zone():
+    assert read(text("center_lonlat = [18.4, -33.9]\nsize_m = [100, 100]")).grid().epsg == 32734
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("bounds_lonlat = [9.1, 47.0, 9.0, 47.1]", "west 9.1 > east 9.0"),
+        ("bounds_lonlat = [179.9, 47.0, -179.9, 47.1]", "antimeridian"),
+        ("bounds_lonlat = [9.0, 47.1, 9.1, 47.0]", "swap"),
+        ("bounds_lonlat = [9.0, 84.5, 9.1, 84.6]", "84"),
+        ("bounds_lonlat = [9.0, 47.0, 9.0, 47.1]", "positive size"),
+        ("bounds_lonlat = [nan, 47.0, 9.0, 47.1]", "within -180..180"),
+        ("bounds_lonlat = [0.0, 40.0, 12.0, 50.0]", "make it smaller"),
+        ("center_lonlat = [9.0, 47.0]\nsize_m = [1e6, 1e6]", "GB each"),
+        ("center_lonlat = [9.0, 47.0]\nsize_m = [-5, 100]", "positive"),
+        ("center_lonlat = [9.0, 47.0]", "either by center_lonlat and size_m, or by bounds_lonlat"),
+        ("center_lonlat = [9.0, 47.0]\nsize_m = [9, 9]\nbounds_lonlat = [9.0, 47.0, 9.1, 47.1]", "either by"),
+        ("", "either by"),
+    ],
+)
+def test_a_place_that_is_none_is_refused_with_the_mend(place, words):
+    assert words in fault(text(place))
+
+
+@pytest.mark.parametrize("cell", ["0.0", "-1.0", "nan", "inf", "1e6"])
+def test_a_cell_size_out_of_range_is_refused(cell):
+    assert "cell_size_m must lie between" in fault(text(cell=cell))
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("epsg = 4326", "not a projected CRS in metres"),
+        ("epsg = 999999", "unknown"),
+        ("coverage_lonlat = [[9.0, 47.0], [9.1, 47.0]]", "at least 3"),
+        ("cell_sise = 3", "unknown key 'cell_sise'"),
+    ],
+)
+def test_other_faults_are_told_in_one_line(more, words):
+    assert words in fault(text(more=more))
+
+
+def test_an_extract_needs_a_hash_or_a_town():
+    assert "needs either sha256" in fault(text().replace(f'sha256 = ["{"0" * 64}"]', ""))
+
+
+def test_a_hash_must_be_a_hash():
+    assert "sha256" in fault(text().replace("0" * 64, "0" * 63))
+
+
+def test_a_file_name_with_a_folder_is_refused():
+    assert "without folders" in fault(text().replace("a.osm.pbf", "../a.osm.pbf"))
+
+
+def test_two_extracts_of_one_date_are_refused():
+    assert "two extracts have the date 2020-01-01" in fault(text() + EXTRACT)
+
+
+def test_the_newest_extract_is_picked_and_any_by_its_date():
+    region = read(text() + EXTRACT.replace("2020", "2022"))
+    assert region.pick(None).date == dt.date(2022, 1, 1)
+    assert region.pick(dt.date(2020, 1, 1)).date == dt.date(2020, 1, 1)
+    with pytest.raises(ConfigError, match="2020-01-01, 2022-01-01"):
+        region.pick(dt.date(2021, 1, 1))

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on a dask cluster of several processes gives the rows of an undisturbed one, also where one is killed."""
+
+import os
+import signal
+import sys
+from dataclasses import replace
+
+import psutil
+import pytest
+
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.running import cluster, prediction_files
+from sasgeo_bench.running.answers import pool_costs
+from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.runner import run
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
+
+PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
+
+
+def request_of(task, out, name="Plain", **changes):
+    request = RunRequest(spec=f"hostile:{name}", tasks=(task,), out=out, limits=PATIENT)
+    return replace(request, **changes)
+
+
+def rows(folder):
+    """All rows by query, without the time they took."""
+    return {
+        item.query_id: replace(item, latency_s=None, matcher_s=None)
+        for item in prediction_files.read_predictions(folder)
+    }
+
+
+@pytest.mark.slow  # the next one holds as much against a run without a cluster, with a kill on the way
+def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
+    alone, spread = (
+        plan_run(request_of(task, tmp_path / name, dask=dask)) for name, dask in (("one", None), ("two", "local:2"))
+    )
+    run(alone, tell=lambda _: None)
+    told = []
+    report = run(spread, tell=told.append)
+    assert report.counts == {"ok": len(task_files.read_ids(task))}
+    assert rows(spread.parts[0].folder) == rows(alone.parts[0].folder)
+    about = prediction_files.read_run(spread.parts[0].folder)
+    assert about["isolation"] == prediction_files.read_run(alone.parts[0].folder)["isolation"]
+    assert about["prepare_s"] >= 0
+    again = plan_run(request_of(task, tmp_path / "two", dask="local:2"))
+    assert run(again, tell=told.append).counts == {}
+    assert "nothing left" in told[-1]
+
+
+def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
+    alone = plan_run(request_of(task, tmp_path / "one"))
+    run(alone, tell=lambda _: None)
+    plan = plan_run(request_of(task, tmp_path / "two", name="Held", dask="local:2"))
+    part = plan.parts[0]
+    (place / "hold").write_text(" ".join(next(iter(cluster._chunks(part.left, 2)))), encoding="utf-8")
+    killed, asked, costs = [], [], []
+    with cluster.connected("local:2") as client:
+        for number, _, cost in cluster.answer_on(client, plan, [part]):
+            assert number == 0
+            costs.append(cost)
+            if not killed:  # the first chunk is answered, and both are held at work on another one
+                while not asked:  # the process of a matcher, of a dask worker in the middle of a chunk
+                    killed = list(client.run(os.getpid).values())[:1]
+                    asked = psutil.Process(killed[0]).children(recursive=True)
+                os.kill(killed[0], signal.SIGKILL)
+                (place / "hold").unlink()
+        assert killed[0] not in client.run(os.getpid).values()
+    assert len(costs) > 2
+    assert asked
+    assert not [process for process in asked if process.is_running()]
+    assert rows(part.folder) == rows(alone.parts[0].folder)
+    assert sum(pool_costs(costs).counts.values()) <= len(rows(part.folder))
+
+
+def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
+    first = plan_run(request_of(task, tmp_path, limit=3))
+    run(first, tell=lambda _: None)
+    plan = plan_run(request_of(task, tmp_path))
+    asked = task_files.read_asked(task)
+    chunk = replace(plan.parts[0], left=tuple(asked)[:5], asked=asked)
+    assert cluster._answer_chunk(plan, chunk).counts == {"ok": 2}
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("local:0", "local:N with N >= 1"),
+        ("local:", "local:N with N >= 1"),
+        ("local:two", "local:N with N >= 1"),
+        ("tcp://127.0.0.1:9", "no dask scheduler answers at 'tcp://127.0.0.1:9'"),
+        ("nonsense", "no dask scheduler answers at 'nonsense'"),
+    ],
+)
+def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeypatch, address, words):
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    plan = plan_run(request_of(task, tmp_path, dask=address))
+    with pytest.raises(ConfigError, match=words):
+        run(plan, tell=lambda _: None)
+    assert not plan.parts[0].folder.exists()
+
+
+def test_without_the_extra_the_way_to_it_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"pip install 'sasgeo-bench\[dask\]'"), cluster.connected("local:2"):
+        pass
+
+
+def test_jobs_and_a_cluster_are_not_asked_for_together(task, tmp_path):
+    with pytest.raises(ConfigError, match="leave one of them out"):
+        plan_run(request_of(task, tmp_path, dask="local:2", jobs=2))
+
+
+def test_chunks_hold_every_id_once_and_are_neither_tiny_nor_huge():
+    for count, threads in ((1, 4), (60, 2), (5000, 2), (100_000, 64)):
+        ids = tuple(map(str, range(count)))
+        chunks = list(cluster._chunks(ids, threads))
+        assert tuple(name for chunk in chunks for name in chunk) == ids
+        assert all(8 <= len(chunk) <= 256 for chunk in chunks[:-1])
+
+
+def test_workers_that_die_over_and_over_end_the_run_with_one_line(task, tmp_path, monkeypatch):
+    class Future:
+        def result(self):
+            raise distributed.KilledWorker(*("chunk", None, 3))
+
+    class Client:
+        def nthreads(self):
+            return {"a": 1}
+
+        def submit(self, *_, **__):
+            return Future()
+
+    monkeypatch.setattr("distributed.as_completed", iter)
+    plan = plan_run(request_of(task, tmp_path))
+    with pytest.raises(StoreError, match="died over and over"):
+        list(cluster.answer_on(Client(), plan, plan.parts))
+
+
+@pytest.mark.slow
+def test_over_500_queries_two_processes_two_shards_and_a_cluster_give_the_same_rows(tmp_path):
+    wanted = Wanted(
+        suites=("occlusion", "clean", "season"),
+        regions=("town-grid",),
+        split="crossfit",
+        count=16,
+        seed=3,
+        out=tmp_path,
+    )
+    requests = plan_requests(replace(wanted, may_be_fewer=True), tell=lambda _: None)
+    tasks = [made.folder for request in requests for made in make_tasks(request, tell=lambda _: None)]
+    assert sum(len(task_files.read_ids(task)) for task in tasks) > 500
+    ways = {
+        "two processes": [{"jobs": 2}],
+        "two shards": [{"shard": (1, 2)}, {"shard": (2, 2)}],
+        "a cluster": [{"dask": "local:2"}],
+    }
+    files = []
+    for name, changes in ways.items():
+        folders = []
+        for number, change in enumerate(changes):
+            out = tmp_path / name / str(number)
+            plan = plan_run(RunRequest(spec="global_descriptor", tasks=tasks, out=out, **change))
+            run(plan, tell=lambda _: None)
+            folders += [part.folder for part in plan.parts]
+        prediction_files.merge_runs(folders, tmp_path / f"{name}.parquet")
+        files.append(rows(tmp_path / f"{name}.parquet"))
+    assert len(files[0]) > 500
+    assert files[0] == files[1] == files[2]
+    assert sum(item.status == "ok" for item in files[0].values()) > 500

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The walk through the folders of the code finds what tells answers, is bounded, and says what it did not look at."""
+
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.leaderboard import board_files
+from sasgeo_bench.publishing import archive_file, release_files, site_files
+from sasgeo_bench.running import leak_scan
+from sasgeo_bench.scoring import submission_files
+from sasgeo_bench.tasks import task_files
+
+
+def lay(root, *names):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+
+def hidden(root, *kept, **limits):
+    """What is hidden below a folder, by its place in it, and what is said of the rest."""
+    found = leak_scan.walk([str(root)], **limits)
+    return sorted(str(Path(path).relative_to(root)) for path in found.hidden(kept)), found.unsearched
+
+
+@pytest.mark.parametrize(
+    "sign",
+    [
+        *("pack.json", "truths.parquet", "truth.parquet", "truth.json", "truth-test.parquet", "part-00001-2.parquet"),
+        "queries.parquet",
+    ],
+)
+def test_one_telling_name_hides_its_folder(tmp_path, sign):
+    lay(tmp_path, f"a/b/{sign}", "a/c/notes.txt")
+    assert hidden(tmp_path) == (["a/b"], "")
+
+
+@pytest.mark.parametrize(
+    ("sign", "with_it"), [(a, b) for a, b in map(sorted, filter(lambda sign: len(sign) > 1, leak_scan._SIGNS))]
+)
+def test_a_name_that_others_use_too_hides_nothing_alone(tmp_path, sign, with_it):
+    lay(tmp_path, f"a/{sign}", f"b/{with_it}", f"c/{sign}", f"c/{with_it}")
+    assert hidden(tmp_path)[0] == ["c"]
+
+
+def test_what_stored_results_are_called_is_what_is_looked_for():
+    signs = set().union(*leak_scan._SIGNS)
+    assert {
+        archive_file.PACK,
+        task_files.QUERIES,
+        task_files.TRUTH,
+        task_files.TRUTH_OF,
+        board_files.BOARD,
+        site_files.MANIFEST,
+    } <= signs
+    assert {release_files.INDEX, submission_files.SAID, "truths.parquet"} <= signs
+
+
+def test_a_root_of_the_program_hides_all_of_it(tmp_path):
+    lay(tmp_path, "out/tasks/clean/a/task.json", "out/truth/clean/a/truth.parquet", "out/runs/x/run.json", "out/x.txt")
+    lay(tmp_path, "out/regions/a/region.json", "out/regions/a/layers.tif")
+    everything = [*sorted(f"out/{name}" for name in ("boards", "release", "results", "runs", "tasks", "truth"))]
+    assert hidden(tmp_path)[0] == sorted([*everything, "out/regions/a"])
+    assert hidden(tmp_path, tmp_path / "out/regions/a")[0] == everything
+
+
+def test_a_release_whose_map_is_asked_about_keeps_the_map_and_loses_the_rest(tmp_path):
+    lay(tmp_path, "rel/release.json", "rel/SHA256SUMS", "rel/truth/clean/a/truth.parquet")
+    lay(tmp_path, *(f"rel/regions/{name}/{file}" for name in "ab" for file in ("region.json", "layers.tif")))
+    assert hidden(tmp_path)[0] == ["rel"]
+    assert hidden(tmp_path, tmp_path / "rel/regions/a")[0] == ["rel/regions/b", "rel/truth"]
+
+
+def test_code_beside_what_tells_stays_and_what_tells_goes(tmp_path):
+    lay(tmp_path, "mine/matcher.py", "mine/truths.parquet", "mine/predictions/a.parquet", "mine/weights.npz")
+    assert hidden(tmp_path)[0] == ["mine/predictions", "mine/truths.parquet"]
+    lay(tmp_path, "pack.json")
+    assert hidden(tmp_path, tmp_path)[0] == ["mine/predictions", "mine/truths.parquet", "pack.json"]
+
+
+def test_installed_packages_are_passed_over_and_what_was_committed_is_hidden(tmp_path):
+    lay(tmp_path, ".venv/pyvenv.cfg", ".venv/lib/a/pack.json", "node_modules/b/pack.json", ".git/objects/ab/cd")
+    assert hidden(tmp_path) == ([".git"], "")
+
+
+def test_links_are_not_followed(tmp_path):
+    lay(tmp_path, "far/pack.json")
+    (tmp_path / "near").mkdir()
+    (tmp_path / "near/link").symlink_to(tmp_path / "far")
+    (tmp_path / "near/round").symlink_to(tmp_path / "near")
+    assert hidden(tmp_path / "near") == ([], "")
+
+
+def test_a_walk_that_ends_early_has_found_the_upper_ones_and_says_what_it_did_not_see(tmp_path):
+    lay(tmp_path, "a/pack.json", "b/c/d/e/pack.json")
+    assert hidden(tmp_path, most_depth=2) == (
+        ["a"],
+        "stored results deeper than 2 folders beside the code were not looked for",
+    )
+    assert hidden(tmp_path, most_depth=4) == (["a", "b/c/d/e"], "")
+    found, words = hidden(tmp_path, most_entries=4)
+    assert (found, words) == (["a"], "stored results beyond 4 files beside the code were not looked for")
+
+
+def test_the_interpreters_own_folders_are_not_walked(tmp_path):
+    lay(tmp_path, "pack.json")
+    own = [Path(sys.prefix), Path(sys.base_prefix), Path(sysconfig.get_paths()["stdlib"])]
+    leak_scan._walked.cache_clear()
+    found = leak_scan.walk_code([*own, tmp_path, tmp_path / "no.zip"])
+    assert [item.folder for item in found.found] == [str(tmp_path)]
+
+
+def test_many_processes_of_a_run_share_a_walk(tmp_path, monkeypatch):
+    walks = []
+    monkeypatch.setattr(leak_scan, "walk", lambda roots: walks.append(roots) or leak_scan.Walk(found=()))
+    monkeypatch.setattr(leak_scan.time, "monotonic", lambda: 30.0)
+    leak_scan._walked.cache_clear()
+    for _ in range(3):
+        leak_scan.walk_code([tmp_path])
+    assert len(walks) == 1
+    monkeypatch.setattr(leak_scan.time, "monotonic", lambda: 90.0)
+    leak_scan.walk_code([tmp_path])
+    assert len(walks) == 2
+    leak_scan._walked.cache_clear()

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on disk: rows that are read as they were written, whoever wrote them; what is wrong with a file, in a line."""
+
+import errno
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running import prediction_files, prediction_rows
+
+POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
+FULL = Prediction(
+    query_id="b", candidates=((POSE, 0.7), (POSE, 0.1)), confidence=0.5, diagnostics={"margin": 0.6}, latency_s=0.01
+)
+FAILED = Prediction(query_id="a", status="crash", message="died by SIGSEGV")
+
+
+@pytest.fixture
+def rows(tmp_path):
+    """The table of a sound file, to be changed and written by `write`."""
+    path = prediction_files.write_part(tmp_path / "sound", [FULL, FAILED])
+    return pq.read_table(path)
+
+
+@pytest.fixture
+def write(tmp_path):
+    def put(table, name="mine.parquet"):
+        pq.write_table(table, tmp_path / name)
+        return tmp_path / name
+
+    return put
+
+
+def refusal(read, *words):
+    with pytest.raises(StoreError) as refused:
+        read(*words)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def everything(path):
+    return list(prediction_files.read_predictions(path))
+
+
+def with_column(table, name, values):
+    return table.set_column(table.column_names.index(name), name, values)
+
+
+def test_rows_are_read_as_they_were_written(tmp_path):
+    folder = tmp_path / "run"
+    prediction_files.write_part(folder, [FULL])
+    prediction_files.write_part(folder, [FAILED])
+    assert sorted(everything(folder), key=lambda item: item.query_id) == [FAILED, FULL]
+    assert prediction_files.ids_done(folder, {"a": "", "b": ""}) == {"a", "b"}
+    assert prediction_files.ids_done(folder, {"a": "", "b": ""}, again=("crash",)) == {"b"}
+    assert {path.suffix for path in folder.iterdir()} == {".parquet"}
+
+
+def test_more_columns_other_orders_and_like_types_are_read_too(rows, write):
+    strings = with_column(rows, "status", rows["status"].cast(pa.large_string()))
+    single = with_column(rows, "confidence", rows["confidence"].cast(pa.float32()))
+    nothing = with_column(rows, "latency_s", pa.nulls(2))
+    for table in (rows.select(rows.column_names[::-1]), rows.append_column("rank", pa.array([1, 2])), strings, single):
+        assert everything(write(table))[::-1] == [FULL, FAILED]
+    assert {item.latency_s for item in everything(write(nothing))} == {None}
+
+
+@pytest.mark.parametrize("name", prediction_rows.PREDICTION_SCHEMA.names)
+def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_are_read(tmp_path, rows, write, name):
+    for table in (rows.drop_columns([name]), with_column(rows, name, pa.array([[True], [False]]))):
+        (column, _, _) = prediction_rows.differing_columns(table)[0]
+        assert column == name
+        path = write(table, "part-1.parquet")
+        assert f"part-1.parquet holds no predictions ({name}: found " in refusal(everything, path)
+        assert "holds no predictions" in refusal(prediction_files.merge_runs, [path], tmp_path / "new.parquet")
+        assert "move it out of the run's folder" in refusal(prediction_files.ids_done, tmp_path, {})
+    assert not (tmp_path / "new.parquet").exists()
+
+
+@pytest.mark.parametrize("name", ["query_id", "confidence"])
+def test_a_column_that_is_there_twice_is_refused(rows, write, name):
+    path = write(rows.append_column(name, rows[name]))
+    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'validate'" in refusal(
+        everything, path
+    )
+    same = pa.array([[]] * 2, type=pa.list_(pa.struct([*rows.schema.field("candidates").type.value_type] * 2)))
+    assert "(candidates: found list<" in refusal(everything, write(with_column(rows, "candidates", same)))
+
+
+def test_where_a_clock_was_set_back_the_row_that_was_written_last_still_counts(tmp_path, monkeypatch):
+    late = replace(FAILED, status="timeout", message="too late")
+    for now_ns, row in ((2_000, late), (1_000, FAILED), (1_500, replace(FAILED, status="ok", message=""))):
+        monkeypatch.setattr(prediction_files.time, "time_ns", lambda now_ns=now_ns: now_ns)
+        prediction_files.write_part(tmp_path / "run", [row])
+    assert [item.status for item in everything(tmp_path / "run")] == ["ok"]
+    assert len(prediction_files.parts_of(tmp_path / "run")) == 3
+    assert prediction_files.ids_done(tmp_path / "run", {"a": ""}) == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("query_id", None, "(query_id: found None, expected the id of a query)"),
+        ("status", None, "(status: found None, expected ok, timeout"),
+        ("candidates", [{"easting_m": None}], "(candidates: found easting_m is nan, expected -1e+08..1e+08)"),
+        ("candidates", [{"easting_m": float("nan")}], "easting_m is nan"),
+        ("candidates", [{"easting_m": 1e300}], "easting_m is 1e+300"),
+        ("candidates", [{"yaw_deg": 1e300}], "yaw_deg is 1e+300, expected -1e+06..1e+06"),
+        ("candidates", [{"scale": 0.0}], "(candidates: found scale is 0, expected 0.001..1000)"),
+        ("candidates", [None], "(candidates: found a null, expected poses with scores)"),
+        ("candidates", None, "(candidates: found null, expected a list, empty where there is no pose)"),
+        ("candidates", [{}] * 1001, "(candidates: found 1001 poses, expected at most 1000)"),
+        ("confidence", 1.5, "(confidence: found confidence is 1.5, expected 0..1 or null)"),
+        ("latency_s", float("inf"), "(latency_s: found latency_s is inf, expected 0..604800 or null)"),
+        ("latency_s", -1.0, "latency_s is -1"),
+        ("message", "x" * 1_000_000, "expected a line of at most 300 printable characters)"),
+        ("message", "two\nlines", "(message: found 'two\\nlines', expected"),
+        ("diagnostics", [("margin", 1.0), ("seen", 2.0), ("margin", 3.0)], "(diagnostics: found 'margin' twice"),
+        ("diagnostics", [("margin", None)], "diagnostics['margin'] is nan"),
+        ("diagnostics", [("", 1.0)], "found the name '', expected names of 1..64 printable characters"),
+        ("diagnostics", [(str(at), 0.0) for at in range(65)], "found 65 numbers, expected at most 64"),
+    ],
+)
+def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words):
+    row = rows.to_pylist()[0]
+    if name == "candidates":
+        value = value and [None if item is None else row["candidates"][0] | item for item in value]
+    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=prediction_rows.PREDICTION_SCHEMA)
+    pq.write_table(table, tmp_path / "mine.parquet")
+    told = refusal(everything, tmp_path / "mine.parquet")
+    assert "mine.parquet, row 1, is no prediction (" in told
+    assert words in told
+    assert told.endswith("'validate' says all that is wrong")
+
+
+def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows, write):
+    folders = [tmp_path / name for name in ("one", "two", "three")]
+    for folder, found in zip(folders, ("aa", "aa", "bb"), strict=True):
+        prediction_files.write_part(folder, [FULL])
+        prediction_files.write_run(folder, {"hash": found, "matcher": {"name": "mine", "version": found[0]}})
+    into = tmp_path / "all.parquet"
+    assert prediction_files.merge_runs(folders[:2], into) == 1
+    assert prediction_files.merge_runs([folders[2], write(rows)], into) == 2  # a file does not say whose it is
+    whole = into.read_bytes()
+    assert "never mixed" in refusal(prediction_files.merge_runs, folders[1:], into)
+    told = refusal(prediction_files.merge_runs, folders, into)
+    assert f"{folders[2]} holds answers of mine b (bb), {folders[0]} those of mine a (aa)" in told
+    (folders[2] / prediction_files.RUN).write_text('{"hash": 1, "matcher": 2}')
+    assert "None None (1)" in refusal(prediction_files.merge_runs, folders, into)
+    assert into.read_bytes() == whole
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", "[" * 100_000, "\x00", '{"a": NaN}', '{"a": 1, "a": 2}'])
+def test_a_damaged_run_json_is_told_in_one_line(tmp_path, text):
+    (tmp_path / prediction_files.RUN).write_text(text)
+    line = refusal(prediction_files.read_run, tmp_path)
+    assert "run.json is damaged (" in line
+    assert line.endswith("remove it and run again, the parts beside it are kept")
+
+
+def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):
+    assert prediction_files.read_run(tmp_path) is None
+    for about in ({"hash": "aa"}, {"hash": "bb", "title": "Köln"}):
+        prediction_files.write_run(tmp_path / "run", about)
+        assert prediction_files.read_run(tmp_path / "run") == about
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [prediction_files.RUN]
+
+
+def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for folder in (tmp_path / "file", tmp_path / "file" / "deep"):
+        assert f"{folder} cannot be written (" in refusal(prediction_files.write_run, folder, {})
+        assert f"{folder} cannot be written (" in refusal(prediction_files.write_part, folder, [FULL])
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_full_disk_leaves_the_run_json_that_was_there(tmp_path, monkeypatch):
+    prediction_files.write_run(tmp_path, {"hash": "aa"})
+
+    def full(self, text, **_):
+        self.write_bytes(text[:4].encode())
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    assert "No space left on device" in refusal(prediction_files.write_run, tmp_path, {"hash": "bb"})
+    assert prediction_files.read_run(tmp_path) == {"hash": "aa"}
+    assert [path.name for path in tmp_path.iterdir()] == [prediction_files.RUN]

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever a matcher's process sends is a reply or one line that says why it is none; never anything else."""
+
+import json
+import socket
+import threading
+import time
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.bounds import MOST_MESSAGE
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Match, check_match
+from sasgeo_bench.running import wire
+from sasgeo_bench.running.replies import read_reply
+from sasgeo_bench.tasks.query import Head
+
+CARD = {
+    **dict.fromkeys(("name", "version", "title", "source", "ours", "licence"), "mine"),
+    "tracks": ["localization"],
+    "needs": [],
+    "limits": "",
+    "trained_on": [],
+}
+SOUND = {
+    "load": {"status": "ok", "card": CARD, "code": "0" * 64, "learns": False},
+    "learn": {"status": "ok", "seconds": 1.0, "learned": "text"},
+    "prepare": {"status": "ok", "seconds": 1.0, "grown_bytes": 5},
+    "match": {
+        "status": "ok",
+        "seconds": 0.5,
+        "cpu_s": 0.25,
+        "match": {"candidates": [[1, 2.0, 3.0, 1.0, 7.0]], "confidence": None, "diagnostics": [["margin", 1.0]]},
+    },
+}
+KINDS = tuple(SOUND)
+
+
+def put(channel, data):
+    with suppress(OSError):  # nobody reads what is too long
+        channel.sendall(data)
+
+
+def received(text, kind="match", nonce="7", length=None):
+    """What comes of the bytes of a message, as a runner reads them."""
+    ours, theirs = socket.socketpair()
+    with theirs, ours:
+        threading.Thread(target=put, args=(theirs, (length or len(text)).to_bytes(4, "big") + bytes(4) + text)).start()
+        said, _ = wire.receive(ours, deadline=time.monotonic() + 60, most_bytes=wire.MOST_BYTES)
+    return read_reply(kind, said, nonce=nonce)
+
+
+def sound(kind, **changes):
+    return json.dumps({**SOUND[kind], "nonce": "7", **changes}).encode()
+
+
+def test_who_goes_without_an_answer_is_told_apart_from_who_sends_too_much():
+    ours, theirs = socket.socketpair()
+    with ours:
+        theirs.close()
+        with pytest.raises(wire.Closed, match="closed its connection to the runner without an answer"):
+            wire.receive(ours)
+    with pytest.raises(wire.TooLong, match="an answer of 2147483647 bytes, at most"):
+        received(b"x" * 10, length=2**31 - 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sound_answer_is_read(kind):
+    reply = received(sound(kind), kind)
+    assert reply.status == "ok"
+    assert reply.seconds is None, "the runner's clock alone says how long it took"
+    failed = received(json.dumps({"nonce": "7", "status": "refused", "message": "why"}).encode(), kind)
+    assert (failed.status, failed.message) == ("refused", "why")
+
+
+def answer(candidates="[]", confidence="null", diagnostics="[]", seconds="0.1"):
+    row = f'{{"candidates": {candidates}, "confidence": {confidence}, "diagnostics": {diagnostics}}}'
+    return f'{{"nonce": "7", "status": "ok", "seconds": {seconds}, "cpu_s": 0.1, "match": {row}}}'
+
+
+def test_the_shape_of_an_answer_by_hand_is_that_of_a_sound_one():
+    assert received(answer().encode()).match == Match(poses=[], scores=[])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        answer(candidates="[[1e300, 0, 0, 1, 1]]"),
+        answer(candidates="[[0, 0, 1e300, 1, 1]]"),
+        answer(candidates="[[0, 0, 0, 0, 1]]"),
+        answer(candidates="[[0, 0, 0, 1, 1e300]]"),
+        answer(candidates=f"[[1{'0' * 400}, 0, 0, 1, 1]]"),
+        answer(candidates=f"[[1{'0' * 5000}, 0, 0, 1, 1]]"),
+        answer(candidates="[[true, 0, 0, 1, 1]]"),
+        answer(candidates='[["1", 0, 0, 1, 1]]'),
+        answer(candidates="[[0, 0, 0, 1]]"),
+        answer(candidates="[[0, 0, 0, 1, 1, 1]]"),
+        answer(candidates="[[[0, 0], 0, 0, 1, 1]]"),
+        answer(candidates="[null]"),
+        answer(candidates="null"),
+        answer(candidates=str([[0, 0, 0, 1, 1]] * 1001)),
+        answer(candidates="[" * 100_000 + "]" * 100_000),
+        answer(confidence="NaN"),
+        answer(confidence="1.5"),
+        answer(confidence="true"),
+        answer(diagnostics='[["a", 1], ["a", 2]]'),
+        answer(diagnostics='[["\\ud800", 1]]'),
+        answer(diagnostics='[["two\\nlines", 1]]'),
+        answer(diagnostics=json.dumps([["x" * 65, 1]])),
+        answer(diagnostics='[["", 1]]'),
+        answer(diagnostics=json.dumps([[str(at), 1] for at in range(65)])),
+        answer(diagnostics='[["a", Infinity]]'),
+        answer(diagnostics='{"a": 1}'),
+        answer(seconds="Infinity"),
+        answer(seconds="-1"),
+        answer(seconds="1e9"),
+        answer().replace('"cpu_s"', '"seconds": 0.1, "cpu_s"'),
+        answer().replace('"cpu_s"', '"more": 0.1, "cpu_s"'),
+        answer().replace('"7"', '"8"'),
+        answer().replace('"ok"', '"timeout"'),
+        answer().replace('"ok"', "[]"),
+        "{}",
+        "[]",
+        "",
+        "\x00",
+        '{"nonce": "7", "status": "crash", "message": "\\ud800"}',
+        json.dumps({"nonce": "7", "status": "crash", "message": "x" * (MOST_MESSAGE + 1)}),
+        json.dumps({"nonce": "7", "status": "crash", "message": "x" * 900_000}),
+    ],
+    ids=lambda text: text[-60:].encode("ascii", "replace").decode(),
+)
+def test_what_is_no_answer_is_one_line(text):
+    with pytest.raises((MatchError, wire.Garbled)) as refused:
+        received(text.encode())
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) <= MOST_MESSAGE
+
+
+@pytest.mark.parametrize(
+    "card",
+    [
+        *([], [[]], None, "mine", 5, {}, {**CARD, "more": 1}),
+        *({**CARD, "name": value} for value in (["mine"], None, 5, "", "\ud800", "x" * 5000, "two\nlines")),
+        *({**CARD, "tracks": value} for value in ("localization", [], ["other"], {"localization": 1}, [["a"]], None)),
+        *({**CARD, "trained_on": value} for value in ("munich", [5], ["a"] * 1001, {"a": ["b"]})),
+    ],
+    ids=lambda card: ascii(card)[-40:],
+)
+def test_a_card_that_is_none_is_one_line(card):
+    with pytest.raises(MatchError) as refused:
+        received(sound("load", card=card), "load")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_card_with_a_field_twice_and_a_message_that_is_too_long_are_refused_before_they_are_looked_at():
+    with pytest.raises(wire.Garbled, match="a name is there twice"):
+        received(sound("load").replace(b'"title"', b'"name": "other", "title"'), "load")
+    with pytest.raises(wire.Closed, match="an answer of 2000050 bytes, at most 1048576 are read"):
+        received(json.dumps({"nonce": "7", "status": "crash", "message": "x" * 2_000_000}).encode()[:-2] + b"xxxx")
+
+
+# Any JSON, and JSON that is nearly an answer: one value of a sound one is replaced by whatever there is.
+texts = st.text(st.characters(), max_size=8)  # with halves of pairs of surrogates
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | texts | st.just(10**400),
+    lambda inner: st.lists(inner, max_size=6) | st.dictionaries(texts, inner, max_size=4),
+    max_leaves=12,
+)
+
+
+def paths(value):
+    yield ()
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield from ((key, *path) for path in paths(inner))
+
+
+def replaced(value, path, new):
+    if not path:
+        return new
+    copied = value.copy()
+    copied[path[0]] = replaced(value[path[0]], path[1:], new)
+    return copied
+
+
+def check_line(text):
+    assert "\n" not in text
+    assert len(text) <= MOST_MESSAGE
+
+
+@st.composite
+def nearly(draw):
+    kind = draw(st.sampled_from(KINDS))
+    path = draw(st.sampled_from(list(paths(SOUND[kind]))))
+    changed = replaced(SOUND[kind], path, draw(values))
+    return kind, {**changed, "nonce": "7"} if isinstance(changed, dict) else changed
+
+
+@given(nearly())
+def test_any_json_is_a_reply_or_one_line(case):
+    kind, said = case
+    try:
+        reply = received(json.dumps(said).encode(), kind)
+    except (MatchError, wire.Garbled) as refused:
+        check_line(str(refused))
+        return
+    assert reply.status in {"ok", "crash", "invalid", "refused"}
+    assert reply.message.isprintable()
+    for match in [reply.match] if reply.match is not None else []:
+        assert all(abs(pose.easting_m) <= 1e8 for pose in match.poses)
+        assert all(name.isprintable() for name in match.diagnostics)
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_refused_in_one_line(data):
+    with pytest.raises((MatchError, wire.Garbled)):
+        received(data)
+
+
+# --- the same bounds in the matcher's own process ---------------------------------------------------------------------
+
+HEAD = Head(
+    **dict.fromkeys(("query_id", "suite", "part", "region"), "a"),
+    track="localization",
+    suite_version=1,
+    view_cells=64,
+    cell_size_m=1.0,
+    prior_group="none",
+    candidates=(),
+)
+HERE = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+
+
+class Endless:
+    """Is longer than it says."""
+
+    def __len__(self):
+        return 1
+
+    def __iter__(self):
+        while True:
+            yield 1.0
+
+
+class Unsteady(dict):
+    """Gives a name twice."""
+
+    def items(self):
+        return [("a", 1.0), ("a", 2.0)]
+
+
+@pytest.mark.parametrize(
+    ("match", "words"),
+    [
+        (Match(poses=[Pose(easting_m=1e300, northing_m=0.0, yaw_deg=0.0)], scores=[1.0]), "easting_m is 1e.300"),
+        (Match(poses=[Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0, scale=1e9)], scores=[1.0]), "scale is 1e.09"),
+        (Match(poses=[HERE], scores=[1e300]), r"score is 1e.300, expected a finite number within -3\.4"),
+        (Match(poses=[HERE], scores=Endless()), "1001 scores for 1 poses"),
+        (Match(poses=Endless(), scores=[1.0]), "a pose is a float"),
+        (Match(poses=(), scores=(), diagnostics={"\ud800": 1.0}), "the name .*expected 1..64 printable characters"),
+        (Match(poses=(), scores=(), diagnostics={"x" * 65: 1.0}), "expected 1..64 printable characters"),
+        (Match(poses=(), scores=(), diagnostics={1: 1.0, "1": 2.0}), "2 entries under 1 names"),
+        (Match(poses=(), scores=(), diagnostics=Unsteady(a=1, b=2)), "2 entries under 1 names"),
+        (Match(poses=(), scores=(), diagnostics={"a": 1e300}), r"diagnostics\['a'\] is 1e.300"),
+    ],
+)
+def test_a_matchers_own_process_keeps_to_the_same_bounds(match, words):
+    with pytest.raises(MatchError, match=words):
+        check_match(match, HEAD, top_k=5)

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A matcher may do what it likes: it costs its own rows, and nothing of it is left."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import psutil
+import pytest
+
+from sasgeo_bench.running import leak_scan, sandbox
+from sasgeo_bench.running.worker import Limits, Reach, Worker
+from sasgeo_bench.tasks import task_files, task_rows
+
+# Only what hangs has to run into its time; on a busy machine all others may take theirs.
+PATIENT = Limits(match_s=600.0, memory_bytes=800 * 10**6)
+TELLING = b" ".join((b"this", b"tells", b"answers"))  # as `hostile.ReadsAllBeside` looks for it
+HASTY = replace(PATIENT, match_s=1.0)
+HAS_LANDLOCK = sandbox.landlock_version() > 0
+shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlock to refuse files with")
+
+
+def ask(place, task, name, *, limits=PATIENT, times=1, is_shut_in=True):
+    """The replies of a hostile matcher to the first query, and its worker after its end."""
+    query = task_rows.query_bytes(next(iter(task_files.read_queries(task))))
+    region = place / "out" / "regions" / task.name
+    reach = Reach(readable=[region], hidden=[place / "out" / "truth", place / "out" / "runs"], is_shut_in=is_shut_in)
+    with Worker(spec=f"hostile:{name}", reach=reach, limits=limits) as worker:
+        ready = worker.prepare(region)
+        if ready.status != "ok":
+            return [ready], worker
+        return [worker.match(query, top_k=5) for _ in range(times)], worker
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "words"),
+    [
+        ("Plain", "ok", ""),
+        ("Hangs", "timeout", "no answer within 1 s"),
+        ("Segfaults", "crash", "died by SIGSEGV"),
+        ("DiesByAnySignal", "crash", "died by signal 40"),
+        ("Exits", "crash", "ended with exit status 3: last words"),
+        ("Raises", "crash", "ValueError: no idea where this is"),
+        ("RaisesInPrepare", "crash", "ValueError: no index today"),
+        ("Leaks", "crash", "more than the 800 MB of memory that are allowed|out of memory"),
+        ("Forks", "ok", ""),
+        ("Prints", "ok", ""),
+        ("ScoresNan", "invalid", "score is nan, expected a finite number"),
+        ("SureByWords", "invalid", "confidence is a str, expected a number"),
+        ("SureBeyondNumbers", "invalid", "confidence is a int, expected a number"),
+        ("MeasuresItself", "invalid", "an answer that is none"),
+        ("LeavesAtOnce", "invalid", "hostile:LeavesAtOnce: cannot be made .SystemExit: 0"),
+        ("ReturnsText", "invalid", "match.. returned str, expected"),
+        ("ReturnsMany", "invalid", "returned 1000000 poses, expected at most top_k = 5"),
+        ("LiesOnTheWire", "crash", "an answer of 2147483647 bytes"),
+        ("FarAway", "invalid", "an answer that is none: match.candidates.0.0: Input should be less than"),
+        ("CardOfAList", "invalid", "an answer that is none: "),
+        ("OddName", "invalid", "the name .*, expected 1..64 printable characters"),
+        ("PoseFarAway", "invalid", "easting_m is 1e.300, expected a finite number within"),
+        ("RaisesWhatNobodyCatches", "crash", "ended with exit status 1"),
+        ("AnswersLiars", "crash", "ended with exit status 1"),
+        ("NoMatcher", "invalid", "NoMatcher is not a matcher, it has no prepare and no match"),
+        ("NoCard", "invalid", "card is a NoneType, expected a"),
+        ("BadCard", "invalid", "licence is empty"),
+        ("NoSuchClass", "invalid", "cannot be imported"),
+    ],
+)
+def test_whatever_a_matcher_does_becomes_a_status_and_a_line(place, task, name, status, words):
+    (reply,), _ = ask(place, task, name, limits=HASTY if name == "Hangs" else PATIENT)
+    assert reply.status == status, reply.message
+    assert re.search(words, reply.message), reply.message
+    assert "\n" not in reply.message
+
+
+def test_a_map_that_takes_too_long_is_a_timeout(place, task):
+    (reply,), _ = ask(place, task, "HangsInPrepare", limits=Limits(prepare_s=1.0))
+    assert (reply.status, reply.message) == ("timeout", "no answer within 1 s")
+
+
+def test_after_a_crash_the_next_query_has_a_fresh_process(place, task):
+    replies, worker = ask(place, task, "Exits", times=3)
+    assert [reply.status for reply in replies] == ["crash"] * 3
+    assert worker.starts == 3
+
+
+@shut_in
+def test_the_truth_is_out_of_reach(place, task):
+    (reply,), worker = ask(place, task, "ReadsTruth")
+    assert "read the truth" not in reply.message
+    (listed,), _ = ask(place, task, "ListsFolders")
+    assert listed.match.diagnostics["truth files"] == 0
+    assert worker.isolation["truth"] != "not protected"
+
+
+@shut_in
+@pytest.mark.parametrize("folder", ["", "checkout"])
+def test_truths_of_other_runs_beside_the_code_are_out_of_reach_too(place, task, tmp_path, monkeypatch, folder):
+    other = tmp_path / folder / "out" if folder else tmp_path / "out"
+    for name in ("tasks", "truth/clean/vaduz", "regions/vaduz"):
+        (other / name).mkdir(parents=True)
+    (other / "truth" / "clean" / "vaduz" / "truth.parquet").write_bytes(b"answers")
+    monkeypatch.syspath_prepend(str(other.parent))
+    (reply,), _ = ask(place, task, "ReadsTruth")
+    assert "read the truth" not in reply.message
+    (trusted,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
+    assert "read the truth" in trusted.message
+
+
+TELLS = (
+    *("results/base/pack.json", "results/base/predictions/a.parquet", "results/base/more/deep/a.parquet"),
+    *(
+        "kept/truths.parquet",
+        "asked/clean/vaduz/queries.parquet",
+        "copied/clean/vaduz/truth.parquet",
+        "copied/clean/vaduz/truth.json",
+    ),
+    *("data/truth/clean/vaduz/truth-test.parquet", "answered/part-1-2.parquet", ".git/objects/ab/cd"),
+)
+FOLDERS_THAT_TELL = (
+    ("board.json", "leaderboard.parquet", "pictures/cases/one.png"),
+    ("site.json", "index.html", "cases/one.png"),
+    ("release.json", "SHA256SUMS", "truth/clean/vaduz/truth.parquet"),
+    ("region.json", "layers.tif"),
+    ("submission.json", "predictions/a.parquet"),
+)
+
+
+@shut_in
+@pytest.mark.parametrize("depth", ["", "one/two/three/four"])
+def test_whatever_beside_the_code_tells_answers_is_out_of_reach(place, task, tmp_path, monkeypatch, depth):
+    names = (*TELLS, *(f"other{at}/{name}" for at, names in enumerate(FOLDERS_THAT_TELL) for name in names))
+    for name in (*names, "harmless/notes.txt"):
+        (tmp_path / depth / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / depth / name).write_bytes(TELLING)
+    (tmp_path / "link").symlink_to(place / "out" / "truth")
+    (place / "out" / "truth" / "copied").write_bytes(TELLING)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    (reply,), worker = ask(place, task, "ReadsAllBeside")
+    assert reply.match.diagnostics == {"told": 1}, "the harmless one alone"
+    assert "not looked for" not in worker.isolation["truth"]
+    (trusted,), _ = ask(place, task, "ReadsAllBeside", is_shut_in=False)
+    assert trusted.match.diagnostics["told"] > len(names) + 1
+
+
+@shut_in
+def test_a_matcher_that_lies_among_stored_results_runs_and_does_not_read_them(place, task, tmp_path, monkeypatch):
+    shutil.copy(place / "hostile.py", tmp_path / "hostile.py")
+    for name in ("pack.json", "truths.parquet", "predictions/a.parquet"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(TELLING)
+    monkeypatch.chdir(tmp_path)
+    (reply,), worker = ask(place, task, "ReadsAllBeside")
+    assert reply.message == ""
+    assert reply.match.diagnostics == {"told": 0}
+    assert worker.isolation["truth"] != "not protected"
+
+
+@shut_in
+def test_where_not_all_was_searched_the_run_says_so(place, task, monkeypatch):
+    monkeypatch.setattr(leak_scan, "walk_code", lambda code: leak_scan.walk([*map(str, code)], most_entries=3))
+    monkeypatch.setattr("sasgeo_bench.running.worker.walk_code", leak_scan.walk_code)
+    _, worker = ask(place, task, "Plain")
+    assert "stored results beyond 3 files beside the code were not looked for" in worker.isolation["truth"]
+
+
+@shut_in
+def test_command_lines_of_others_are_out_of_reach(place, task):
+    command = [sys.executable, "-c", "import time; time.sleep(1000)", "my-secret-seed"]
+    with subprocess.Popen(command) as other:  # noqa: S603 - ours
+        try:
+            (reply,), worker = ask(place, task, "ReadsCommandLines")
+            (trusted,), _ = ask(place, task, "ReadsCommandLines", is_shut_in=False)
+        finally:
+            other.kill()
+    assert reply.match.diagnostics["secrets"] == 0
+    assert reply.match.diagnostics["own"] > 0
+    assert trusted.match.diagnostics["secrets"] == 1
+    assert "can be read" not in worker.isolation["processes"]
+
+
+def test_the_memory_of_a_map_is_that_of_the_matchers_own_process(place, task):
+    region = place / "out" / "regions" / task.name
+    with Worker(spec="hostile:Holds", reach=Reach(readable=[region], hidden=[]), limits=PATIENT) as worker:
+        assert worker.prepare(region).grown_bytes > 50 * 2**20
+
+
+def test_without_the_shutting_in_the_truth_would_be_read(place, task):
+    # So that the test above cannot pass by looking in the wrong place.
+    (reply,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
+    assert "read the truth" in reply.message
+
+
+@shut_in
+def test_results_cannot_be_written(place, task):
+    (reply,), _ = ask(place, task, "WritesResults")
+    assert reply.status == "refused"
+    assert not (place / "out" / "tasks" / "mine").exists()
+
+
+@shut_in
+def test_there_is_no_network(place, task):
+    (reply,), worker = ask(place, task, "Connects")
+    assert reply.status in {"refused", "crash"}
+    assert worker.isolation["network"] != "not cut"
+
+
+def test_the_environment_says_nothing_of_where_it_runs(place, task, monkeypatch):
+    monkeypatch.setenv("SASGEO_OUT", str(place))
+    monkeypatch.setenv("MY_SECRET", "1")
+    (reply,), _ = ask(place, task, "TellsEnvironment")
+    assert {"HOME", "PATH"} <= set(reply.match.diagnostics)
+    assert not {"SASGEO_OUT", "SASGEO_EXTRACTS", "MY_SECRET", "PYTHONPATH"} & set(reply.match.diagnostics)
+
+
+@pytest.mark.parametrize("name", ["Forks", "Hangs", "Plain"])
+def test_nothing_is_left_of_a_matcher(place, task, name):
+    before = {child.pid for child in psutil.Process(os.getpid()).children(recursive=True)}
+    _, worker = ask(place, task, name, limits=HASTY if name == "Hangs" else PATIENT)
+    after = psutil.Process(os.getpid()).children(recursive=True)
+    assert [child for child in after if child.pid not in before] == []
+    assert worker.peak_bytes > 50 * 2**20
+
+
+def test_an_answer_that_came_before_its_question_is_refused_and_the_process_is_replaced(place, task):
+    replies, worker = ask(place, task, "AnswersInAdvance", limits=PATIENT, times=3)
+    assert [reply.status for reply in replies] == ["ok", "invalid", "ok"]
+    assert "it was not made for this question" in replies[1].message
+    assert worker.starts == 2
+
+
+def test_the_runners_clock_counts_whatever_a_process_says_of_its_own(place, task):
+    (reply,), _ = ask(place, task, "SetsItsClock", limits=PATIENT)
+    assert reply.own_s == 0.0
+    assert reply.seconds >= 0.3  # it sleeps so long
+    assert reply.cpu_s <= reply.seconds * os.cpu_count() + 0.2
+
+
+def test_nothing_is_left_of_a_scratch_folder_however_deep_it_is(place, task, monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (reply,), _ = ask(place, task, "DigsDeep", limits=PATIENT)
+    assert reply.status == "ok", reply.message
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What classes are worth: Eq. 5 by hand, the gains of the arm where fitted, and the weight of each cell of a map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.sasgeo.class_weights import (
+    FITTED,
+    HAND,
+    check_age,
+    check_classes,
+    check_season,
+    side_by_side,
+    weight_map,
+    worth_of,
+    worth_table,
+)
+from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.rates import ClassRates
+from sasgeo_bench.sasgeo.seasons import by_hand
+from sasgeo_bench.sasgeo.weights import information
+
+NAMES = load_taxonomy().names
+HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
+
+
+def test_by_hand_the_worth_is_sigma_of_eq_5():
+    hand = [load_taxonomy()[name].persistence for name in NAMES]
+    sigma = [one.prior * np.exp(-7 * one.vanish_per_year) for one in hand] * by_hand("snow", NAMES)
+    assert worth_of(Learnt.by_hand(NAMES), HAND, age_years=7.0, season="snow") == pytest.approx(sigma)
+
+
+def test_gains_and_information_shrink_as_the_map_ages():
+    learnt = replace(Learnt.by_hand(["building"]), rates=(HOUSE,))
+    table = worth_table(learnt, FITTED)
+    for column in ("worth", "agree", "information"):
+        assert table[column].is_monotonic_decreasing
+    assert table["missed"].is_monotonic_increasing
+
+
+def test_a_fitted_table_holds_the_gains_of_the_arm_and_its_exponents():
+    learnt = replace(Learnt.by_hand(NAMES), temper=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(13, 0.4))
+    table = worth_table(learnt, FITTED, ages_years=[3.0], season="leaf_on")
+    gains = FITTED.gains(learnt, age_years=3.0, season="leaf_on")
+    assert table["class"].tolist() == list(NAMES)
+    assert table["missed"].to_numpy() == pytest.approx(gains.missed)
+    assert table["worth"].to_numpy() == pytest.approx(100 * learnt.temper * gains.agree)
+
+
+def test_information_out_of_season_is_less():
+    assert 0 < information(HOUSE, age_years=1.0, persists=0.5) < information(HOUSE, age_years=1.0)
+
+
+def test_tables_stand_side_by_side_in_the_order_of_the_classes():
+    tables = {
+        name: worth_table(Learnt.by_hand(NAMES), arm, ages_years=[0.0, 5.0]) for name, arm in (("a", HAND), ("b", HAND))
+    }
+    wide = side_by_side(tables, "worth")
+    assert wide.index.tolist() == list(NAMES)
+    assert wide.columns.tolist() == [("a", 0.0), ("a", 5.0), ("b", 0.0), ("b", 5.0)]
+
+
+def test_a_cell_weighs_the_sum_of_its_classes_times_its_rarity():
+    layers = np.array([[[1, 1, 0, 255]], [[0, 1, 0, 255]]], dtype=np.uint8)
+    rarity = np.array([[2.0, 3.0, 5.0, 7.0]], dtype=np.float32)
+    weights = weight_map(layers, np.array([0.5, 0.25]), rarity)
+    assert weights[0, :3].tolist() == [1.0, 2.25, 0.0]
+    assert np.isnan(weights[0, 3])
+
+
+@pytest.mark.parametrize("age", [-1.0, float("nan"), float("inf")])
+def test_what_is_no_age_is_refused(age):
+    with pytest.raises(ConfigError, match="at least 0 years"):
+        check_age(age)
+
+
+def test_what_is_no_season_or_no_class_is_refused():
+    with pytest.raises(ConfigError, match=r"no season 'spring' \(leaf_on"):
+        check_season("spring")
+    with pytest.raises(ConfigError, match="no class 'lamp'"):
+        check_classes(Learnt.by_hand(["water"]), ["lamp"])
+    with pytest.raises(ConfigError, match="nothing was learnt of the map's class 'railway'"):
+        check_classes(Learnt.by_hand(["water"]), ["water", "railway"])

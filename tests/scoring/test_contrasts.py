@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registered contrasts: a real difference is found, none is a null, and what cannot be decided is said to be so."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.scoring.contrasts import COLUMNS, Contrast, contrast_frame, hold_contrasts
+from sasgeo_bench.scoring.intervals import wilson
+from tests.scoring.test_tables import scores
+
+CONTRAST = Contrast(name="graph", first="with", second="without", suites=("occlusion",))
+
+
+def errors(share, count=600, seed=1):
+    """Errors of which a share is right; the same queries are right for the same seed."""
+    return np.where(np.random.default_rng(seed).random(count) < share, 1.0, 99.0)
+
+
+def held(contrast, judged=None, **tables):
+    return hold_contrasts([contrast], tables, judged or {}, draws=400)[0]
+
+
+def test_a_real_difference_is_found_with_its_discordant_pairs():
+    better, worse = errors(0.8), errors(0.6)
+    found = held(CONTRAST, **{"with": scores(better, blocks=60), "without": scores(worse, blocks=60)})
+    assert (found.first_only, found.second_only) == (int(((better < 25) & (worse > 25)).sum()), 0)
+    assert found.difference == pytest.approx((better < 25).mean() - (worse < 25).mean())
+    assert 0 < found.lo < found.difference < found.hi
+    assert found.p_holm < 0.001
+    assert found.verdict == "with is better"
+    other = held(
+        replace(CONTRAST, first="without", second="with"),
+        **{"with": scores(better, blocks=60), "without": scores(worse, blocks=60)},
+    )
+    assert other.verdict == "with is better"
+    assert other.difference == -found.difference
+
+
+def test_a_small_difference_is_told_to_be_small():
+    better = errors(0.5)
+    worse = better.copy()
+    worse[np.flatnonzero(better < 25)[:12]] = 99.0
+    found = held(CONTRAST, **{"with": scores(better, blocks=60), "without": scores(worse, blocks=60)})
+    assert found.verdict == "with is better, by less than would matter"
+
+
+def test_no_difference_is_a_null_and_says_how_sure_it_is():
+    same = errors(0.7)
+    found = held(CONTRAST, **{"with": scores(same, blocks=60), "without": scores(same, blocks=60)})
+    assert found.verdict == "null: any difference is smaller than would matter"
+    assert found.p_exact == 1.0
+    few = errors(0.7, 40)
+    unsure = held(CONTRAST, **{"with": scores(few, blocks=10), "without": scores(errors(0.7, 40, seed=9), blocks=10)})
+    assert unsure.verdict == "null: no difference shown, and one that matters is not ruled out"
+
+
+def test_of_few_sites_no_difference_is_not_ruled_out():
+    same = {name: scores(np.ones(6), blocks=6) for name in ("with", "without")}
+    found = held(CONTRAST, **same)
+    most = wilson(0, 6).hi  # neither won a query: each may have, as often as 0 of 6 allows
+    assert (found.lo, found.hi) == pytest.approx((-most, most))
+    assert found.verdict == "null: no difference shown, and one that matters is not ruled out"
+
+
+def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
+    # Two blocks of two sites of ten queries: the first is right at all of them, the second at none.
+    sites = {"block": [f"b{at // 20}" for at in range(40)], "pair_id": [f"s{at // 10}" for at in range(40)]}
+    found = held(CONTRAST, **{"with": scores(np.ones(40), **sites), "without": scores(99 * np.ones(40), **sites)})
+    won, lost = wilson(4, 4), wilson(0, 4)
+    assert found.lo == pytest.approx(1 - math.hypot(1 - won.lo, lost.hi))
+    assert (found.difference, found.hi) == (1.0, 1.0)
+
+
+def test_few_blocks_decide_nothing():
+    found = held(CONTRAST, **{"with": scores(np.ones(100), blocks=5), "without": scores(99 * np.ones(100), blocks=5)})
+    assert found.verdict == "not decided: 5 blocks, at least 6 are needed"
+
+
+def test_kinds_choose_and_controls_and_falsifiers_do_not_count():
+    roles = ["stress", "stress", "control", "falsifier"] * 60
+    kinds = ["U1 rectangles", "U2 border", "control", "U2 none"] * 60
+    table = scores(np.ones(240), blocks=60, role=roles, kind=kinds)
+    found = held(replace(CONTRAST, kinds=("U2",)), **{"with": table, "without": table})
+    assert found.n == 60
+    assert held(CONTRAST, **{"with": table, "without": table}).n == 120
+    assert held(replace(CONTRAST, kinds=("U9",)), **{"with": table, "without": table}).verdict == "not tested: no query"
+
+
+def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
+    table = scores(errors(0.6), blocks=60)
+    is_false = ~table["is_right"].to_numpy(bool)
+    sure = table.assign(p_right=np.where(is_false, 0.1, 0.9))
+    blind = table.assign(p_right=np.random.default_rng(2).random(len(table)))
+    contrast = Contrast(
+        name="rejection",
+        first="mine x logistic",
+        second="mine x margin",
+        suites=("occlusion",),
+        metric="aurc",
+        min_effect=0.2,
+    )
+    judged = {("mine", "logistic"): sure, ("mine", "margin"): blind}
+    found = held(contrast, judged)
+    assert found.difference < found.hi < 0
+    assert found.verdict == "mine x logistic is better"
+    same = held(replace(contrast, first="mine x margin"), judged)
+    assert same.verdict.startswith("null")
+
+
+def test_holm_is_over_all_that_were_registered():
+    better, worse = errors(0.62), errors(0.58)
+    tables = {"with": scores(better, blocks=60), "without": scores(worse, blocks=60)}
+    alone = hold_contrasts([CONTRAST], tables, {}, draws=400)[0]
+    many = hold_contrasts([replace(CONTRAST, name=str(at)) for at in range(4)], tables, {}, draws=400)
+    assert many[0].p_holm == pytest.approx(min(1.0, 4 * alone.p_holm))
+    assert tuple(contrast_frame(many).columns) == COLUMNS
+
+
+def test_an_unknown_method_is_refused_by_name():
+    with pytest.raises(
+        ConfigError, match=r"contrast 'graph' names 'without', which is not on the board: there is with"
+    ):
+        held(CONTRAST, **{"with": scores([1.0])})

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rejection on a board: a matcher's own confidence as a rejector, and answers that leave nothing to choose."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.scoring.decisions import COST_RATIOS
+from sasgeo_bench.scoring.draws import ClusterDraws
+from sasgeo_bench.scoring.integrity import integrity_rows
+from sasgeo_bench.scoring.integrity_metric import aurc
+from sasgeo_bench.scoring.intervals import statistic_interval, wilson
+from sasgeo_bench.scoring.rejection import OWN, answers_of, own_word, turns, why_not
+from sasgeo_bench.scoring.rows import to_frame
+from sasgeo_bench.tasks.split import SplitFile, make_split
+from tests.scoring.test_tables import scores
+
+ERRORS = np.where(np.arange(120) % 3 > 0, 1.0, 99.0)  # two of three are right
+
+
+def rows_of(table, split=None):
+    return to_frame(list(integrity_rows("mine", OWN, own_word(table, split))))
+
+
+def pooled(table, split=None):
+    rows = rows_of(table, split)
+    rows = rows[(rows["suite"] == "all suites") & (rows["stratum"] == "as drawn")]
+    return {row["metric"]: row for _, row in rows.iterrows()}
+
+
+def split_of(kind):
+    names = ("place0", "place1", "place2", "place3")[: 2 if kind == "holdout" else 4]
+    grids = {
+        name: Grid(epsg=32632, west_m=5e5 + 1e5 * at, north_m=5.2e6, cell_size_m=1.0, rows=1000, cols=1000)
+        for at, name in enumerate(names)
+    }
+    parts = (
+        [{"part": part} for part in ("calibration", "test")]
+        if kind == "holdout"
+        else [{"half": half} for half in "aabb"]
+    )
+    places = [{"name": name, "regions": [name]} | part for name, part in zip(names, parts, strict=True)]
+    said = {"id": "two", "title": "Two", "kind": kind, "buffer_m": 0.0, "place": places}
+    return make_split(SplitFile.model_validate(said), grids)
+
+
+def test_the_own_word_of_a_matcher_needs_no_split():
+    sure = np.where(ERRORS < 25, 0.75, 0.25)
+    found = pooled(scores(ERRORS, confidence=sure))
+    assert found["e_aurc"]["value"] == 0.0  # every right fix before every false one
+    assert found["brier"]["value"] == found["ece"]["value"] ** 2 == 0.0625
+    assert found["aurc"]["lo"] < found["aurc"]["value"] < found["aurc"]["hi"]
+    assert found["aurc"]["n"] == 120
+    assert "coverage_at_risk_0.05" not in found
+
+
+def test_its_intervals_are_those_of_any_figure():
+    table = own_word(scores(ERRORS, confidence=np.random.default_rng(1).random(120)))
+    found = pooled(table.drop(columns="p_right"))["aurc"]
+    rows = rows_of(table)
+    assert (rows[(rows["suite"] == "all suites") & (rows["metric"] == "aurc")]["value"] == found["value"]).all()
+    some = answers_of(table)
+    drawn = ClusterDraws(blocks=table["block"].tolist(), seed=1, draws=1000)
+    slow = statistic_interval(lambda mass: aurc(some, mass), drawn)
+    assert (found["lo"], found["hi"]) == pytest.approx((slow.lo, slow.hi), abs=0.02)
+
+
+def test_equal_confidences_are_worth_as_much_as_chance():
+    found = pooled(scores(ERRORS, confidence=0.5))
+    assert found["aurc"]["value"] == pytest.approx(1 / 3)  # the share of false fixes at each coverage
+    assert found["ece"]["value"] == pytest.approx(2 / 3 - 0.5)
+    assert found["cost_20"]["value"] == pytest.approx(2 / 3)  # none is sure enough: two of three right ones withheld
+    assert found["cost_20_place"]["value"] == 1.0
+
+
+def test_a_matcher_that_says_nothing_has_no_own_word():
+    assert own_word(scores(ERRORS)).empty
+    assert rows_of(scores(ERRORS)).empty
+    assert rows_of(scores(ERRORS), split_of("crossfit")).empty
+
+
+def test_answers_without_a_confidence_are_trusted_least_and_leave_calibration_open():
+    sure = np.where(ERRORS < 25, 0.9, math.nan)
+    found = pooled(scores(ERRORS, confidence=sure))
+    assert found["e_aurc"]["value"] == 0.0
+    assert math.isnan(found["brier"]["value"])
+    assert math.isnan(found["ece"]["value"])
+
+
+def test_only_tracks_in_which_it_speaks_are_told():
+    both = scores(ERRORS, track=["localization", "retrieval"] * 60, confidence=[0.5, math.nan] * 60)
+    assert set(rows_of(both)["track"]) == {"localization"}
+
+
+@pytest.mark.parametrize("error_m", [1.0, 99.0])
+def test_nothing_but_right_or_nothing_but_false_fixes_is_told_plainly(error_m):
+    is_right = error_m < 25
+    table = scores(np.full(120, error_m), confidence=np.random.default_rng(2).random(120))
+    found = pooled(table, split_of("crossfit"))
+    assert found["aurc"]["value"] == (0.0 if is_right else 1.0)
+    expected = wilson(0 if is_right else 120, 120)
+    assert (found["aurc"]["lo"], found["aurc"]["hi"], found["aurc"]["interval"]) == (expected.lo, expected.hi, "wilson")
+    assert found["e_aurc"]["value"] == 0.0
+    assert found["coverage_at_risk_0.05"]["value"] == pytest.approx(1.0 if is_right else 0.0, abs=0.1)
+    reached = found["risk_reached_at_0.05"]["value"]
+    assert reached == 0.0 if is_right else math.isnan(reached)
+
+
+def test_ten_queries_of_a_site_are_one_place_to_rejection_too():
+    sure = np.random.default_rng(3).random(30)
+    one = scores(ERRORS[:30], confidence=sure)
+    ten = scores(
+        np.repeat(ERRORS[:30], 10),
+        confidence=np.repeat(sure, 10),
+        **{name: np.repeat(one[name], 10).to_numpy() for name in ("pair_id", "block", "place")},
+    )
+    for name in ("augrc", "coverage_at_risk_0.05"):
+        rows = [pooled(table, split_of("crossfit"))[name][["value", "lo", "hi"]].tolist() for table in (one, ten)]
+        assert rows[0] == pytest.approx(rows[1])
+
+
+def test_thresholds_of_a_split_are_chosen_on_other_places():
+    # Place 0 says 0.9 of its right fixes and 0.1 of the false ones; place 1 the other way round.
+    at = np.arange(120)
+    is_first, is_right = at % 2 == 0, ERRORS < 25
+    table = scores(ERRORS, confidence=np.where(is_first == is_right, 0.9, 0.1), block=[f"b{one % 8}" for one in at])
+    found = pooled(table, split_of("crossfit"))
+    assert found["risk_reached_at_0.05"]["value"] == 1.0
+    held = pooled(table.assign(part=np.where(is_first, "calibration", "test")), split_of("holdout"))
+    assert held["aurc"]["n"] == 60
+    assert held["risk_reached_at_0.01"]["value"] == 1.0
+    one_place = table.assign(place="place0")
+    assert "coverage_at_risk_0.05" not in pooled(one_place, split_of("crossfit"))
+
+
+def test_what_the_test_place_taught_calibrates_nobody():
+    table = scores(ERRORS, confidence=0.5)  # place0 and place1, of one half
+    apart = table.assign(place=table["place"].replace("place1", "place2"))  # of two halves
+    split = split_of("crossfit")
+    for rows, is_taught, expected in (
+        (table, False, [True, True]),
+        (table, True, [True, True]),
+        (apart, False, [False, False]),
+        (apart, True, [True, True]),
+    ):
+        found = list(turns(rows, split, is_taught=is_taught))
+        assert [turn.is_own for turn in found] == expected
+        assert all(turn.calibration.any() for turn in found) == (rows is table or not is_taught)
+        assert not any((turn.test & turn.calibration).any() for turn in found)
+    assert "half" in why_not(apart, is_taught=True)
+
+
+def test_withholding_all_is_no_cost_by_right_fixes_and_the_whole_one_by_places():
+    found = pooled(scores(np.full(120, 99.0), confidence=0.0))
+    for ratio in COST_RATIOS:
+        assert found[f"cost_{ratio:g}"]["value"] == 0.0
+        assert found[f"cost_{ratio:g}_place"]["value"] == 1.0
+
+
+def test_without_an_answer_a_query_is_false_at_full_coverage_and_no_part_of_calibration():
+    # Half of the answers are withheld or missing, the others right and sure: risk is 0 up to half of the coverage.
+    is_there = np.arange(120) % 2 == 0
+    status = np.where(is_there, "ok", np.where(np.arange(120) % 4 == 1, "ok", "missing"))
+    table = scores(np.where(is_there, 1.0, math.inf), confidence=np.where(is_there, 0.96, math.nan), status=status)
+    found = {name: row["value"] for name, row in pooled(table).items()}
+    false = np.arange(1, 61)
+    assert found["aurc"] == pytest.approx((false / (60 + false)).sum() / 120)
+    assert (found["brier"], found["ece"]) == pytest.approx((0.04**2, 0.04))
+    assert (found["cost_20"], found["cost_20_place"]) == (0.0, 0.5)
+
+
+def test_an_order_that_is_no_probability_has_no_figures_that_judge_one():
+    judged = own_word(scores(ERRORS, confidence=np.where(ERRORS < 25, 0.75, 0.25)))
+    told, bare = (
+        {row.metric for row in integrity_rows("mine", "margin", judged, is_calibrated=is_calibrated)}
+        for is_calibrated in (True, False)
+    )
+    costs = {f"cost_{ratio:g}{kind}" for ratio in COST_RATIOS for kind in ("", "_place")}
+    assert told - bare == {"brier", "ece", *costs}
+    assert {"aurc", "e_aurc", "augrc"} < bare

@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Intervals hold as often as they say, count blocks instead of queries, and share their draws."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest, bootstrap
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.scoring import draws
+from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.draws import ClusterDraws
+from sasgeo_bench.scoring.integrity_metric import aurc
+from sasgeo_bench.scoring.intervals import (
+    Interval,
+    bootstrap_means,
+    bootstrap_statistic,
+    difference_interval,
+    effective_count,
+    mean_difference,
+    mean_interval,
+    percentile_interval,
+    share_interval,
+    statistic_interval,
+    wilson,
+    wilson_mean,
+)
+
+BLOCKS = st.lists(st.sampled_from("abcdef"), min_size=2, max_size=15).filter(lambda blocks: len(set(blocks)) > 1)
+
+
+# Wilson
+
+
+@pytest.mark.parametrize(
+    ("hits", "lo", "hi"), [(129, 0.520, 0.649), (208, 0.907, 0.969), (209, 0.913, 0.972), (210, 0.918, 0.975)]
+)
+def test_the_intervals_of_the_paper(hits, lo, hi) -> None:
+    found = wilson(hits, 220)
+    assert (round(found.lo, 3), round(found.hi, 3)) == (lo, hi)
+
+
+@given(trials=st.integers(1, 400), share=st.floats(0, 1), level=st.sampled_from([0.9, 0.95, 0.99]))
+def test_wilson_is_that_of_scipy(trials, share, level) -> None:
+    hits = round(share * trials)
+    ours = wilson(hits, trials, level=level)
+    theirs = binomtest(hits, trials).proportion_ci(level, method="wilson")
+    assert (ours.lo, ours.hi) == pytest.approx((theirs.low, theirs.high), abs=1e-9)
+    assert ours.lo <= ours.value <= ours.hi
+
+
+def test_wilson_at_its_ends() -> None:
+    # 0 of n: hi = z^2 / (n + z^2).
+    assert wilson(0, 10).lo == 0.0
+    assert wilson(0, 10).hi == pytest.approx(1.959964**2 / (10 + 1.959964**2), abs=1e-6)
+    assert wilson(10, 10).hi == 1.0
+    nothing = wilson(0, 0)
+    assert math.isnan(nothing.value)
+    assert (nothing.lo, nothing.hi) == (0.0, 1.0)
+    assert wilson_mean([]).hi == 1.0
+
+
+def test_shared_hits_and_weights_count_in_proportion() -> None:
+    assert wilson_mean([1.0, 0.25, 0.25, 0.5]) == wilson(2, 4)
+    # Weights 3, 1: (3 + 1)^2 / (9 + 1) = 1.6 trials, of which 3/4 succeed.
+    found = wilson_mean([1.0, 0.0], [3.0, 1.0])
+    expected = wilson(1.2, 1.6)
+    assert (found.value, found.lo, found.hi) == pytest.approx((0.75, expected.lo, expected.hi))
+    assert wilson_mean([1.0, 0.0, 1.0], [5.0, 5.0, 0.0]) == wilson(1, 2)
+    with pytest.raises(MetricError, match="shares"):
+        wilson_mean([2.0])
+    with pytest.raises(MetricError, match="between 0 and the trials"):
+        wilson(3, 2)
+    with pytest.raises(MetricError, match="level"):
+        wilson(1, 2, level=1.0)
+
+
+# Draws
+
+
+@given(blocks=BLOCKS, seed=st.integers(0, 2**40))
+def test_a_draw_takes_as_many_blocks_as_there_are_and_from_each_as_many_queries_as_it_has(blocks, seed) -> None:
+    drawn = ClusterDraws(blocks=blocks, seed=seed, draws=20)
+    weights = np.vstack(list(drawn.weights()))
+    assert weights.shape == (20, len(blocks))
+    names = np.array(blocks)
+    copies = np.stack([weights[:, names == name].sum(axis=1) / (names == name).sum() for name in set(blocks)], axis=1)
+    assert (copies == np.round(copies)).all()
+    assert (copies.sum(axis=1) == len(set(blocks))).all()
+    whole = np.vstack(list(ClusterDraws(blocks=blocks, seed=seed, draws=20, draws_within=False).weights()))
+    for name in set(blocks):
+        assert (np.ptp(whole[:, names == name], axis=1) == 0).all()
+
+
+def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch) -> None:
+    blocks = list("aabbbc")
+    one, same, other = (ClusterDraws(blocks=blocks, seed=seed, draws=50) for seed in (7, 7, 8))
+    values = np.arange(6.0)
+    assert bootstrap_means(values, one).tolist() == bootstrap_means(values, same).tolist()
+    assert bootstrap_means(values, one).tolist() == bootstrap_means(values, one).tolist()
+    assert bootstrap_means(values, one).tolist() != bootstrap_means(values, other).tolist()
+    monkeypatch.setattr(draws, "_CHUNK_CELLS", 6 * 8)
+    chunks = list(one.weights())
+    assert [len(chunk) for chunk in chunks] == [8] * 6 + [2]
+    assert not np.array_equal(chunks[0], chunks[1])
+
+
+@given(blocks=BLOCKS, draws_within=st.booleans())
+def test_sums_are_those_of_the_weights_and_numbers_serve_as_names(blocks, draws_within) -> None:
+    drawn = ClusterDraws(blocks=blocks, seed=5, draws=20, draws_within=draws_within)
+    table = np.random.default_rng(6).random((len(blocks), 3))
+    sums = np.vstack(list(drawn.sums(table)))
+    np.testing.assert_allclose(sums, np.vstack(list(drawn.weights())) @ table, rtol=1e-12)
+    hits = (table > 0.5).astype(float)  # whole numbers come out whole
+    assert np.array_equal(np.vstack(list(drawn.sums(hits))), np.vstack(list(drawn.weights())) @ hits)
+    numbers = np.unique(blocks, return_inverse=True)[1]
+    same = ClusterDraws(blocks=numbers, seed=5, draws=20, draws_within=draws_within)
+    assert np.array_equal(np.vstack(list(same.sums(table))), sums)
+
+
+@pytest.mark.parametrize("draws_within", [True, False])
+def test_the_spread_of_means_is_what_theory_says(draws_within) -> None:
+    # B equal blocks of n: variance of block means / B, and with queries drawn the mean variance within / (B n).
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(12, 9)) + rng.normal(size=(12, 1))
+    blocks = np.repeat([f"block {at}" for at in range(12)], 9)
+    drawn = ClusterDraws(blocks=list(blocks), seed=3, draws=20_000, draws_within=draws_within)
+    means = bootstrap_means(values.ravel(), drawn)
+    expected = values.mean(axis=1).var() / 12
+    if draws_within:
+        expected += values.var(axis=1).mean() / (12 * 9)
+    assert means.var() == pytest.approx(expected, rel=0.05)
+    assert means.mean() == pytest.approx(values.mean(), abs=4 * math.sqrt(expected / 20_000))
+
+
+@given(sites=st.lists(st.integers(0, 9), min_size=1, max_size=25), seed=st.integers(0, 2**40))
+def test_the_queries_of_a_site_are_drawn_together_as_one_of_its_block(sites, seed) -> None:
+    names = list(dict.fromkeys(sites))
+    blocks = [f"block {site % 3}" for site in sites]
+    drawn = ClusterDraws(blocks=blocks, sites=[f"site {site}" for site in sites], seed=seed, draws=20)
+    weights = np.vstack(list(drawn.weights()))
+    alone = ClusterDraws(blocks=[f"block {site % 3}" for site in names], seed=seed, draws=20)
+    of_site = np.vstack(list(alone.weights()))
+    assert np.array_equal(weights, of_site[:, [names.index(site) for site in sites]])
+    table = np.random.default_rng(6).random((len(sites), 3))
+    np.testing.assert_allclose(np.vstack(list(drawn.sums(table))), weights @ table, rtol=1e-12)
+
+
+def test_a_name_of_a_site_in_two_blocks_is_two_sites() -> None:
+    drawn = ClusterDraws(blocks=["a", "b"], sites=["p", "p"], seed=1, draws=100)
+    weights = np.vstack(list(drawn.weights()))
+    assert not np.array_equal(weights[:, 0], weights[:, 1])
+    with pytest.raises(MetricError, match="1 blocks for 2 queries"):
+        ClusterDraws(blocks=["a", "b"], sites=["p"], seed=1)
+
+
+@given(blocks=BLOCKS)
+def test_the_fast_way_and_the_slow_way_agree(blocks) -> None:
+    rng = np.random.default_rng(4)
+    drawn = ClusterDraws(blocks=blocks, seed=1, draws=30)
+    values, weights = rng.random(len(blocks)), rng.integers(0, 2, len(blocks))
+    fast = bootstrap_means(values, drawn, weights)
+
+    def mean(mass: np.ndarray) -> float:
+        return float(mass @ values / mass.sum()) if mass.sum() else math.nan
+
+    np.testing.assert_allclose(bootstrap_statistic(mean, drawn, weights), fast)
+
+
+def test_two_methods_share_their_draws() -> None:
+    rng = np.random.default_rng(5)
+    blocks = [f"{at % 7}" for at in range(60)]
+    ours, theirs = rng.random(60), rng.random(60)
+    drawn = ClusterDraws(blocks=blocks, seed=1, draws=500)
+    apart = bootstrap_means(ours - theirs, drawn)
+    np.testing.assert_allclose(bootstrap_means(ours, drawn) - bootstrap_means(theirs, drawn), apart)
+    side_by_side = bootstrap_means(np.column_stack((ours, theirs)), drawn)
+    np.testing.assert_allclose(side_by_side[:, 0] - side_by_side[:, 1], apart)
+    found = mean_difference(ours, theirs, drawn)
+    assert (found.lo, found.hi) == tuple(np.quantile(apart, [0.025, 0.975], method="inverted_cdf"))
+    assert mean_difference(ours, ours, drawn) == Interval(value=0.0, lo=0.0, hi=0.0)
+    # A difference that holds for every query is seen however much the queries vary.
+    assert mean_difference(ours + 0.01, ours, drawn).lo == pytest.approx(0.01)
+
+
+def test_with_a_block_for_each_query_the_interval_is_that_of_scipy() -> None:
+    values = np.random.default_rng(6).exponential(size=80)
+    ours = mean_interval(values, ClusterDraws(blocks=[str(at) for at in range(80)], seed=1))
+    theirs = bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(9)).confidence_interval
+    assert (ours.lo, ours.hi) == pytest.approx((theirs.low, theirs.high), rel=0.02)
+
+
+def test_intervals_hold_as_often_as_they_say_and_only_if_blocks_are_counted() -> None:
+    rng = np.random.default_rng(8)
+    blocks = [f"{at // 10}" for at in range(300)]
+    alone = [str(at) for at in range(300)]
+    held, naive = 0, 0
+    for trial in range(150):
+        values = (rng.normal(size=(30, 10)) + rng.normal(size=(30, 1))).ravel()  # mean 0, correlation 1/2
+        for names in (blocks, alone):
+            found = mean_interval(values, ClusterDraws(blocks=names, seed=trial, draws=400))
+            is_held = found.lo <= 0.0 <= found.hi
+            held, naive = held + (is_held and names is blocks), naive + (is_held and names is alone)
+    assert 0.90 <= held / 150 <= 0.99
+    assert naive / 150 < 0.75
+
+
+# Figures with intervals
+
+
+def test_a_figure_of_one_block_has_no_interval() -> None:
+    found = mean_interval([1.0, 0.0], ClusterDraws(blocks=["a", "a"], seed=1, draws=50))
+    assert found.value == 0.5
+    assert math.isnan(found.lo)
+    assert math.isnan(found.hi)
+    nothing = mean_interval([], ClusterDraws(blocks=[], seed=1, draws=50))
+    assert math.isnan(nothing.value)
+    assert math.isnan(nothing.hi)
+
+
+def test_draws_without_a_query_that_counts_are_left_out() -> None:
+    drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=200)
+    means = bootstrap_means([1.0, 0.0], drawn, [1.0, 0.0])
+    assert 0.15 < np.isnan(means).mean() < 0.35  # block b twice
+    assert mean_interval([1.0, 0.0], drawn, [1.0, 0.0]) == Interval(value=1.0, lo=1.0, hi=1.0)
+    assert math.isnan(percentile_interval(1.0, [math.nan]).lo)
+
+
+def test_any_figure_can_have_an_interval() -> None:
+    rng = np.random.default_rng(9)
+    count = 120
+    right, confidence = rng.random(count) < 0.7, rng.random(count)
+    answers = Answers(
+        confidence=confidence, is_answered=np.ones(count), is_right=right, is_present=np.ones(count, dtype=bool)
+    )
+    sure = Answers(confidence=right + 0.0, is_answered=np.ones(count), is_right=right, is_present=np.ones(count))
+    drawn = ClusterDraws(blocks=[f"{at % 10}" for at in range(count)], seed=1, draws=300)
+    found = statistic_interval(lambda weights: aurc(answers, weights), drawn)
+    assert found.value == aurc(answers)
+    assert 0.0 < found.lo < found.value < found.hi < 1.0
+    apart = statistic_interval(lambda weights: aurc(answers, weights) - aurc(sure, weights), drawn)
+    assert 0.0 < apart.lo < apart.value == pytest.approx(aurc(answers) - aurc(sure))
+
+
+def test_what_cannot_be_is_refused() -> None:
+    drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=5)
+    for values in ([1.0], [1.0, math.inf], [1.0, math.nan], 1.0, [[[1.0]], [[1.0]]]):
+        with pytest.raises(MetricError, match="finite"):
+            bootstrap_means(values, drawn)
+    with pytest.raises(MetricError, match="shape"):
+        mean_difference([1.0, 0.0], [1.0], drawn)
+    with pytest.raises(MetricError, match="draws"):
+        ClusterDraws(blocks=["a"], seed=1, draws=0)
+    with pytest.raises(MetricError, match="weights"):
+        bootstrap_means([1.0, 0.0], drawn, [1.0, -1.0])
+
+
+# Few sites
+
+
+def test_sites_count_by_their_mass() -> None:
+    assert effective_count(["p", "q", "p", "q", "r", "r"]) == pytest.approx(3)
+    # Masses 9 and 1: 100 / 82.
+    assert effective_count([0] * 9 + [1]) == pytest.approx(100 / 82)
+    assert effective_count(["p", "q", "r"], [1.0, 1.0, 0.0]) == 2
+    assert effective_count([]) == effective_count(["p"], [0.0]) == 0
+
+
+def test_an_interval_is_the_wider_of_both_at_each_end() -> None:
+    # z^2 = 3.8415: of 3 in 4 Wilson's is (0.75 + 0.4802 -+ 1.96 sqrt(0.1875 / 4 + 0.0600)) / 1.9604.
+    lo, hi = 0.30064, 0.95441
+    few, how = share_interval(0.75, np.array([0.7, 0.75, 0.8]), 4)
+    assert (few.lo, few.hi, how) == (pytest.approx(lo, abs=1e-4), pytest.approx(hi, abs=1e-4), "wilson")
+    apart, how = share_interval(0.75, np.linspace(0.2, 1.0, 1001), 4)
+    assert (apart.lo, apart.hi, how) == (pytest.approx(0.22), pytest.approx(0.98), "blocks")
+    one_sided, how = share_interval(0.75, np.linspace(0.5, 1.0, 1001), 4)
+    assert (one_sided.lo, one_sided.hi, how) == (pytest.approx(lo, abs=1e-4), pytest.approx(0.9875), "wilson")
+    alone, how = share_interval(0.75, [], 4)
+    assert (alone, how) == (wilson(3, 4), "wilson")
+    nothing, how = share_interval(math.nan, [math.nan], 4)
+    assert math.isnan(nothing.lo)
+    assert how == ""
+
+
+@given(
+    sites=st.lists(st.integers(0, 6), min_size=2, max_size=40),
+    seed=st.integers(0, 2**30),
+    shares=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+)
+def test_who_is_right_wherever_another_one_is_has_no_lower_end(sites, seed, shares) -> None:
+    lot = np.random.default_rng(seed).random(len(sites))
+    table = np.column_stack([lot < share for share in sorted(shares)] + [np.ones(len(sites))]).astype(float)
+    drawn = ClusterDraws(blocks=[str(site % 3) for site in sites], sites=sites, seed=seed, draws=50)
+    means, trials = bootstrap_means(table, drawn), effective_count(sites)
+    ends = [share_interval(float(table[:, at].mean()), means[:, at], trials)[0] for at in range(3)]
+    assert sorted(end.lo for end in ends) == [end.lo for end in ends]
+    assert sorted(end.hi for end in ends) == [end.hi for end in ends]
+
+
+def test_a_difference_of_shares_has_both_their_doubts() -> None:
+    ours, theirs = Interval(value=0.5, lo=0.2, hi=0.8), Interval(value=0.1, lo=0.0, hi=0.5)
+    found = difference_interval(ours, theirs)
+    assert (found.value, found.lo, found.hi) == pytest.approx((0.4, 0.4 - 0.5, 0.4 + math.hypot(0.3, 0.1)))

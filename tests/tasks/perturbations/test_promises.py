@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every perturbation promises, held for all of them; and what is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.perturbations.base import apply, check_perturbation, neutral, share_changed, share_hidden
+from sasgeo_bench.tasks.perturbations.border import Border
+from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
+from sasgeo_bench.tasks.perturbations.crop import CentralCrop
+from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
+from sasgeo_bench.tasks.perturbations.glare import Glare
+from sasgeo_bench.tasks.perturbations.line_width import LayerOffset, LineWidth
+from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
+from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
+from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.perturbations.rotation import Rotation
+from sasgeo_bench.tasks.perturbations.scale import Scale
+from sasgeo_bench.tasks.perturbations.season import Season
+from sasgeo_bench.tasks.perturbations.tilt import Tilt
+from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
+
+RATES = AgeingRates.set_by_hand()
+ALL = (
+    Perception(error_factor=1.0),
+    Rectangles(share=0.3),
+    Border(share=0.3),
+    TiltWedge(share=0.3),
+    Glare(share=0.2),
+    CanopyAndShadow(share=0.6),
+    AdversarialMask(share=0.3),
+    FalseUnknown(share=0.2),
+    LocalWarp(rms_m=10.0),
+    Tilt(tilt_deg=3.0),
+    CentralCrop(share=0.3),
+    Rotation(angle_deg=5.0),
+    Scale(excess=0.1),
+    LineWidth(grow_m=1.0),
+    LayerOffset(offset_m=4.0),
+    Season(kind="leaf_on", strength=0.6),
+    Season(kind="snow", strength=0.6),
+    Season(kind="low_water", strength=0.6),
+    Season(kind="harvest", strength=0.6),
+    Ageing(years=10.0, rates=RATES, place="here", redrawn=0.3),
+)
+DETERMINISTIC = (AdversarialMask, CentralCrop, LineWidth)
+every = pytest.mark.parametrize("perturbation", ALL, ids=lambda item: getattr(item, "kind", type(item).__name__))
+
+
+@every
+def test_strength_zero_changes_nothing(perturbation, half_known):
+    same = neutral(perturbation)(half_known, np.random.default_rng(1))
+    np.testing.assert_array_equal(same.cells, half_known.cells)
+
+
+@every
+def test_the_same_seed_gives_the_same_view_and_another_one_another(perturbation, view):
+    first, second, other = (perturbation(view, np.random.default_rng(seed)).cells for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, second)
+    assert (first != other).any() == (type(perturbation) not in DETERMINISTIC)
+
+
+@every
+def test_it_keeps_its_promises_on_every_view(perturbation, views, half_known):
+    for view in (*views[::3], half_known):
+        check_perturbation(perturbation, view)
+
+
+@every
+def test_what_is_unknown_stays_so_unless_cells_move(perturbation, half_known):
+    unknown = half_known.cells == UNKNOWN
+    after = perturbation(half_known, np.random.default_rng(3))
+    assert perturbation.MOVES or (after.cells[unknown] == UNKNOWN).all()
+    assert after.confidence.shape == half_known.cells.shape
+
+
+@every
+def test_it_does_something_and_no_more_than_half_of_the_view(perturbation, views, view):
+    changed = [share_changed(item, perturbation(item, np.random.default_rng(4))) for item in (*views[::2], view, view)]
+    assert 0.0001 < np.mean(changed) < 0.5
+
+
+@every
+def test_views_of_one_class_one_cell_and_of_any_shape_are_taken(perturbation, view):
+    one_class = dataclasses.replace(view, classes=view.classes[4:5], cells=view.cells[4:5, :50, :70].copy())
+    check_perturbation(perturbation, one_class)
+    for rows, cols in ((1, 1), (1, 40), (40, 3)):
+        check_perturbation(perturbation, view.replace(view.cells[:, :rows, :cols].copy()))
+
+
+@every
+def test_a_view_that_is_unknown_all_over_stays_so(perturbation, view):
+    blank = view.replace(np.full_like(view.cells, UNKNOWN))
+    assert perturbation(blank, np.random.default_rng(0)).unknown_share == 1.0
+
+
+@every
+@pytest.mark.parametrize("value", [-99.0, float("nan"), float("inf"), "much", None, True])
+def test_a_strength_that_is_none_is_refused_in_one_line(perturbation, value):
+    name = next(iter(perturbation.NEUTRAL))
+    with pytest.raises(PerturbError, match=f"{type(perturbation).__name__}: {name} lies between") as caught:
+        dataclasses.replace(perturbation, **{name: value})
+    assert "\n" not in str(caught.value)
+
+
+def test_perturbations_follow_each_other_and_each_draws_for_itself(view):
+    rng_seed = 5
+    one = apply([LocalWarp(rms_m=5.0), Rectangles(share=0.3)], view, np.random.default_rng(rng_seed))
+    other = apply([LocalWarp(rms_m=0.0), Rectangles(share=0.3)], view, np.random.default_rng(rng_seed))
+    hidden = (other.cells == UNKNOWN).all(axis=0)
+    assert (one.cells[:, hidden] == UNKNOWN).all()  # the same rectangles, whatever the warp drew
+    assert share_hidden(view, other) == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_perturbation_that_breaks_its_promises_is_named_with_all_of_them(view):
+    @dataclasses.dataclass(frozen=True)
+    class Careless:
+        NEUTRAL = {"strength": 0.0}
+        MOVES = False
+        strength: float = 1.0
+
+        def __call__(self, evidence, _rng):
+            return evidence.replace(np.random.default_rng().integers(0, 2, evidence.cells.shape, dtype=np.uint8))
+
+    blank = view.replace(np.full_like(view.cells, UNKNOWN))
+    with pytest.raises(PerturbError, match="Careless breaks") as caught:
+        check_perturbation(Careless(), blank)
+    for promise in ("same seed", "keeps unknown", "strength 0"):
+        assert promise in str(caught.value)

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Embedded towns and what each suite draws of one of them: made once, in memory where a map is edited."""
+
+import datetime as dt
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import geopandas as gpd
+import pytest
+
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.evidence import LayerBits
+from sasgeo_bench.regions.graph import build_graph
+from sasgeo_bench.regions.layers import burn_layers, make_paint
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.split import blocks_of
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant
+from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
+from sasgeo_bench.tasks.twin import paste
+
+# Sides of the region and of the town behind its name: "large" has room for the copies of several sites, "huge" for
+# three of each, and the map of a "short" one ends short of its grid.
+SIDES_M = {"medium": (1024.0, 1280.0), "large": (1792.0, 2048.0), "huge": (2560.0, 2816.0), "short": (1536.0, 1280.0)}
+DATED = ("town-suburb",)  # towns that are built at older dates too
+OLDER = (dt.date(2014, 1, 1), dt.date(2019, 1, 1))  # of a town of 2025
+# Where each suite finds what it needs; what is not named here is drawn of the suburb.
+TOWN_OF = {
+    "occlusion": "town-riverside",
+    "false-unknown": "town-riverside",
+    "season": "town-riverside",
+    "stable-not-distinctive": "town-industrial large",
+    "topology-twins": "town-grid large",
+    "instance-twins": "town-old-town large",
+    "grade-separation": "town-industrial large",
+    "volatile-lure": "town-agricultural large",
+    "alias": "town-agricultural huge",
+    "controls": "town-suburb large",
+}
+# One overpass, little room for wide views; the others get as many as are asked for.
+SITES = {"grade-separation": 1, "no-priors": 3}
+MOST_SITES = 4
+MAIN_REACH_M = 144.0  # half a diagonal of a view of 192 m at its largest scale
+
+TownOf = Callable[..., Region]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Carried:
+    """A suite on a town: what it draws from, after its edit, and where; `plain` is the scene before, if it edits."""
+
+    suite: Suite
+    scene: Scene
+    plain: Scene
+    sites: tuple[Site, ...]
+    seeds: Seeds
+    edit: Edit | None
+
+    def draw(self, site: Site, variant: Variant) -> Draft:
+        """One draft, as `draw.Drawer` asks for it."""
+        return self.suite.draw(self.scene, site, variant, self.seeds.under("site", site.index))
+
+    def control(self, variant: Variant) -> Variant:
+        """The control whose view has the same size."""
+        return next(
+            item for item in self.suite.variants if item.role == "control" and item.view_cells == variant.view_cells
+        )
+
+
+def _view_reach_m(suite: Suite) -> float:
+    """How far from its centre a view of a suite may show anything."""
+    return max(item.side_m for item in suite.variants) / 2 * 2**0.5 * largest_scale(suite.card.group)
+
+
+@pytest.fixture(scope="session")
+def town(tmp_path_factory) -> TownOf:
+    """A town by its name, one of `SIDES_M` behind it for another size; each is built once."""
+    out = tmp_path_factory.mktemp("towns")
+
+    @cache
+    def built(name: str, date: dt.date | None = None) -> Region:
+        plain_name, _, size = name.partition(" ")
+        spec = read_region_file(find_region_file(plain_name))
+        if size:
+            side_m, town_m = SIDES_M[size]
+            extracts = [
+                item.model_copy(update={"town": item.town.model_copy(update={"size_m": town_m})})
+                for item in spec.extract
+                if item.town
+            ]
+            spec = spec.model_copy(update={"id": f"{spec.id}-{size}", "size_m": (side_m, side_m), "extract": extracts})
+        plan = plan_build(spec, out=out, date=date)
+        build_region(plan, tell=lambda _: None, with_preview=False)
+        return read_region(plan.folder)
+
+    return built
+
+
+@pytest.fixture(scope="session")
+def scene(town) -> Callable[..., Scene]:
+    """All that a town can offer to a suite; with the reach of a suite's views, or of those of 192 m."""
+
+    @cache
+    def of_town(name: str, suite: str = "") -> Scene:
+        if suite:
+            return replace(of_town(name), view_reach_m=_view_reach_m(EVERY_SUITE[suite]))
+        state = State.of(town(name))
+        return Scene(
+            map=state,
+            world=state,
+            blocks=blocks_of(state.region, state.grid),
+            view_reach_m=MAIN_REACH_M,
+            scenes=town(name).manifest.scenes,
+            others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if name in DATED else (),
+            elsewhere=State.of(town("town-riverside")),
+            ageing=Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="here", redrawn=0.2),
+        )
+
+    return of_town
+
+
+@pytest.fixture(scope="session")
+def edited(town) -> Callable[[str, gpd.GeoDataFrame], State]:
+    """A town's state with other features, made in memory."""
+
+    def of_features(name: str, features: gpd.GeoDataFrame) -> State:
+        base = town(name)
+        layers = burn_layers(make_paint(features, base.classes, base.coverage), base.grid)
+        graph = build_graph(features, bounds_m=base.grid.bounds_m)
+        return replace(State.of(base), bits=LayerBits.of(layers), features=features, graph=graph)
+
+    return of_features
+
+
+@pytest.fixture(scope="session")
+def carried(scene, edited) -> Callable[[str], Carried]:
+    """A suite on the town that can carry it, its edits carried out."""
+
+    @cache
+    def of_suite(name: str) -> Carried:
+        suite, where = EVERY_SUITE[name], TOWN_OF.get(name, "town-suburb")
+        plain = scene(where, name)
+        assert suite.lack(plain) is None
+        suite = replace(suite, variants=suite.usable(plain))
+        seeds = Seeds(root=1, names=(plain.map.region, name))
+        count = SITES.get(name, MOST_SITES)
+        sites = choose_sites(plain, suite, count=count, seeds=seeds, group=suite.card.group)
+        edit, after = suite.edit(plain, sites, seeds), plain
+        if edit is not None and edit.map_pastes:
+            changed = edited(where, paste(plain.map.features, edit.map_pastes))
+            world = changed
+            if edit.world_pastes is not None:
+                world = edited(where, paste(plain.map.features, edit.world_pastes))
+            after = replace(plain, map=changed, world=world)
+        if edit is not None:
+            after, sites = replace(after, twins=edit.twins), edit.sites
+            assert len(sites) == count
+        return Carried(suite=suite, scene=after, plain=plain, sites=sites, seeds=seeds, edit=edit)
+
+    return of_suite

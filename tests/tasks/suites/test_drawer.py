@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is added to a draft tells nothing of the answer: priors, candidates and ids are the same for all variants."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import LayerBits
+from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, PriorGroup
+from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, UNANSWERABLE, Drawer, away, make_prior
+from sasgeo_bench.tasks.split import SplitFile, make_split
+from sasgeo_bench.tasks.suites.mining import STRIDE_M, least_apart_m
+
+SITES = 3
+PLACES = ("here", "there", "beyond", "away")
+GROUP = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
+
+
+@pytest.fixture(scope="module")
+def drawn(carried):
+    """A suite on its town, the drawer, and queries and truths at its first sites."""
+
+    @cache
+    def of_suite(name):
+        made = carried(name)
+        grid = made.scene.map.grid
+        spec = SplitFile.model_validate(
+            {
+                "id": "mine",
+                "title": "Mine",
+                "kind": "crossfit",
+                "buffer_m": 0.0,
+                "place": [
+                    {"name": name, "regions": [name], "half": half} for name, half in zip(PLACES, "abab", strict=True)
+                ],
+            }
+        )
+
+        def far(at):
+            return replace(grid, west_m=grid.west_m + 50_000 * at)
+
+        split = make_split(spec, {name: grid if name == "here" else far(at) for at, name in enumerate(PLACES)})
+        drawer = Drawer(suite=made.suite, scene=made.scene, seeds=made.seeds, group=made.suite.card.group, split=split)
+        jobs = [job for job in drawer.jobs(made.sites[:SITES]) if drawer.why_not(job) is None]
+        return made, drawer, [drawer.draw(job) for job in jobs]
+
+    return of_suite
+
+
+def by_site(drafts):
+    pairs = {}
+    for query, truth in drafts:
+        pairs.setdefault(truth.pair_id, []).append((query, truth))
+    return pairs.values()
+
+
+@pytest.mark.parametrize("name", ["occlusion", "alias", "instance-twins", "growth"])
+def test_control_stress_and_falsifier_of_a_site_share_pose_and_prior(drawn, name):
+    _, _, drafts = drawn(name)
+    for pair in by_site(drafts):
+        assert len({truth.role for _, truth in pair}) > 1
+        assert len({truth.pose for _, truth in pair}) == 1
+        assert len({query.prior for query, _ in pair}) == 1
+        assert len({query.prior_group for query, _ in pair}) == 1
+
+
+def test_only_without_priors_the_prior_differs_and_the_falsifier_has_that_of_the_control(drawn):
+    _, _, drafts = drawn("no-priors")
+    for pair in by_site(drafts):
+        priors = {(truth.role, query.evidence.shape): query.prior for query, truth in pair}
+        assert priors["falsifier", (192, 192)] == priors["control", (192, 192)]
+        assert priors["stress", (192, 192)].center_m is None
+        assert priors["stress", (192, 192)].yaw_deg is None
+        assert priors["control", (192, 192)].scale_sigma == priors["stress", (192, 192)].scale_sigma
+
+
+def places_of(query):
+    return np.array([(pose.easting_m, pose.northing_m) for pose in query.candidates])
+
+
+def same_places(one, other):
+    """How many places of one are also in the other, but for the jitter of both."""
+    apart_m = np.abs(one[:, None] - other[None]).max(axis=2)
+    return int((apart_m.min(axis=1) <= STRIDE_M + 0.02).sum())
+
+
+def test_candidates_are_as_many_and_the_same_but_for_what_the_stress_does_to_them(drawn):
+    made, _, drafts = drawn("alias")
+    for pair in by_site(drafts):
+        found = {truth.kind: (places_of(query), truth) for query, truth in pair}
+        assert set(found) == {"no copies", "R1 truth removed", "R2 neighbours", "R4 identical blocks"}
+        plain, truth = found["no copies"]
+        assert LEAST_CANDIDATES <= len(plain) <= max(CANDIDATES)
+        twins = len(made.scene.twins[0])
+        for kind, same in (("R1 truth removed", len(plain) - twins), ("R4 identical blocks", len(plain) - twins)):
+            places, _ = found[kind]
+            assert len(places) == len(plain)
+            assert same_places(places, plain) == same
+            assert not np.isin(places, plain).any()  # another jitter for every query, lest the shared one be the truth
+        assert found["R1 truth removed"][1].candidate == -1
+        here = np.array([truth.pose.easting_m, truth.pose.northing_m])
+        for kind in ("no copies", "R4 identical blocks"):
+            places, truth = found[kind]
+            assert np.abs(places[truth.candidate] - here).max() <= STRIDE_M / 2 + 0.01
+        places, truth = found["R2 neighbours"]
+        assert places[truth.candidate] == pytest.approx(here, abs=0.01)
+        assert (np.hypot(*(places - here).T) < 11).sum() == 5
+
+
+@pytest.mark.parametrize("name", ["alias", "topology-twins", "stable-not-distinctive"])
+def test_the_truth_is_no_lonelier_than_any_other_candidate(drawn, name):
+    _, _, drafts = drawn(name)
+    loneliest = []
+    for query, truth in drafts:
+        if not query.candidates or truth.kind.startswith("R2"):
+            continue
+        apart_m = np.hypot(*(places_of(query)[:, None] - places_of(query)[None]).transpose(2, 0, 1))
+        apart_m[np.eye(len(apart_m), dtype=bool)] = np.inf
+        least_m = apart_m.min(axis=1)
+        # Both ends are jittered by half a stride at most, either way.
+        assert least_m.min() >= least_apart_m(96.0) - np.sqrt(2) * STRIDE_M - 0.1
+        if truth.candidate >= 0:
+            loneliest.append((int(np.argmax(least_m)) == truth.candidate) - 1 / len(least_m))
+    assert loneliest
+    assert np.mean(loneliest) < 0.35
+
+
+def test_copies_are_candidates_only_where_the_suite_says_so(drawn):
+    made, _, drafts = drawn("alias")
+    for query, truth in drafts:
+        site = next(site for site in made.sites if site.pose == truth.pose)
+        twins = np.array(made.scene.twins[site.index])
+        near = np.abs(twins[:, None] - places_of(query)[None]).max(axis=2).min(axis=1) <= STRIDE_M / 2 + 0.01
+        if truth.kind.startswith(("R1", "R4")):
+            assert near.all()
+        elif not truth.kind.startswith("R2"):
+            assert not near.any()
+
+
+def test_every_query_of_a_site_has_its_candidates_in_another_order(drawn):
+    made, drawer, _ = drawn("alias")
+    plain, copies = ([], [])
+    jobs = {job.variant.kind: job for job in drawer.jobs(made.sites[:1])}
+    for root in range(60):
+        other = replace(drawer, seeds=replace(drawer.seeds, root=root))
+        for kind, at in (("no copies", plain), ("R4 identical blocks", copies)):
+            at.append(other.draw(jobs[kind])[1].candidate)
+    assert np.mean(np.array(plain) == np.array(copies)) < 0.35  # one in ten would be
+    assert len(set(plain)) > 5
+
+
+def test_a_query_with_too_few_decoys_cannot_be_drawn(drawn):
+    made, drawer, _ = drawn("alias")
+    job = next(job for job in drawer.jobs(made.sites) if job.track == "retrieval")
+    decoys = drawer.mined[made.scene.map.region, 192.0, job.site.index]
+    for count, can in ((LEAST_CANDIDATES - 1, False), (LEAST_CANDIDATES, True)):
+        far = np.array([(10_000.0 * at, 0.0) for at in range(count)])
+        few = replace(decoys, points_m=far, scorer=decoys.scorer[:1] * count)
+        mined = {(made.scene.map.region, 192.0, job.site.index): few}
+        assert (replace(drawer, mined=mined).why_not(job) is None) == can
+
+
+def test_a_query_at_a_place_of_which_the_map_shows_next_to_nothing_is_not_asked(drawn):
+    made, drawer, drafts = drawn("occlusion")
+    grid, shown = made.scene.map.grid, ("road_major", "green", "water")
+    jobs = [job for job in drawer.jobs(made.sites[:1]) if job.track == "localization"]
+    site, wide, narrow = made.sites[0], *(next(job for job in jobs if job.variant.view_cells == n) for n in (192, 96))
+    row, col = grid.to_cells(np.array([[site.pose.easting_m, site.pose.northing_m]]))[0].tolist()
+
+    def blank(name, cells):
+        """The map with nothing on it but one class, in a square of so many cells at the site."""
+        bits = np.zeros(grid.shape, dtype=np.uint32)
+        bits[row : row + cells, col : col + cells] = 1 << shown.index(name)
+        state = replace(made.scene.map, classes=shown, bits=LayerBits(bits=bits, count=len(shown)))
+        return replace(drawer, scene=replace(made.scene, map=state, world=state))
+
+    reason = "less than 1% of the map is drawn there"
+    assert blank("road_major", 9).why_not(narrow) == reason
+    assert blank("road_major", 12).why_not(narrow) is None
+    assert blank("green", 90).why_not(narrow) == reason  # ground cover is nothing to hold on to
+    assert blank("water", 90).why_not(narrow) is None
+    assert blank("green", 90).why_not(wide) is None  # a site was chosen by what is drawn in the main view
+    assert not any(UNANSWERABLE in truth.measured for _, truth in drafts)
+
+
+def test_a_query_that_asks_for_a_blank_place_is_marked_and_stays(drawn):
+    _, _, drafts = drawn("absent")
+    poor = [truth for _, truth in drafts if truth.measured.get("is_real_place") == 1.0]
+    assert poor
+    assert all(truth.measured[UNANSWERABLE] == 1.0 for truth in poor)
+
+
+def test_a_truth_says_where_the_twin_of_its_place_lies(drawn):
+    made, _, drafts = drawn("topology-twins")
+    assert drafts
+    for _, truth in drafts:
+        site = next(site for site in made.sites if site.pose == truth.pose)
+        east_m, north_m = made.scene.twins[site.index][0]
+        told = (truth.pose.easting_m + truth.measured[TWIN_EAST], truth.pose.northing_m + truth.measured[TWIN_NORTH])
+        np.testing.assert_allclose(told, (east_m, north_m), atol=0.01)
+
+
+def test_ids_say_nothing_and_do_not_depend_on_how_many_sites_there_are(drawn):
+    made, drawer, drafts = drawn("growth")
+    ids = [query.query_id for query, _ in drafts]
+    assert ids == sorted(ids)
+    assert len(set(ids)) == len(ids)
+    assert {job.query_id for job in drawer.jobs(made.sites[:1])} < set(ids)
+
+
+# Priors
+
+
+HERE = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=350.0)
+
+
+def test_the_truth_lies_anywhere_within_the_disc():
+    priors = [make_prior(HERE, GROUP, rng=np.random.default_rng(seed)) for seed in range(2000)]
+    apart_m = np.hypot(*np.array([prior.center_m for prior in priors]).T)
+    assert apart_m.max() <= 500.1
+    assert np.mean(apart_m < 250) == pytest.approx(0.25, abs=0.04)  # by area
+    off_deg = (np.array([prior.yaw_deg for prior in priors]) - 350 + 180) % 360 - 180
+    assert off_deg.std() == pytest.approx(20, rel=0.06)
+    assert off_deg.mean() == pytest.approx(0, abs=1.5)
+
+
+def moved_away(share_of, *, seed=0):
+    prior = make_prior(HERE, GROUP, rng=np.random.default_rng(seed))
+    return prior, away(prior, HERE, away_m=384.0, share_of=share_of, rng=np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_outside_means_that_the_disc_ends_at_least_that_far_away_and_nothing_else_is_said(seed):
+    before, after = moved_away(lambda center_m, radius_m: 1.0, seed=seed)  # noqa: ARG005
+    assert 384 - 0.2 <= np.hypot(*after.center_m) - 500 <= 1.5 * 384 + 0.2
+    assert replace(after, center_m=before.center_m) == before
+
+
+def test_a_disc_that_is_moved_away_is_as_much_on_the_map_as_it_was():
+    def half_plane(center_m, radius_m):
+        return float(np.clip(0.5 + center_m[0] / (2 * radius_m), 0, 1))  # the map lies in the east
+
+    for seed in range(20):
+        before, after = moved_away(half_plane, seed=seed)
+        assert half_plane(after.center_m, 500.0) == pytest.approx(half_plane(before.center_m, 500.0), abs=0.1)
+
+
+def test_the_disc_of_a_view_outside_is_on_the_map_and_far_from_the_view(drawn):
+    made, drawer, drafts = drawn("absent")
+    share_of = drawer._share_of_disc(made.scene.map)
+    for pair in by_site(drafts):
+        prior, at = next((query.prior, truth.pose) for query, truth in pair if truth.kind == "outside")
+        assert share_of(prior.center_m, prior.radius_m) > 0
+        off_m = np.hypot(prior.center_m[0] - at.easting_m, prior.center_m[1] - at.northing_m)
+        assert 2 * 192 - 0.2 <= off_m - 500 <= 3 * 192 + 0.2
+
+
+def test_a_truth_says_how_far_outside_of_the_disc_its_view_lies(drawn):
+    _, _, drafts = drawn("absent")
+    outside = [(query.prior, truth) for query, truth in drafts if truth.kind == "outside"]
+    assert outside
+    for prior, truth in outside:
+        off_m = np.hypot(prior.center_m[0] - truth.pose.easting_m, prior.center_m[1] - truth.pose.northing_m)
+        assert truth.measured["away_m"] == pytest.approx(off_m - 500, abs=0.1)
+
+
+def test_density_is_of_the_place_that_is_seen_and_likeness_of_the_site_alone(drawn):
+    _, _, drafts = drawn("absent")
+    for pair in by_site(drafts):
+        told = {truth.kind: truth for _, truth in pair}
+        site = told["control"].feature_density
+        assert told["feature-poor"].feature_density <= 0.003 < site
+        assert told["wrong place"].feature_density == told["wrong place"].measured["density"] != site
+        assert {told[kind].feature_density for kind in ("outside", "corrupted view")} == {site}
+        at_site = {kind for kind, truth in told.items() if truth.alias_index is not None}
+        moved = told["feature-poor"].measured["is_real_place"] == 1
+        assert at_site == set(told) - {"wrong place"} - ({"feature-poor"} if moved else set())
+
+
+def test_a_disc_counts_as_much_as_of_it_is_mapped(drawn):
+    made, drawer, _ = drawn("absent")
+    share_of = drawer._share_of_disc(made.scene.map)
+    west, south, east, north = made.scene.map.grid.bounds_m
+    middle = (north + south) / 2
+    assert share_of(((west + east) / 2, middle), 400.0) == 1
+    assert share_of((west, middle), 400.0) == pytest.approx(0.5, abs=0.02)
+    assert share_of((west - 500.0, middle), 400.0) == 0
+
+
+def test_nothing_is_outside_a_disc_that_is_not_there():
+    prior = make_prior(HERE, replace(GROUP, radius_m=None), rng=np.random.default_rng(0))
+    with pytest.raises(ConfigError, match="searches the whole map, and no place is outside"):
+        away(prior, HERE, away_m=384.0, share_of=lambda *_: 1.0, rng=np.random.default_rng(0))

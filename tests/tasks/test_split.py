@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splits: blocks tile a region, parts keep their distance in metres, and every fault names the pair."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.config import parse_toml
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import footprint
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.tasks.split import (
+    HALVES,
+    PARTS,
+    SplitFile,
+    blocks_of,
+    find_split_file,
+    make_split,
+    nearest_blocks,
+    nearest_pair,
+    read_split_file,
+)
+
+
+def grid(west_m=500_000.0, north_m=5_200_000.0, side_m=2000, epsg=32632):
+    return Grid(epsg=epsg, west_m=west_m, north_m=north_m, cell_size_m=2.0, rows=side_m // 2, cols=side_m // 2)
+
+
+def spec(places, kind="holdout", **changes):
+    base = {"id": "mine", "title": "Mine", "kind": kind, "buffer_m": 1000.0, "reach_m": 100.0, "place": places}
+    return SplitFile.model_validate(base | changes)
+
+
+TWO = [
+    {"name": "a", "regions": ["a"], "part": "train"},
+    {"name": "b", "regions": ["b"], "part": "test"},
+]
+
+
+def halved(halves):
+    """A place of its own for each letter, in that half."""
+    return [{"name": name, "regions": [name], "half": half} for name, half in zip("abcdefgh", halves, strict=False)]
+
+
+@given(st.integers(100, 6000), st.integers(100, 6000), st.floats(150, 3000))
+def test_blocks_tile_a_region_without_gap_or_overlap(rows, cols, block_m):
+    lattice = Grid(epsg=32632, west_m=7.0, north_m=9000.0, cell_size_m=1.0, rows=rows, cols=cols)
+    blocks = blocks_of("x", lattice, block_m=block_m)
+    outlines = [block.polygon() for block in blocks]
+    assert sum(outline.area for outline in outlines) == pytest.approx(rows * cols)
+    assert shapely.union_all(outlines).area == pytest.approx(rows * cols)
+    assert len({block.id for block in blocks}) == len(blocks)
+
+
+def test_parts_that_are_far_enough_apart_are_taken_and_their_distance_is_measured():
+    split = make_split(spec(TWO), {"a": grid(), "b": grid(west_m=503_500.0)})
+    near = nearest_pair(split)
+    assert near.gap_m == pytest.approx(1500.0)
+    assert {near.first[0], near.second[0]} == {"a", "b"}
+
+
+def test_parts_that_come_nearer_than_the_buffer_are_refused_with_the_pair_named():
+    with pytest.raises(ConfigError, match=r"blocks a/\d-1 and b/\d-0 .* 1100 m apart"):
+        make_split(spec(TWO), {"a": grid(), "b": grid(west_m=503_100.0)})
+
+
+def test_the_reach_of_the_footprints_counts():
+    grids = {"a": grid(), "b": grid(west_m=503_500.0)}
+    assert make_split(spec(TWO, reach_m=250.0), grids).blocks
+    with pytest.raises(ConfigError, match="footprints reach 251 m"):
+        make_split(spec(TWO, reach_m=251.0), grids)
+
+
+def test_an_overlap_is_refused_even_without_a_buffer():
+    with pytest.raises(ConfigError, match="0 m apart"):
+        make_split(spec(TWO, buffer_m=1.0, reach_m=0.0), {"a": grid(), "b": grid(west_m=501_000.0)})
+
+
+def test_distance_holds_across_two_zones():
+    # 12 E is the edge of zones 32 and 33: the two regions meet there although their coordinates differ by far.
+    west, east = grid(west_m=722_000.0, north_m=5_322_000.0), grid(west_m=278_000.0, north_m=5_322_000.0, epsg=32633)
+    with pytest.raises(ConfigError, match="of different parts"):
+        make_split(spec(TWO, buffer_m=5000.0), {"a": west, "b": east})
+
+
+def test_blocks_of_one_region_may_stand_in_different_parts_if_the_buffer_holds():
+    places = [
+        {"name": "west", "blocks": ["a/0-0", "a/1-0"], "part": "train"},
+        {"name": "east", "blocks": ["a/0-3", "a/1-3"], "part": "test"},
+    ]
+    region = {"a": Grid(epsg=32632, west_m=0.0, north_m=2000.0, cell_size_m=1.0, rows=2000, cols=4000)}
+    split = make_split(spec(places, buffer_m=1800.0), region)
+    assert nearest_pair(split).gap_m == pytest.approx(2000.0)
+    assert [split.part_in_task(block) for block in split.blocks_in("a")] == ["train", "test", "train", "test"]
+    with pytest.raises(ConfigError, match="a/0-0"):
+        make_split(spec(places, buffer_m=1801.0), region)
+
+
+@pytest.mark.parametrize(
+    ("places", "fault"),
+    [
+        ([TWO[0], {"name": "b", "regions": ["nowhere"], "part": "test"}], "unknown region 'nowhere'"),
+        ([TWO[0], {"name": "b", "blocks": ["b/9-9"], "part": "test"}], "unknown block 'b/9-9'"),
+        ([TWO[0], TWO[1] | {"blocks": ["a/0-0"]}], "stands in"),
+    ],
+)
+def test_what_is_not_there_is_named(places, fault):
+    with pytest.raises(ConfigError, match=fault):
+        make_split(spec(places), {"a": grid(), "b": grid(west_m=600_000.0)})
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("buffer_m = -1.0\n", "greater than or equal"),
+        ("bufer_m = 5.0\n", "did you mean 'buffer_m'"),
+    ],
+)
+def test_a_split_file_with_a_fault_is_refused(text, fault):
+    whole = 'id = "x"\ntitle = "X"\nkind = "crossfit"\n' + text
+    with pytest.raises(ConfigError, match=fault):
+        parse_toml(whole, SplitFile, source="x.toml")
+
+
+@pytest.mark.parametrize(
+    ("places", "kind", "fault"),
+    [
+        ([TWO[0], TWO[0]], "holdout", "place 'a' is listed twice"),
+        ([TWO[0], TWO[1] | {"regions": ["a"]}], "holdout", "region 'a' is listed twice"),
+        ([TWO[0], {"name": "b", "regions": ["b"]}], "holdout", "needs a part"),
+        (TWO, "crossfit", "must not say a part"),
+        ([*halved("aabb")[:3], {"name": "d", "regions": ["d"]}], "crossfit", 'place \'d\' needs a half, "a" or "b"'),
+        (halved("aaab"), "crossfit", "half 'b' needs two places at least: one is tested, and another one calibrates"),
+        ([TWO[0], TWO[1] | {"half": "a"}], "holdout", "place 'b' must not say a half in a hold-out"),
+        ([TWO[0], {"name": "b", "part": "test"}], "holdout", "needs regions or blocks"),
+    ],
+)
+def test_places_that_contradict_each_other_are_refused(places, kind, fault):
+    with pytest.raises(ValueError, match=fault):
+        spec(places, kind)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 800), st.integers(0, 1500))
+def test_footprints_of_different_parts_never_meet(seed, buffer_m, apart_m):
+    rng = np.random.default_rng(seed)
+    grids = {"a": grid(), "b": grid(west_m=502_000.0 + apart_m, north_m=5_200_000.0 + float(rng.integers(-900, 900)))}
+    try:
+        split = make_split(spec(TWO, buffer_m=buffer_m, reach_m=136.0), grids)
+    except ConfigError:
+        return
+    prints = {
+        place: [
+            footprint(Pose(easting_m=x, northing_m=y, yaw_deg=rng.uniform(0, 360)), size_m=(192.0, 192.0))
+            for block in blocks
+            for x, y in rng.uniform(block.bounds_m[:2], block.bounds_m[2:], (6, 2))
+        ]
+        for place, blocks in split.blocks.items()
+    }
+    gap_m = min(shapely.distance(one, two) for one in prints["a"] for two in prints["b"])
+    assert gap_m >= buffer_m - 1e-6
+    assert gap_m > 0 or buffer_m == 0
+
+
+@pytest.mark.parametrize("name", ["holdout", "crossfit"])
+def test_the_shipped_splits_hold_every_shipped_region_once_five_kilometres_apart(name):
+    grids = {region: read_region_file(path).grid() for region, path in list_region_files().items()}
+    shipped = read_split_file(find_split_file(name))
+    split = make_split(shipped, grids)
+    assert sorted(shipped.region_ids) == sorted(grids)
+    assert nearest_pair(split).gap_m >= 5000.0
+
+
+@pytest.fixture(scope="module")
+def crossfit():
+    """The shipped cross-fit, and its region files."""
+    files = {region: read_region_file(path) for region, path in list_region_files().items()}
+    grids = {region: file.grid() for region, file in files.items()}
+    return make_split(read_split_file(find_split_file("crossfit")), grids), files
+
+
+def test_in_a_cross_fit_every_place_tests_once_and_never_teaches_itself(crossfit):
+    split, _ = crossfit
+    tested = [place for fold in split.folds for place, part in fold.part_of.items() if part == "test"]
+    assert sorted(tested) == sorted(split.blocks)
+    for fold in split.folds:
+        assert set(fold.part_of.values()) == set(PARTS)
+        assert fold.part_of[fold.held_out] == "test"
+        assert len(fold.part_of) == len(split.blocks)
+
+
+def test_what_is_learnt_for_a_place_comes_from_places_that_neither_test_nor_calibrate_it(crossfit):
+    split, _ = crossfit
+    taught = set()
+    for fold in split.folds:
+        train = frozenset(place for place, part in fold.part_of.items() if part == "train")
+        own = split.half_of[fold.held_out]
+        assert train == {place for place, half in split.half_of.items() if half != own}
+        assert {place for place, part in fold.part_of.items() if part != "train"} == set(split.half_of) - train
+        taught.add(train)
+    assert len(taught) == 2  # learning is done twice, not once for each place
+
+
+def test_the_halves_of_the_shipped_cross_fit_are_alike(crossfit):
+    split, files = crossfit
+    blocks, towns, dated = (dict.fromkeys(HALVES, 0) for _ in range(3))
+    for place in split.spec.place:
+        blocks[place.half] += len(split.blocks[place.name])
+        towns[place.half] += any(files[region].pick(None).town is not None for region in place.regions)
+        dated[place.half] += any(
+            files[region].pick(None).town is None and len(files[region].extract) > 1 for region in place.regions
+        )
+    assert blocks["a"] == pytest.approx(blocks["b"], rel=0.1)
+    assert towns["a"] == towns["b"]
+    assert min(dated.values()) >= 2
+
+
+@given(st.permutations("aaabbb"))
+def test_adding_a_place_to_a_cross_fit_leaves_what_the_others_are_for(halves):
+    grids = {name: grid(west_m=500_000.0 + 20_000 * at) for at, name in enumerate("abcdefg")}
+    small, large = (make_split(spec(halved(letters), "crossfit"), grids) for letters in (halves, [*halves, "a"]))
+    for before, after in zip(small.folds, large.folds, strict=False):
+        assert after.part_of == before.part_of | {
+            "g": "calibration" if small.half_of[before.held_out] == "a" else "train"
+        }
+
+
+def test_places_of_a_region_are_those_that_hold_its_blocks(crossfit):
+    split, _ = crossfit
+    assert split.places_in("vaduz") == ("liechtenstein",)
+    assert split.places_in("atlantis") == ()
+
+
+def test_groups_of_blocks_that_are_no_parts_of_a_split_have_a_distance_too():
+    blocks = {name: blocks_of(name, grid(west_m=west_m)) for name, west_m in (("a", 500_000.0), ("b", 503_000.0))}
+    assert nearest_blocks(blocks).gap_m == pytest.approx(1000.0)
+    assert nearest_blocks(blocks, within_m=999.0) is None

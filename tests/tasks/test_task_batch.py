@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many requests: no query hangs on how many processes draw, nor on which variants are left out."""
+
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import CONTROLS
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, find_suite
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Variant
+from sasgeo_bench.tasks.task_batch import carry_out
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+TOWNS = ("town-suburb", "town-agricultural")
+
+
+def wanted(out, *suites, regions=TOWNS, **changes):
+    return plan_requests(
+        Wanted(
+            suites=suites, regions=regions, split="crossfit", count=1, seed=3, out=out, may_be_fewer=True, **changes
+        ),
+        tell=lambda _: None,
+    )
+
+
+def queries_of(drawn):
+    return {
+        query.query_id: query for item in drawn for folder in item.folders for query in task_files.read_queries(folder)
+    }
+
+
+def test_two_processes_draw_the_queries_that_one_draws(tmp_path, lay_towns):
+    for name in ("one", "two"):
+        lay_towns(tmp_path / name, *TOWNS)
+    one = list(carry_out(wanted(tmp_path / "one", "clean")))
+    two = list(carry_out(wanted(tmp_path / "two", "clean"), jobs=2))
+    assert [item.lines[-1].partition(" in ")[0] for item in one] == [
+        item.lines[-1].partition(" in ")[0] for item in two
+    ]
+    hashes = [
+        [task_files.read_task(folder)["files"] for item in drawn for folder in item.folders] for drawn in (one, two)
+    ]
+    assert len(hashes[0]) == 2
+    assert hashes[0] == hashes[1]
+    again = list(carry_out(wanted(tmp_path / "two", "clean"), jobs=2))
+    assert [item.folders for item in again] == [item.folders for item in two]
+    assert not any(item.lines for item in again)
+
+
+def test_what_a_region_lacks_is_told_beside_what_others_give(tmp_path, lay_towns):
+    lay_towns(tmp_path, "town-suburb", "town-grid")
+    drawn = list(carry_out(wanted(tmp_path, "season", regions=("town-suburb", "town-grid")), jobs=2))
+    assert [bool(item.folders) for item in drawn] == [item.lack is None for item in drawn]
+
+
+def test_what_is_left_out_changes_no_other_query(tmp_path, lay_towns):
+    for name in ("all", "some"):
+        lay_towns(tmp_path / name, TOWNS[0])
+    all_of_it = queries_of(carry_out(wanted(tmp_path / "all", "occlusion", regions=TOWNS[:1])))
+    choice = Choice(views_cells=(192,), kinds=("U2", "U3"), tracks=("localization",))
+    some = queries_of(carry_out(wanted(tmp_path / "some", "occlusion", regions=TOWNS[:1], choice=choice)))
+    assert 0 < len(some) < len(all_of_it)
+    assert {name: query.prior for name, query in some.items()} == {name: all_of_it[name].prior for name in some}
+    assert {query.track for query in some.values()} == {"localization"}
+    assert {query.evidence.shape for query in some.values()} == {(192, 192)}
+
+
+def test_controls_and_falsifiers_are_drawn_whatever_the_kinds():
+    choice = Choice(kinds=("U2",))
+    assert choice.takes(Variant(role="control", kind="control"), "localization")
+    assert choice.takes(Variant(role="falsifier", kind="none"), "retrieval")
+    assert EVERYTHING.takes(Variant(role="stress", kind="U1"), "retrieval")
+    assert all(EVERYTHING.lack(find_suite(name)) is None for name in (*EVERY_SUITE, CONTROLS))
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (Choice(views_cells=(100,)), "nothing of views_cells 100: it has 96, 192, 384"),
+        (Choice(kinds=("U9",)), "nothing of kinds 'U9': it has U1 rectangles, U2 border, "),
+        (Choice(tracks=("localization",), kinds=("U1",), views_cells=(384, 96)), None),
+        (Choice(kinds=("U2",), views_cells=(384,)), "has no stress of all that is chosen"),
+    ],
+)
+def test_a_choice_of_nothing_is_refused_before_anything_is_drawn(tmp_path, choice, words):
+    assert (choice.lack(find_suite("occlusion")) is None) == (words is None)
+    if words is not None:
+        with pytest.raises(ConfigError, match=f"suite 'occlusion' .*{words}"):
+            wanted(tmp_path, "occlusion", choice=choice)
+    with pytest.raises(ConfigError, match="suite 'growth' has nothing of tracks 'retrieval': it has localization"):
+        wanted(tmp_path, "growth", choice=Choice(tracks=("retrieval",)))

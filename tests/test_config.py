@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults in TOML files, each in one line."""
+
+import pytest
+
+from sasgeo_bench.config import Document, parse_toml
+from sasgeo_bench.errors import ConfigError
+
+
+class Inner(Document):
+    depth_m: float
+
+
+class Outer(Document):
+    name: str
+    inner: list[Inner] = []
+    near: Inner | None = None
+
+
+def fault(text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        parse_toml(text, Outer, source="a.toml")
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("a.toml: ")
+    return message
+
+
+def test_a_good_document_is_read():
+    assert parse_toml('name = "x"\n[[inner]]\ndepth_m = 2.0', Outer, source="a").inner[0].depth_m == 2.0
+
+
+def test_an_unknown_key_suggests_the_nearest():
+    assert "unknown key 'nam', did you mean 'name'?" in fault('nam = "x"')
+
+
+def test_an_unknown_key_far_inside_suggests_the_nearest_there():
+    assert "did you mean 'depth_m'?" in fault('name = "x"\n[[inner]]\ndepth = 2.0')
+    assert "did you mean 'depth_m'?" in fault('name = "x"\n[near]\ndepth_n = 2.0\ndepth_m = 1.0')
+
+
+def test_an_unknown_key_like_no_other_lists_the_known_ones():
+    assert "known keys: name, inner, near" in fault('name = "x"\nzzz = 1')
+
+
+def test_a_wrong_type_says_what_was_found():
+    assert "got 3" in fault("name = 3")
+
+
+def test_one_thing_where_a_list_is_wanted_is_shown_as_a_list():
+    class Sizes(Document):
+        sizes: list[int]
+
+    with pytest.raises(ConfigError, match=r"a\.toml: 'sizes' is a list: write \[192\]$"):
+        parse_toml("sizes = 192", Sizes, source="a.toml")
+    with pytest.raises(ConfigError, match=r"'sizes': Input should be a valid list"):
+        parse_toml("[sizes]\nx = 1", Sizes, source="a.toml")
+
+
+def test_a_missing_key_is_named():
+    assert "'name' is missing" in fault("")
+
+
+def test_two_faults_are_both_told():
+    message = fault("nam = 3\nzzz = 4")
+    assert "nam" in message
+    assert "zzz" in message
+
+
+@pytest.mark.parametrize("text", ["name = " + "[" * 5000, "name = " + "9" * 5000, "name = \x00", "name"])
+def test_what_the_parser_itself_gives_up_on_is_a_fault_of_the_file(text):
+    assert "not valid TOML: " in fault(text)
+
+
+def test_no_toml_says_so():
+    assert "not valid TOML" in fault("name = ")

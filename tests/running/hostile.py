@@ -276,8 +276,12 @@ class ReadsCommandLines(Plain):
     """Looks for a secret among the command lines of all processes, and reads of itself what libraries read."""
 
     def match(self, query, *, top_k):
+        try:
+            numbers = [name for name in os.listdir("/proc") if name.isdigit()]
+        except OSError:  # a folder that may not be listed may still be read by name
+            numbers = range(1, 2**16)
         secrets = 0
-        for number in range(1, 2**16):
+        for number in numbers:
             try:
                 secrets += b"my-secret-seed" in Path(f"/proc/{number}/cmdline").read_bytes()
             except OSError:

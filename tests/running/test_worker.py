@@ -178,7 +178,7 @@ def test_command_lines_of_others_are_out_of_reach(place, task):
             other.kill()
     assert reply.match.diagnostics["secrets"] == 0
     assert reply.match.diagnostics["own"] > 0
-    assert trusted.match.diagnostics["secrets"] == 1
+    assert trusted.match.diagnostics["secrets"] >= 1  # others on this machine may run this test at the same time
     assert "can be read" not in worker.isolation["processes"]
 
 

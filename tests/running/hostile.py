@@ -277,7 +277,7 @@ class ReadsCommandLines(Plain):
 
     def match(self, query, *, top_k):
         try:
-            numbers = [name for name in os.listdir("/proc") if name.isdigit()]
+            numbers = [path.name for path in Path("/proc").iterdir() if path.name.isdigit()]
         except OSError:  # a folder that may not be listed may still be read by name
             numbers = range(1, 2**16)
         secrets = 0

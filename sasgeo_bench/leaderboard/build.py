@@ -27,7 +27,7 @@ from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.contestants import Told, read_told, score_told
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict, hold_controls, is_control, verdict_frame
-from sasgeo_bench.scoring.costs import cost_rows
+from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out
 from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
@@ -39,7 +39,7 @@ from sasgeo_bench.scoring.rows import Contestant, name_alone, to_frame, with_con
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.scored_tasks import ScoredTask, read_scored_task
 from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
-from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.scoring.tables import cost_rows, leaderboard
 from sasgeo_bench.scoring.train_test_overlap import set_apart
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, Truth, base_of
@@ -269,7 +269,8 @@ def _costs(
     for entry in entries:
         frame = scores[entry.name]
         with failures.of(f"costs of {entry.name}"):
-            rows.append(to_frame(list(cost_rows(entry.name, frame, entry.runs, view_bytes=views, area_km2=areas))))
+            costs = Costs(scores=frame, runs=entry.runs, view_bytes=views, area_km2=areas)
+            rows.append(to_frame(list(cost_rows(entry.name, costs))))
         tell(f"{entry.name}: {_in_words(frame)}")
     return rows
 

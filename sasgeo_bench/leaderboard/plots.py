@@ -26,7 +26,7 @@ from sasgeo_bench.leaderboard.axes import (
 from sasgeo_bench.leaderboard.board_plots import FAINT, GREY, Page, look_of, page
 from sasgeo_bench.leaderboard.plot_tables import AS_DRAWN, BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, PlaceDifference
-from sasgeo_bench.scoring.measures import primary_of
+from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import ToldLevels
 from sasgeo_bench.scoring.rows import ALL_SUITES
 

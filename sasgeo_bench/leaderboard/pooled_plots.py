@@ -24,7 +24,7 @@ from sasgeo_bench.leaderboard.axes import (
 from sasgeo_bench.leaderboard.board_plots import FAINT, Page, look_of, page
 from sasgeo_bench.leaderboard.pooled_tables import LEAST_ERROR_M, MOST_ERROR_M, front_of
 from sasgeo_bench.scoring.decisions import COST_RATIOS
-from sasgeo_bench.scoring.measures import primary_of
+from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
 

@@ -27,7 +27,7 @@ from sasgeo_bench.scoring.intervals import (
     percentile_interval,
     wilson,
 )
-from sasgeo_bench.scoring.measures import FALSE_ABSENT, Measure, primary_of
+from sasgeo_bench.scoring.metrics import FALSE_ABSENT, MeanMetric, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, REPRODUCED, RUN_HERE
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
@@ -71,7 +71,7 @@ class _Pair:
     """Scored rows of one matcher on both seeds that one figure is of."""
 
     key: tuple[str, str, str]
-    measure: Measure
+    measure: MeanMetric
     public: pd.DataFrame
     private: pd.DataFrame
 
@@ -124,7 +124,7 @@ def _measured(key: tuple[str, str, str], public: pd.DataFrame, private: pd.DataF
             yield _Pair(key=key, measure=measure, public=ours, private=theirs)
 
 
-def _counted(measure: Measure, frame: pd.DataFrame) -> Bools:
+def _counted(measure: MeanMetric, frame: pd.DataFrame) -> Bools:
     return np.asarray(measure.counts(frame)) & (frame["role"] != "falsifier").to_numpy(bool)
 
 

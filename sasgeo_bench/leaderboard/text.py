@@ -15,7 +15,7 @@ from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Verdict, verdict_frame
 from sasgeo_bench.scoring.falsifiers import Falsifier
 from sasgeo_bench.scoring.integrity import AS_DRAWN
-from sasgeo_bench.scoring.measures import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.metrics import ANSWERED, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, RUN_HERE, is_apart, is_unranked
 from sasgeo_bench.scoring.steps import GROUP
 from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS

@@ -31,7 +31,7 @@ from sasgeo_bench.publishing.site_table import (
 )
 from sasgeo_bench.publishing.site_words import column, marks_of, prior_words
 from sasgeo_bench.scoring.contrasts import LESS_THAN_MATTERS, Contrast, chosen_rows
-from sasgeo_bench.scoring.measures import CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.metrics import CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
 from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS
 

@@ -28,7 +28,7 @@ from sasgeo_bench.publishing.site_table import (
 )
 from sasgeo_bench.publishing.site_words import column, prior_words
 from sasgeo_bench.scoring.integrity import AS_DRAWN
-from sasgeo_bench.scoring.measures import primary_of
+from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import base_of

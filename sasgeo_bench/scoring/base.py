@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every figure shares: its declaration, weights that are checked, weighted means and quantiles."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,45 +11,6 @@ from sasgeo_bench.errors import MetricError
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Metric:
-    """A figure as a table prints it.
-
-    Parameters
-    ----------
-    name : str
-        Column name, as in "recall_at_1".
-    unit : str
-        As in "m", "deg", "s"; "1" where there is none.
-    better : {"higher", "lower"}
-        Which way is good.
-    bounds : tuple of float
-        Least and greatest value it can have.
-    compute : callable
-        The pure function of this room that gives it.
-    source : str
-        Where the definition comes from.
-
-    Examples
-    --------
-    >>> share = Metric(name="share", unit="1", better="higher", bounds=(0, 1), compute=weighted_mean, source="ours")
-    >>> share.worst
-    0
-    """
-
-    name: str
-    unit: str
-    better: Literal["higher", "lower"]
-    bounds: tuple[float, float]
-    compute: Callable[..., float]
-    source: str
-
-    @property
-    def worst(self) -> float:
-        """The value of a method that fails at everything."""
-        return self.bounds[0] if self.better == "higher" else self.bounds[1]
 
 
 def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:

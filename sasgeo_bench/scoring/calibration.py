@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Bools, Floats, Ints, Metric, check_column, check_weights, weighted_mean
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, check_weights, weighted_mean
 from sasgeo_bench.scoring.decisions import Answers, check_probabilities
 
 BINS: Final = 10
@@ -299,23 +299,3 @@ def stanford(protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_l
         unavailable=~is_available & is_bounded,
         unavailable_misleading=~is_available & ~is_bounded,
     )
-
-
-METRICS: Final = (
-    Metric(
-        name="brier",
-        unit="1",
-        better="lower",
-        bounds=(0.0, 1.0),
-        compute=brier,
-        source="Brier, Monthly Weather Review 1950",
-    ),
-    Metric(
-        name="ece",
-        unit="1",
-        better="lower",
-        bounds=(0.0, 1.0),
-        compute=calibration_error,
-        source="Nguyen and O'Connor, EMNLP 2015; bins of equal mass",
-    ),
-)

@@ -27,7 +27,7 @@ from sasgeo_bench.scoring.intervals import (
     statistic_interval,
     wilson,
 )
-from sasgeo_bench.scoring.measures import primary_of
+from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.power import sensitivity
 from sasgeo_bench.scoring.rejection import answers_of
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.scoring.base import Bools, Floats
-from sasgeo_bench.scoring.measures import is_present, primary_of
+from sasgeo_bench.scoring.metrics import is_present, primary_of
 from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup

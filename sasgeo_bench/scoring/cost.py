@@ -1,92 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What answers cost: time, memory, map storage, and what has to be sent for one fix."""
+"""Cost of answers: time, memory, map storage, and bytes to send for one fix."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
-import shapely
-from numpy.typing import ArrayLike
+import pandas as pd
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.regions.evidence import pack
-from sasgeo_bench.scoring.base import Floats, Metric, weighted_quantile
-from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
 BYTES_PER_KB: Final = 1e3
 BYTES_PER_MB: Final = 1e6
 
 
-def latencies(predictions: Sequence[Prediction]) -> Floats:
-    """Seconds of `match` alone, one for each query that was timed.
-
-    Parameters
-    ----------
-    predictions : sequence of Prediction
-        Of one run.
-
-    Returns
-    -------
-    ndarray of float, shape (M,)
-        Infinite for a time-out: it took at least the limit, and leaving it out would make a slow matcher look fast.
-        Other queries without a time (crashes, refusals, submissions without code) are left out; the counts of statuses
-        tell how many.
-
-    Examples
-    --------
-    >>> quick = Prediction(query_id="a", latency_s=0.25)
-    >>> latencies([quick, Prediction(query_id="b", status="timeout"), Prediction(query_id="c")]).tolist()
-    [0.25, inf]
-    """
-    timed = [
-        math.inf if item.status == "timeout" else item.latency_s
-        for item in predictions
-        if item.status == "timeout" or item.latency_s is not None
-    ]
-    return np.array(timed, dtype=np.float64)
-
-
-def latency_quantile(latency_s: ArrayLike, share: float, weights: ArrayLike | None = None) -> float:
-    """Least latency that at least a share of the timed queries does not exceed.
-
-    Parameters
-    ----------
-    latency_s : array_like, shape (M,)
-        From `latencies`.
-    share : float
-        In (0, 1]: 0.5, 0.95.
-    weights : array_like, shape (M,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        Seconds; NaN where none was timed.
-
-    Examples
-    --------
-    >>> latency_quantile([0.1, 0.2, 0.9], 0.5), latency_quantile([0.1, 0.2, np.inf], 0.95)
-    (0.2, inf)
-    """
-    return weighted_quantile(latency_s, share, weights)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunCost:
-    """What a run took on one map; NaN where `run.json` does not say.
+    """Cost of a run on one map; NaN where `run.json` does not say.
 
     Parameters
     ----------
     prepare_s : float
-        Seconds of `prepare`, apart from answers.
+        Seconds of `prepare`, without answers.
     peak_rss_mb : float
         Peak memory of the matcher's process and all that came from it (1 MB = 10^6 bytes).
     index_mb : float
-        What the matcher added to the map on disk.
+        Files that the matcher wrote for the map.
     map_mb : float
         The region's files.
     cpu_s : float
@@ -100,18 +41,30 @@ class RunCost:
     cpu_s: float
 
 
-def run_cost(about: Mapping[str, Any]) -> RunCost:
-    """Read the costs out of what `run.json` says.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Costs:
+    """All that the cost metrics of one matcher are computed from.
 
     Parameters
     ----------
-    about : mapping
-        The content of `run.json`; empty for a submission without code.
+    scores : pandas.DataFrame
+        Its scored rows.
+    runs : sequence of mapping
+        What each `run.json` says; none for a file of predictions.
+    view_bytes : mapping of str to int
+        By query: two bits for each cell and class, one byte for each confidence, WKB for each vector.
+    area_km2 : mapping of str to float
+        Mapped area by region, where it is known.
+    """
 
-    Returns
-    -------
-    RunCost
-        In seconds and megabytes.
+    scores: pd.DataFrame
+    runs: Sequence[Mapping[str, Any]]
+    view_bytes: Mapping[str, int]
+    area_km2: Mapping[str, float]
+
+
+def run_cost(about: Mapping[str, Any]) -> RunCost:
+    """Read the cost of a run from the content of `run.json`, empty for a submission without code.
 
     Raises
     ------
@@ -143,74 +96,50 @@ def _number(about: Mapping[str, Any], name: str) -> float:
     return float(value)
 
 
-def bytes_per_km2(stored_bytes: float, area_km2: float) -> float:
-    """Storage of a map, with whatever a matcher adds to it, for each square kilometre.
+def latency_quantile(costs: Costs, share: float) -> float:
+    """Return the least latency in seconds that a share in (0, 1] of the timed queries does not exceed.
 
-    Parameters
-    ----------
-    stored_bytes : float
-        On disk.
-    area_km2 : float
-        Mapped area, positive.
-
-    Returns
-    -------
-    float
-        Bytes.
-
-    Raises
-    ------
-    MetricError
-        If the area is not positive.
-
-    Examples
-    --------
-    >>> bytes_per_km2(3_000_000, 36.0).__round__()
-    83333
+    A time-out is infinite: it took at least the limit, and leaving it out would make a slow matcher look fast. Other
+    queries without a time (crashes, refusals, submissions without code) are left out. NaN where none was timed.
     """
-    if not area_km2 > 0:
-        message = f"area_km2 must be positive, got {area_km2!r}"
-        raise MetricError(message)
-    return stored_bytes / area_km2
+    latency_s = np.where(costs.scores["status"] == "timeout", np.inf, costs.scores["latency_s"].to_numpy(float))
+    timed_s = latency_s[~np.isnan(latency_s)]
+    return float(np.quantile(timed_s, share, method="inverted_cdf")) if len(timed_s) else math.nan
 
 
-def observation_bytes(query: Query) -> int:
-    """Bytes of what was seen, if it were sent as it is stored.
+def most(costs: Costs, name: str) -> float:
+    """Return the largest value of a field of `RunCost` over all maps; NaN where no run says it."""
+    values = [getattr(run_cost(about), name) for about in costs.runs]
+    return max((value for value in values if not math.isnan(value)), default=math.nan)
 
-    Parameters
-    ----------
-    query : Query
-        With its evidence, and vectors where it has any.
 
-    Returns
-    -------
-    int
-        Two bits for each cell and class, one byte for each confidence, WKB for each vector; nothing is compressed, so
-        that the figure does not depend on a library's version. `task_files.read_view_bytes` gives the same of all
-        queries of a task without unpacking one.
-    """
-    evidence = query.evidence
-    total = len(pack(evidence.cells))
-    total += 0 if evidence.confidence is None else evidence.confidence.nbytes
-    if query.vectors is not None:
-        total += sum(len(shape) for shape in shapely.to_wkb(query.vectors.geometry.to_numpy()))
-    return total
+def map_kb_per_km2(costs: Costs) -> float:
+    """Return kilobytes of maps with what the matcher wrote for them per square kilometre; each map counts once."""
+    stored = {about["region"]: run_cost(about) for about in costs.runs if about["region"] in costs.area_km2}
+    size_kb = {name: 1e3 * (cost.map_mb + np.nan_to_num(cost.index_mb)) for name, cost in stored.items()}
+    known = [name for name, size in size_kb.items() if not math.isnan(size)]
+    area_km2 = sum(costs.area_km2[name] for name in known)
+    return float(sum(size_kb[name] for name in known) / area_km2) if area_km2 > 0 else math.nan
+
+
+def cpu_s_per_fix(costs: Costs) -> float:
+    """Return CPU-seconds of all queries over those answered; NaN where no run says it."""
+    if not costs.runs:
+        return math.nan
+    return per_fix(sum(run_cost(about).cpu_s for about in costs.runs), int(costs.scores["is_answered"].sum()))
+
+
+def sent_kb_per_fix(costs: Costs) -> float:
+    """Return kilobytes of the views of all queries over those answered."""
+    asked = costs.scores.loc[costs.scores["status"] != NOT_APPLICABLE, "query_id"]
+    sent_kb = sum(costs.view_bytes[name] for name in asked) / BYTES_PER_KB
+    return per_fix(sent_kb, int(costs.scores["is_answered"].sum()))
 
 
 def per_fix(total: float, fixes: float) -> float:
-    """What one fix costs, all queries paid for: bytes that were sent, CPU-seconds.
+    """Return what one fix costs when all queries are paid for, those without a fix too.
 
-    Parameters
-    ----------
-    total : float
-        Of all queries, those without a fix too.
-    fixes : float
-        How many fixes came of them; say whether accepted or right ones.
-
-    Returns
-    -------
-    float
-        Infinite where all was in vain, NaN where nothing was paid and nothing came, or the total is not known.
+    Infinite where all was in vain; NaN where nothing was paid and nothing came, or the total is not known.
 
     Raises
     ------
@@ -228,16 +157,3 @@ def per_fix(total: float, fixes: float) -> float:
     if fixes > 0:
         return total / fixes
     return math.inf if total > 0 else math.nan
-
-
-METRICS: Final = tuple(
-    Metric(
-        name=f"latency_p{100 * share:g}_s",
-        unit="s",
-        better="lower",
-        bounds=(0.0, math.inf),
-        compute=partial(latency_quantile, share=share),
-        source="time of match alone, a time-out is infinite",
-    )
-    for share in (0.5, 0.95)
-)

@@ -7,14 +7,13 @@ confidence is trusted less than all answers with one; if no answer has one, all 
 
 import math
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Bools, Floats, Ints, Metric, check_column, check_weights, weighted_mean
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, check_weights, weighted_mean
 
 COST_RATIOS: Final = (5.0, 20.0, 100.0)
 PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
@@ -334,16 +333,3 @@ def decision_cost(
     return weighted_mean(
         cost_values(answers, accept_by_cost(answers, cost_ratio), cost_ratio, charged=charged), weights
     )
-
-
-METRICS: Final = tuple(
-    Metric(
-        name=f"cost_{ratio:g}",
-        unit="1",
-        better="lower",
-        bounds=(0.0, ratio),
-        compute=partial(decision_cost, cost_ratio=ratio),
-        source="the SASGeo paper, Eqs. (12)-(14)",
-    )
-    for ratio in COST_RATIOS
-)

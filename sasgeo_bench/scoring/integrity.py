@@ -2,7 +2,7 @@
 """Rows of a board for matcher x rejector: how well it is known which answers are false."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -10,44 +10,18 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.scoring.base import Floats, weighted_mean
-from sasgeo_bench.scoring.calibration import brier, calibration_error
-from sasgeo_bench.scoring.decisions import COST_RATIOS, PRESENT_SHARES, Answers, decision_cost, presence_weights
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
 from sasgeo_bench.scoring.draws import ClusterDraws
-from sasgeo_bench.scoring.integrity_metric import augrc, aurc, drawn_areas, excess_aurc, false_fix_rate
+from sasgeo_bench.scoring.integrity_metric import drawn_areas
 from sasgeo_bench.scoring.intervals import Interval, effective_count, share_interval
-from sasgeo_bench.scoring.rejection import RISKS, answers_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, Better, Row, Told, bare, side_by_side
+from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS, RejectionMetric, ThresholdMetric
+from sasgeo_bench.scoring.rejection import answers_of
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, side_by_side
 
 AS_DRAWN: Final = "as drawn"
-COVERAGES: Final = (0.5, 0.8)
 _CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take twice the time
 SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
-
-_AREAS: Final = {"aurc": 1.0, "augrc": 0.5}  # figures that have intervals, and how large they can be
-_OF_CHANCES: Final = ("brier", "ece", "cost_")  # how figures begin that take a confidence for a probability
 _NO_DRAWS: Final = np.empty(0)
-
-Figure = Callable[[Answers, Floats], float]
-
-_FIGURES: Final[tuple[tuple[str, Figure], ...]] = (
-    ("aurc", aurc),
-    ("e_aurc", excess_aurc),
-    ("augrc", augrc),
-    *(
-        (f"false_fix_at_coverage_{share:g}", lambda some, mass, share=share: false_fix_rate(some, share, mass))
-        for share in COVERAGES
-    ),
-    ("brier", brier),
-    ("ece", calibration_error),
-    *((f"cost_{ratio:g}", lambda some, mass, ratio=ratio: decision_cost(some, ratio, mass)) for ratio in COST_RATIOS),
-    *(
-        (
-            f"cost_{ratio:g}_place",
-            lambda some, mass, ratio=ratio: decision_cost(some, ratio, mass, charged="place"),
-        )
-        for ratio in COST_RATIOS
-    ),
-)
 
 
 def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
@@ -70,7 +44,7 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_cali
     """
     parts = [
         (
-            Told.of(
+            RowKey.of(
                 part,
                 matcher=matcher,
                 rejector=rejector,
@@ -84,35 +58,36 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_cali
         for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
-    figures = [item for item in _FIGURES if is_calibrated or not item[0].startswith(_OF_CHANCES)]
-    yield from side_by_side(lambda item: _rows(*item, figures), parts)
+    metrics = [metric for metric in REJECTION if is_calibrated or not metric.needs_chances]
+    yield from side_by_side(lambda item: _rows(*item, metrics), parts)
 
 
-def _rows(told: Told, part: pd.DataFrame, figures: Sequence[tuple[str, Figure]]) -> Iterator[Row]:
+def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -> Iterator[Row]:
     some = answers_of(part)
     # Of the queries alone, so that two rejectors are drawn alike.
-    text = f"{told.suite}/{told.track}/{told.prior_group}"
+    text = f"{key.suite}/{key.track}/{key.prior_group}"
     seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
     sites = np.unique(part["pair_id"], return_inverse=True)[1]
     drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)
-    is_pooled = told.suite == ALL_SUITES
+    is_pooled = key.suite == ALL_SUITES
     mixtures = dict(_mixtures(some, is_pooled=is_pooled))
     areas = _drawn_areas(some, mixtures, drawn) if is_pooled and drawn.blocks_count > 1 else {}
     shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
     drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
     for stratum, mass in mixtures.items():
-        mine, trials = replace(told, stratum=stratum), effective_count(sites, mass)
-        for name, figure in figures:
-            value, most = figure(some, mass), _AREAS.get(name)
-            if is_pooled and most is not None:
-                found, how = _area_interval(value, areas.get((stratum, name), _NO_DRAWS), trials, most)
-                yield mine.row(name, "1", "lower", found, how)
+        mine, trials = replace(key, stratum=stratum), effective_count(sites, mass)
+        for metric in metrics:
+            value = metric.compute(some, weights=mass)
+            if is_pooled and metric.has_interval:
+                drawn_values = areas.get((stratum, metric.name), _NO_DRAWS)
+                found, how = _area_interval(value, drawn_values, trials, metric.bounds[1])
+                yield mine.row(metric, found, how)
             else:
-                yield mine.row(name, "1", "lower", bare(value))
+                yield mine.row(metric, bare(value))
         for share in shares[stratum]:
             value = weighted_mean(share.counted, share.mass)
             found, how = share_interval(value, next(drawn_shares), effective_count(sites, share.mass))
-            yield mine.row(share.name, "1", share.better, found, how)
+            yield mine.row(share.metric, found, how)
 
 
 def _area_interval(value: float, draws: Floats, trials: float, most: float) -> tuple[Interval, str]:
@@ -147,8 +122,7 @@ def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]
 class _Share:
     """A share of the queries by mass, as the coverage of a threshold; each column has shape (N,)."""
 
-    name: str
-    better: Better
+    metric: ThresholdMetric
     counted: Floats
     mass: Floats
 
@@ -156,15 +130,15 @@ class _Share:
 def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
     """Coverage at the thresholds chosen on calibration places, and the risk that was really reached.
 
-    Nothing where some row has no threshold: the coverage of the others would not be that of the queries told.
+    Nothing where some row has no threshold: the coverage of the others would not be that of these queries.
     """
     is_false = (~part["is_right"].to_numpy(bool)).astype(float)
-    for risk in RISKS:
-        column = part[f"accepted_{risk:g}"]
+    for metric in THRESHOLDS:
+        column = part[f"accepted_{metric.risk:g}"]
         if not column.isna().any():
             accepted = column.to_numpy(float)
-            yield _Share(name=f"coverage_at_risk_{risk:g}", better="higher", counted=accepted, mass=mass)
-            yield _Share(name=f"risk_reached_at_{risk:g}", better="lower", counted=is_false, mass=mass * accepted)
+            counted, counts = (is_false, mass * accepted) if metric.is_of_accepted else (accepted, mass)
+            yield _Share(metric=metric, counted=counted, mass=counts)
 
 
 def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Floats]:

@@ -7,19 +7,14 @@ never a way to a better area.
 
 import math
 from dataclasses import dataclass
-from functools import partial
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import digamma
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Floats, Metric, check_weights, weighted_mean
-from sasgeo_bench.scoring.decisions import Answers, accept
-
-RISKS: Final = (0.01, 0.05)
-COVERAGES: Final = (0.5, 0.8)
+from sasgeo_bench.scoring.base import Floats, check_weights
+from sasgeo_bench.scoring.decisions import Answers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,28 +278,6 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     return float(np.interp(coverage * total, accepted, wrong) / (coverage * total))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OperatingPoint:
-    """What a threshold does to some queries.
-
-    Parameters
-    ----------
-    threshold : float
-        Fixes with at least this confidence are accepted; `inf` where none is.
-    coverage : float
-        Accepted / all; NaN for no queries.
-    risk : float
-        False / accepted, the risk really reached; NaN where nothing is accepted.
-    accepted : int
-        How many fixes are accepted: 0 false ones in 299 support "below 1 %", in 59 "below 5 %", at 95 %.
-    """
-
-    threshold: float
-    coverage: float
-    risk: float
-    accepted: int
-
-
 def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | None = None) -> float:
     """Threshold with the largest coverage whose risk on calibration blocks is at most the wanted one.
 
@@ -344,89 +317,3 @@ def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | Non
     curve = risk_coverage(calibration, weights)
     allowed = np.flatnonzero(curve.risk <= risk)
     return float(curve.threshold[allowed[-1]]) if len(allowed) else math.inf
-
-
-def operate(answers: Answers, threshold: float, weights: ArrayLike | None = None) -> OperatingPoint:
-    """Coverage and risk that a threshold reaches.
-
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    threshold : float
-        As in `accept`.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    OperatingPoint
-        What it does.
-
-    Examples
-    --------
-    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 0], is_present=[1, 1])
-    >>> operate(some, 0.8)
-    OperatingPoint(threshold=0.8, coverage=1.0, risk=0.5, accepted=2)
-    """
-    mass = check_weights(weights, len(answers))
-    taken = accept(answers, threshold)
-    return OperatingPoint(
-        threshold=threshold,
-        coverage=weighted_mean(taken, mass),
-        risk=weighted_mean(~answers.is_right[taken], mass[taken]),
-        accepted=int((taken & (mass > 0)).sum()),
-    )
-
-
-def coverage_at_risk(
-    calibration: Answers,
-    test: Answers,
-    risk: float,
-    *,
-    calibration_weights: ArrayLike | None = None,
-    test_weights: ArrayLike | None = None,
-) -> OperatingPoint:
-    """Coverage on test blocks at a risk whose threshold is chosen on calibration blocks.
-
-    Parameters
-    ----------
-    calibration, test : Answers
-        Of queries from different blocks.
-    risk : float
-        In [0, 1]: 0.01 or 0.05.
-    calibration_weights, test_weights : array_like, optional
-        Not negative; the same mixture of present and absent places for both, or the threshold answers another question.
-
-    Returns
-    -------
-    OperatingPoint
-        On the test queries; its `risk` is the one really reached, which may exceed the wanted one.
-
-    Examples
-    --------
-    >>> facts = {"is_answered": [1] * 3, "is_right": [1, 1, 0], "is_present": [1] * 3}
-    >>> calibration = Answers(confidence=[0.9, 0.8, 0.1], **facts)
-    >>> point = coverage_at_risk(calibration, Answers(confidence=[0.9, 0.2, 0.85], **facts), 0.05)
-    >>> round(point.coverage, 3), point.risk
-    (0.667, 0.5)
-    """
-    return operate(test, choose_threshold(calibration, risk, calibration_weights), test_weights)
-
-
-_lower = partial(Metric, unit="1", better="lower")
-
-METRICS: Final = (
-    _lower(name="aurc", bounds=(0.0, 1.0), compute=aurc, source="Geifman and El-Yaniv, NeurIPS 2017; ties averaged"),
-    _lower(name="e_aurc", bounds=(0.0, 1.0), compute=excess_aurc, source="Geifman et al., ICLR 2019; exact for N"),
-    _lower(name="augrc", bounds=(0.0, 0.5), compute=augrc, source="Traub et al., NeurIPS 2024"),
-    *(
-        _lower(
-            name=f"false_fix_at_{100 * coverage:g}",
-            bounds=(0.0, 1.0),
-            compute=partial(false_fix_rate, coverage=coverage),
-            source="risk at a coverage; ties in proportion",
-        )
-        for coverage in COVERAGES
-    ),
-)

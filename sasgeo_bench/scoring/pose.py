@@ -4,7 +4,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -14,14 +13,12 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.base import Bools, Floats, Metric, check_column, weighted_mean, weighted_quantile
+from sasgeo_bench.scoring.base import Bools, Floats, check_column, weighted_quantile
 from sasgeo_bench.scoring.ranking import MISS, Rank, rank_of
 from sasgeo_bench.tasks.query import Truth
 
-SUCCESS_M: Final = (5.0, 10.0, 25.0)
 SUCCESS_DEG: Final = 5.0
 AUC_M: Final = 50.0
-QUANTILES: Final = (0.5, 0.9, 0.99)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,34 +186,6 @@ def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, w
     return rank_of([score for _, score in prediction.candidates], successes(errors, within_m, within_deg))
 
 
-def success_rate(
-    errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_DEG, weights: ArrayLike | None = None
-) -> float:
-    """Share of all queries whose fix is within metres and degrees.
-
-    Parameters
-    ----------
-    errors : PoseErrors
-        Of every query whose place is present.
-    within_m, within_deg : float
-        Tolerance, as in `successes`.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In [0, 1]; NaN for no queries.
-
-    Examples
-    --------
-    >>> errors = PoseErrors(position_m=[5.0, np.inf], yaw_deg=[5.0, np.inf], log_scale=[0.0, np.inf])
-    >>> success_rate(errors, 5.0)
-    0.5
-    """
-    return weighted_mean(successes(errors, within_m, within_deg), weights)
-
-
 def error_quantile(errors: ArrayLike, share: float, weights: ArrayLike | None = None) -> float:
     """Least error that at least a share of all queries does not exceed; infinite where too few were answered.
 
@@ -274,73 +243,3 @@ def area_values(errors: PoseErrors, up_to_m: float = AUC_M, within_deg: float = 
         raise MetricError(message)
     near = np.maximum(0.0, 1.0 - errors.position_m / up_to_m)
     return np.where(errors.yaw_deg <= within_deg, near, 0.0)
-
-
-def success_auc(
-    errors: PoseErrors,
-    up_to_m: float = AUC_M,
-    within_deg: float = SUCCESS_DEG,
-    weights: ArrayLike | None = None,
-) -> float:
-    """Area under the success rate over its tolerance from 0 to `up_to_m`, divided by `up_to_m`.
-
-    Parameters
-    ----------
-    errors : PoseErrors
-        Of every query whose place is present.
-    up_to_m : float
-        Positive, metres.
-    within_deg : float
-        Tolerance of the heading, the same all along; 180 where it does not count.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In [0, 1]; NaN for no queries.
-
-    Notes
-    -----
-    Exact: the success rate steps up by 1/N at each error e, so that the area is the mean of max(0, 1 - e / up_to).
-
-    Examples
-    --------
-    >>> success_auc(PoseErrors(position_m=[0.0, 25.0, np.inf], yaw_deg=[0.0, 0.0, np.inf], log_scale=[0.0] * 3))
-    0.5
-    """
-    return weighted_mean(area_values(errors, up_to_m, within_deg), weights)
-
-
-METRICS: Final = (
-    *(
-        Metric(
-            name=f"success_{within_m:g}m",
-            unit="1",
-            better="higher",
-            bounds=(0.0, 1.0),
-            compute=partial(success_rate, within_m=within_m),
-            source="share of all queries within metres and 5 deg",
-        )
-        for within_m in SUCCESS_M
-    ),
-    *(
-        Metric(
-            name=f"position_error_p{100 * share:g}_m",
-            unit="m",
-            better="lower",
-            bounds=(0.0, math.inf),
-            compute=partial(error_quantile, share=share),
-            source="Hyndman and Fan, American Statistician 1996, type 1",
-        )
-        for share in QUANTILES
-    ),
-    Metric(
-        name="success_auc_50m",
-        unit="1",
-        better="higher",
-        bounds=(0.0, 1.0),
-        compute=success_auc,
-        source="area under the success rate over its tolerance, exact",
-    ),
-)

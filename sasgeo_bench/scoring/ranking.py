@@ -3,7 +3,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final, Self
 
 import numpy as np
@@ -13,10 +12,8 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import candidates_at
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.base import Floats, Ints, Metric, check_column, weighted_mean
+from sasgeo_bench.scoring.base import Floats, Ints, check_column
 from sasgeo_bench.tasks.query import Truth
-
-RECALL_AT: Final = (1, 5, 10, 20, 50, 100, 200)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,123 +228,3 @@ def reciprocal_ranks(ranks: Ranks, k: int | None = None) -> Floats:
         total += (now - before) / place
         before = now
     return total
-
-
-def recall(ranks: Ranks, k: int, weights: ArrayLike | None = None) -> float:
-    """Recall@k: share of queries with a right pose among the first k, ties in random order.
-
-    Parameters
-    ----------
-    ranks : Ranks
-        Of every query whose place is present; a miss is a row like any other, so the denominator is fixed.
-    k : int
-        At least 1.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In [0, 1]; NaN for no queries.
-
-    Examples
-    --------
-    >>> recall(Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=3, tied=1, right=1), MISS, MISS]), 5)
-    0.5
-    """
-    return weighted_mean(hits(ranks, k), weights)
-
-
-def mean_reciprocal_rank(ranks: Ranks, k: int | None = None, weights: ArrayLike | None = None) -> float:
-    """MRR, or MRR@k: mean of 1 / rank of the first right pose, ties in random order; 0 for a miss.
-
-    Parameters
-    ----------
-    ranks : Ranks
-        Of every query whose place is present.
-    k : int, optional
-        Ranks beyond count 0; MRR@1 is Recall@1.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In [0, 1]; NaN for no queries.
-
-    Examples
-    --------
-    >>> mean_reciprocal_rank(Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=3, tied=1, right=1)]))
-    0.625
-    """
-    return weighted_mean(reciprocal_ranks(ranks, k), weights)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoolRecall:
-    """Recall among queries with the same number of candidates."""
-
-    pool: int
-    queries: int
-    recall: float
-
-
-def recall_by_pool(
-    ranks: Ranks, pools: ArrayLike, k: int = 1, weights: ArrayLike | None = None
-) -> tuple[PoolRecall, ...]:
-    """Recall@k against the number of candidates to choose from.
-
-    Parameters
-    ----------
-    ranks : Ranks
-        Of N queries.
-    pools : array_like of int, shape (N,)
-        How many candidates each query has; mostly 10, 50 or 200, fewer where the map holds no more.
-    k : int
-        At least 1.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    tuple of PoolRecall
-        One for each size that occurs, the smallest first: no query is left out.
-
-    Examples
-    --------
-    >>> ranks = Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=2, tied=1, right=1), MISS])
-    >>> [(point.pool, point.recall) for point in recall_by_pool(ranks, [10, 50, 50])]
-    [(10, 1.0), (50, 0.0)]
-    """
-    values = hits(ranks, k)
-    sizes = check_column(pools, "pools", len(values))
-    mass = np.ones(len(values)) if weights is None else check_column(weights, "weights", len(values))
-    found = []
-    for size in np.unique(sizes):
-        chosen = sizes == size
-        share = weighted_mean(values[chosen], mass[chosen])
-        found.append(PoolRecall(pool=int(size), queries=int(chosen.sum()), recall=share))
-    return tuple(found)
-
-
-METRICS: Final = (
-    *(
-        Metric(
-            name=f"recall_at_{k}",
-            unit="1",
-            better="higher",
-            bounds=(0.0, 1.0),
-            compute=partial(recall, k=k),
-            source="share of queries; ties as in McSherry and Najork, ECIR 2008",
-        )
-        for k in RECALL_AT
-    ),
-    Metric(
-        name="mrr",
-        unit="1",
-        better="higher",
-        bounds=(0.0, 1.0),
-        compute=mean_reciprocal_rank,
-        source="Voorhees, TREC-8 1999; ties as in McSherry and Najork, ECIR 2008",
-    ),
-)

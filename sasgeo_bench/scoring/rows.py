@@ -6,11 +6,12 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import pandas as pd
 
 from sasgeo_bench.scoring.intervals import Interval
+from sasgeo_bench.scoring.metrics import Metric
 from sasgeo_bench.scoring.score import MISSING
 
 ALL_SUITES: Final = "all suites"
@@ -22,7 +23,6 @@ UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # 
 YARDSTICK: Final = "oracle_"  # how the names of yardsticks begin, which know what no matcher can: beside the ranks, too
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
-Better = Literal["higher", "lower"]
 Item = TypeVar("Item")
 
 
@@ -87,8 +87,8 @@ COLUMNS: Final = tuple(field.name for field in fields(Row))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
-    """What all rows about the same queries of one matcher say; see `Row`."""
+class RowKey:
+    """Fields that all rows about the same queries of one matcher share; see `Row`."""
 
     matcher: str
     suite: str
@@ -129,14 +129,14 @@ class Told:
             places=int(scores["place"].nunique()),
         )
 
-    def row(self, metric: str, unit: str, better: Better, found: Interval, how: str = "", **more: Any) -> Row:  # noqa: ANN401
-        """One figure about these queries; `more` are other fields of a `Row`."""
-        said = {name: getattr(self, name) for name in self.__slots__}
+    def row(self, metric: Metric, found: Interval, how: str = "", **more: Any) -> Row:  # noqa: ANN401
+        """Return the row of one metric about these queries; `more` are other fields of a `Row`."""
+        key = {name: getattr(self, name) for name in self.__slots__}
         return Row(
-            **said,
-            metric=metric,
-            unit=unit,
-            better=better,
+            **key,
+            metric=metric.name,
+            unit=metric.unit,
+            better=metric.better,
             value=found.value,
             lo=found.lo,
             hi=found.hi,

@@ -4,7 +4,7 @@
 import hashlib
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Self
 
@@ -15,12 +15,13 @@ from numpy.typing import ArrayLike
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, Ints
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
+from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
 from sasgeo_bench.scoring.intervals import Interval, bootstrap_means, effective_count, share_interval
-from sasgeo_bench.scoring.measures import MEASURES, QUANTILE_MEASURES, Measure, Quantile, primary_of
+from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
 from sasgeo_bench.scoring.pose import error_quantile
 from sasgeo_bench.scoring.power import sensitivity
-from sasgeo_bench.scoring.rows import Row, Told, bare, is_unranked, side_by_side, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, is_unranked, side_by_side, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS, strata
 
@@ -89,7 +90,7 @@ def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str
 class _Group:
     """Queries of one suite, track and prior group as columns: shape (N,), or (N, M) for M matchers.
 
-    What is the same in every part of them is worked out once: values of measures by name, errors by column, and codes
+    What is the same in every part of them is worked out once: values of metrics by name, errors by column, and codes
     of blocks, places and sites in the order of their names.
     """
 
@@ -109,7 +110,7 @@ class _Group:
     def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
         """Columns of the rows of some matchers, of which some stand beside the ranks."""
         first = next(iter(frames.values()))
-        columns = dict.fromkeys(quantile.column for quantile in QUANTILE_MEASURES)
+        columns = dict.fromkeys(quantile.column for quantile in QUANTILES)
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
 
         def beside(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
@@ -126,7 +127,7 @@ class _Group:
             sites=codes[2],
             is_answered=beside(lambda frame: frame["is_answered"].to_numpy(bool)),
             is_missing=beside(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
-            measured={measure.name: beside(measure.values) for measure in MEASURES[key[1]]},
+            measured={metric.name: beside(metric.values) for metric in means_of(key[1])},
             errors={name: beside(partial(_floats, name=name)) for name in columns},
         )
 
@@ -150,12 +151,12 @@ class _Cell:
         text = "/".join((*self.group.key, self.stratum))
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
-    def told(self) -> list[Told]:
-        """What all rows of each matcher say of these queries."""
+    def keys(self) -> list[RowKey]:
+        """Return what the rows of each matcher share."""
         suite, track, prior_group = self.group.key
         blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
         return [
-            Told(
+            RowKey(
                 matcher=name,
                 suite=suite,
                 track=track,
@@ -181,45 +182,45 @@ def _rows_of_group(
     if not able:
         return
     group = _Group.of(key, able, beside)
-    counted = {measure.name: measure.counts(group.first) for measure in MEASURES[key[1]]}
+    counted = {metric.name: metric.counts(group.first) for metric in means_of(key[1])}
     for stratum, inside in strata(group.first):
-        by_count: dict[bytes, list[Measure]] = {}
-        for measure in MEASURES[key[1]]:
-            mask = inside & counted[measure.name]
+        by_count: dict[bytes, list[MeanMetric]] = {}
+        for metric in means_of(key[1]):
+            mask = inside & counted[metric.name]
             if mask.any():
-                by_count.setdefault(mask.tobytes(), []).append(measure)
-        for key_of_mask, measures in by_count.items():
+                by_count.setdefault(mask.tobytes(), []).append(metric)
+        for key_of_mask, metrics in by_count.items():
             chosen = np.flatnonzero(np.frombuffer(key_of_mask, dtype=bool))
-            yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), measures)
+            yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), metrics)
 
 
 def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -> Row:
     """The one row of a matcher that cannot."""
     suite, track, prior_group = key
     primary = primary_of(track)
-    told = Told.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
-    return told.row(primary.name, primary.unit, primary.better, bare(math.nan), is_applicable=False)
+    row_key = RowKey.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
+    return row_key.row(primary, bare(math.nan), is_applicable=False)
 
 
-def _mean_rows(cell: _Cell, measures: Sequence[Measure]) -> Iterator[Row]:
+def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
     """Means that share a denominator, by the same draws."""
     group, count = cell.group, len(cell.group.names)
-    told, sites = cell.told(), group.sites[cell.chosen]
+    keys, sites = cell.keys(), group.sites[cell.chosen]
     trials = effective_count(sites)
-    below = list(_thresholds(cell, measures))
-    columns = [group.measured[measure.name][cell.chosen] for measure in measures]
+    below = list(_thresholds(cell, metrics))
+    columns = [group.measured[metric.name][cell.chosen] for metric in metrics]
     table = np.column_stack((*columns, *(item.is_below for item in below)))
     drawn = ClusterDraws(blocks=group.blocks[cell.chosen], sites=sites, seed=cell.seed, draws=cell.draws)
     means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.full((0, table.shape[1]), np.nan)
-    for number, measure in enumerate(measures):
+    for number, metric in enumerate(metrics):
         part = slice(number * count, (number + 1) * count)
-        yield from _ranked(cell, told, measure, table[:, part], means[:, part], trials)
-    for at, item in enumerate(below, start=len(measures) * count):
+        yield from _ranked(cell, keys, metric, table[:, part], means[:, part], trials)
+    for at, item in enumerate(below, start=len(metrics) * count):
         found, how = share_interval(item.quantile.share, means[:, at], trials)
         errors = group.errors[item.quantile.column][cell.chosen, item.matcher]
         lo, hi = (_inverse(errors, share) for share in (found.lo, found.hi))
         interval = Interval(value=item.value, lo=lo, hi=hi)
-        yield told[item.matcher].row(item.quantile.name, item.quantile.unit, "lower", interval, how)
+        yield keys[item.matcher].row(item.quantile, interval, how)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,18 +231,18 @@ class _Below:
     """
 
     matcher: int
-    quantile: Quantile
+    quantile: QuantileMetric
     value: float
     is_below: Floats
 
 
-def _thresholds(cell: _Cell, measures: Sequence[Measure]) -> Iterator[_Below]:
+def _thresholds(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[_Below]:
     """Quantiles of errors, whose intervals are those of the share below them, read backwards (Woodruff 1952)."""
-    is_pose = cell.group.key[1] == "localization" and any(measure.is_primary for measure in measures)
+    is_pose = cell.group.key[1] == "localization" and any(metric.is_primary for metric in metrics)
     if not is_pose or cell.stratum not in _WHOLE:
         return
     for at in range(len(cell.group.names)):
-        for quantile in QUANTILE_MEASURES:
+        for quantile in QUANTILES:
             errors = cell.group.errors[quantile.column][cell.chosen, at]
             value = error_quantile(errors, quantile.share)
             is_below, is_equal = errors < value, errors == value
@@ -257,21 +258,19 @@ def _inverse(errors: Floats, share: float) -> float:
 
 
 def _ranked(
-    cell: _Cell, told: Sequence[Told], measure: Measure, table: Floats, means: Floats, trials: float
+    cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, table: Floats, means: Floats, trials: float
 ) -> Iterator[Row]:
-    """Rows of one measure; of the primary one with ranks."""
+    """Rows of one metric; of the primary one with ranks."""
     names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
     found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
-    is_decidable = measure.is_primary and told[0].blocks >= LEAST_BLOCKS
-    ranks = _ranks(cell.group, [interval.value for interval, _ in found], means, measure) if is_decidable else {}
+    is_decidable = metric.is_primary and keys[0].blocks >= LEAST_BLOCKS
+    ranks = _ranks(cell.group, [interval.value for interval, _ in found], means, metric) if is_decidable else {}
     for at, name in enumerate(names):
         interval, how = found[at]
         rank = ranks.get(name)
         detectable = _detectable(name, cell.group, table, blocks) if is_decidable else math.nan
-        yield told[at].row(
-            measure.name,
-            measure.unit,
-            measure.better,
+        yield keys[at].row(
+            metric,
             interval,
             how,
             rank_best=None if rank is None else rank.best,
@@ -280,12 +279,12 @@ def _ranked(
         )
 
 
-def _ranks(group: _Group, values: Sequence[float], means: Floats, measure: Measure) -> dict[str, RankInterval]:
+def _ranks(group: _Group, values: Sequence[float], means: Floats, metric: MeanMetric) -> dict[str, RankInterval]:
     """Rank intervals of all rivals."""
     chosen = [group.names.index(name) for name in group.rivals]
     if not chosen:
         return {}
-    better = distinguishable([values[at] for at in chosen], means[:, chosen], better=measure.better)
+    better = distinguishable([values[at] for at in chosen], means[:, chosen], better=metric.better)
     return {group.names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
 
 
@@ -296,3 +295,14 @@ def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
     return sensitivity(table[:, group.names.index(name)], table[:, best], blocks).detectable
+
+
+def cost_rows(matcher: str, costs: Costs) -> Iterator[Row]:
+    """Yield every cost metric of one matcher: of each track, or of all tracks together."""
+    by_track = {str(track): part for track, part in costs.scores.groupby("track", sort=True)}
+    for track, part in [*by_track.items(), ("all", costs.scores)]:
+        mine = replace(costs, scores=part)
+        key = RowKey.of(part, matcher=matcher, suite=ALL_SUITES, track=track, prior_group="all", stratum="all")
+        for metric in COSTS:
+            if metric.is_by_track == (track != "all"):
+                yield key.row(metric, bare(metric.compute(mine)))

@@ -27,7 +27,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.protection import level_name
 from sasgeo_bench.scoring.calibration import calibration_error
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
-from sasgeo_bench.scoring.measures import primary_of
+from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import protection_frame, told_levels
 from sasgeo_bench.scoring.rejection import answers_of
 from sasgeo_bench.scoring.steps import queries_of, steps_frame

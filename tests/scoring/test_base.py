@@ -9,8 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import MetricError, SasgeoError
-from sasgeo_bench.scoring import calibration, cost, decisions, pose, ranking
-from sasgeo_bench.scoring import integrity_metric as integrity
 from sasgeo_bench.scoring.base import block_codes, check_weights, weighted_mean, weighted_quantile
 
 ROWS = st.lists(st.tuples(st.floats(-100, 100), st.integers(0, 4)), min_size=1, max_size=12)
@@ -68,12 +66,3 @@ def test_a_value_that_is_missing_is_refused() -> None:
         weighted_quantile([1.0], 0.0)
     with pytest.raises(MetricError, match="2 blocks for 1"):
         block_codes(["a", "b"], 1)
-
-
-def test_every_declared_figure_has_a_name_of_its_own_and_a_source() -> None:
-    metrics = [metric for room in (ranking, pose, decisions, integrity, calibration, cost) for metric in room.METRICS]
-    assert len({metric.name for metric in metrics}) == len(metrics) > 20
-    for metric in metrics:
-        assert metric.bounds[0] < metric.bounds[1]
-        assert metric.source
-        assert metric.worst == metric.bounds[metric.better == "lower"]

@@ -12,7 +12,6 @@ from sklearn.metrics import brier_score_loss
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.calibration import (
-    METRICS,
     brier,
     calibration_error,
     squared_errors,
@@ -163,8 +162,3 @@ def test_shares_of_the_diagram_take_weights_and_refuse_what_cannot_be() -> None:
     for level, limit in ((-1.0, 5.0), (1.0, math.inf), (1.0, 0.0)):
         with pytest.raises(MetricError, match="not negative"):
             stanford([level], [1.0], limit)
-
-
-def test_declared_figures_compute_what_they_are_named_after() -> None:
-    answers = simple([0.5, 0.5], [1, 1])
-    assert {metric.name: metric.compute(answers) for metric in METRICS} == {"brier": 0.25, "ece": 0.5}

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.decisions import (
     COST_RATIOS,
-    METRICS,
     Answers,
     accept,
     accept_by_cost,
@@ -173,12 +172,3 @@ def test_what_cannot_be_is_refused() -> None:
         outcomes(silent, [True])
     with pytest.raises(MetricError, match="cost_ratio"):
         decision_cost(silent, 0.0)
-
-
-def test_declared_figures_compute_what_they_are_named_after() -> None:
-    answers = answers_of([(1.0, True, False, True), (0.0, True, True, True)])
-    assert {metric.name: metric.compute(answers) for metric in METRICS} == {
-        "cost_5": 3.0,
-        "cost_20": 10.5,
-        "cost_100": 50.5,
-    }

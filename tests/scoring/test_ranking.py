@@ -13,17 +13,14 @@ from sklearn.metrics import label_ranking_average_precision_score, top_k_accurac
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.base import weighted_mean
 from sasgeo_bench.scoring.ranking import (
-    METRICS,
     MISS,
     Rank,
     Ranks,
     hits,
-    mean_reciprocal_rank,
     rank_candidate,
     rank_of,
-    recall,
-    recall_by_pool,
     reciprocal_ranks,
 )
 
@@ -32,6 +29,14 @@ POSSIBLE = st.tuples(st.integers(0, 6), st.integers(1, 6), st.integers(1, 6)).ma
 )
 RANKS = st.lists(st.one_of(POSSIBLE, st.just(MISS)), min_size=1, max_size=8)
 ANSWER = st.lists(st.tuples(st.integers(0, 2), st.booleans()), min_size=1, max_size=5)
+
+
+def recall(ranks, k, weights=None):
+    return weighted_mean(hits(ranks, k), weights)
+
+
+def mean_reciprocal_rank(ranks, k=None):
+    return weighted_mean(reciprocal_ranks(ranks, k))
 
 
 def places_in_all_orders(answer: list[tuple[int, bool]]) -> list[float]:
@@ -120,7 +125,6 @@ def test_no_queries_have_no_recall_and_one_has() -> None:
     nothing = Ranks.of([])
     assert math.isnan(recall(nothing, 1))
     assert math.isnan(mean_reciprocal_rank(nothing))
-    assert recall_by_pool(nothing, []) == ()
     assert recall(Ranks.of([MISS]), 200) == 0.0
     assert recall(Ranks.of([Rank(above=0, tied=1, right=1)]), 1) == 1.0
 
@@ -167,13 +171,6 @@ def test_an_absent_place_is_no_query_of_recall(truth_of) -> None:
         rank_candidate(answer((1, 1.0)), truth_of(candidate=-1), CANDIDATES)
 
 
-def test_recall_falls_with_the_number_of_candidates_and_no_query_is_left_out() -> None:
-    first, second = Rank(above=0, tied=1, right=1), Rank(above=1, tied=1, right=1)
-    curve = recall_by_pool(Ranks.of([first, first, first, second, MISS]), [10, 10, 50, 50, 37])
-    assert [(point.pool, point.queries, point.recall) for point in curve] == [(10, 2, 1.0), (37, 1, 0.0), (50, 2, 0.5)]
-    assert sum(point.queries for point in curve) == 5
-
-
 def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(MetricError, match="at least 1"):
         hits(Ranks.of([MISS]), 0)
@@ -183,11 +180,3 @@ def test_what_cannot_be_is_refused() -> None:
         Rank(above=0, tied=1, right=2)
     with pytest.raises(MetricError, match="shape"):
         rank_of([1.0, 2.0], [True])
-
-
-def test_declared_figures_compute_what_they_are_named_after() -> None:
-    table = Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=3, tied=1, right=1)])
-    figures = {metric.name: metric.compute(table) for metric in METRICS}
-    assert figures["recall_at_1"] == 0.5
-    assert figures["recall_at_5"] == 1.0
-    assert figures["mrr"] == 0.625

@@ -14,14 +14,14 @@ from sasgeo_bench.leaderboard.text import board_markdown, summary, tables_of, wa
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
-from sasgeo_bench.scoring.costs import cost_rows
+from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.integrity import integrity_rows
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.rejection import own_word
 from sasgeo_bench.scoring.rows import COLUMNS, Contestant, to_frame, with_contestants
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
-from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.scoring.tables import cost_rows, leaderboard
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
 
@@ -339,7 +339,7 @@ def test_the_board_says_what_each_of_its_columns_is():
     tables = {"mine": scores([1.0, 99.0] * 20, confidence=[0.9, 0.1] * 20, is_present=[True] * 30 + [False] * 10)}
     tables["mine"]["is_right"] &= tables["mine"]["is_present"]
     views = dict.fromkeys(tables["mine"]["query_id"], 1)
-    rows = [*cost_rows("mine", tables["mine"], [], view_bytes=views, area_km2={})]
+    rows = [*cost_rows("mine", Costs(scores=tables["mine"], runs=[], view_bytes=views, area_km2={}))]
     rows += integrity_rows("mine", "own", own_word(tables["mine"]))
     board = pd.concat([leaderboard(tables, draws=200), to_frame(rows)], ignore_index=True)
     text = board_markdown(board, ABOUT).split("## How to read")[1]

@@ -15,9 +15,8 @@ from hypothesis.extra.numpy import arrays
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.evidence import Evidence, pack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.scoring.cost import observation_bytes
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth
 from sasgeo_bench.tasks.task_files import (
     QUERIES,
@@ -46,6 +45,13 @@ shapes = st.one_of(
     st.builds(shapely.LineString, st.lists(points, min_size=2, max_size=4)),
     st.builds(lambda x, y: shapely.box(x, y, x + 1, y + 2), metres, metres),
 )
+
+
+def observation_bytes(query):
+    """Two bits for each cell and class, one byte for each confidence, WKB for each vector; nothing is compressed."""
+    total = len(pack(query.evidence.cells))
+    total += 0 if query.evidence.confidence is None else query.evidence.confidence.size
+    return total + sum(map(len, [] if query.vectors is None else shapely.to_wkb(query.vectors.geometry.to_numpy())))
 
 
 @st.composite

@@ -15,7 +15,7 @@ from sasgeo_bench.scoring.base import Bools
 from sasgeo_bench.scoring.decisions import Answers
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import Interval, wilson_mean
-from sasgeo_bench.scoring.measures import ranks_of
+from sasgeo_bench.scoring.metrics import ranks_of
 from sasgeo_bench.scoring.ranking import hits, reciprocal_ranks
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.scoring.score import NOT_APPLICABLE

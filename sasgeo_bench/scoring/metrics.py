@@ -1,0 +1,453 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one table of metrics: boards, Markdown, LaTeX, the site and the reference of the documentation are made from it.
+
+To add a metric, write its function and add one row to `METRICS`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Literal, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.scoring import cost
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.calibration import brier, calibration_error
+from sasgeo_bench.scoring.decisions import COST_RATIOS, decision_cost
+from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc, false_fix_rate
+from sasgeo_bench.scoring.pose import PoseErrors, area_values, successes
+from sasgeo_bench.scoring.ranking import Ranks, hits, reciprocal_ranks
+from sasgeo_bench.scoring.rejection import RISKS
+
+SUCCESS_M: Final = (25.0, 10.0, 5.0)
+RECALL_AT: Final = (1, 5)
+COVERAGES: Final = (0.5, 0.8)
+_INF: Final = float("inf")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Metric:
+    """A metric as a board prints it.
+
+    Parameters
+    ----------
+    name : str
+        As in the column `metric` of `leaderboard.parquet`.
+    meaning : str
+        One or two sentences for a reader of the board.
+    source : str
+        Where the definition comes from.
+    unit : str
+        "1" where there is none.
+    better : {"higher", "lower"}
+        Which way is good.
+    bounds : (float, float)
+        Least and greatest value it can have.
+
+    Examples
+    --------
+    >>> metric_of("aurc").worst, metric_of("success_25m").worst
+    (1.0, 0.0)
+    """
+
+    name: str
+    meaning: str
+    source: str
+    unit: str = "1"
+    better: Literal["higher", "lower"] = "lower"
+    bounds: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def worst(self) -> float:
+        """Return the value of a method that fails at everything."""
+        return self.bounds[self.better == "lower"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeanMetric(Metric):
+    """A mean over queries.
+
+    Parameters
+    ----------
+    tracks : tuple of str
+        Tracks that print it.
+    values : callable
+        Scored rows -> one finite value for each.
+    counts : callable
+        Scored rows -> which of them are counted: the denominator, the same for every matcher.
+    is_primary : bool
+        Whether matchers are ranked by it.
+    """
+
+    tracks: tuple[str, ...]
+    values: Callable[[pd.DataFrame], Floats]
+    counts: Callable[[pd.DataFrame], Bools]
+    is_primary: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuantileMetric(Metric):
+    """A quantile of the pose errors in a column of scored rows, infinite errors among them."""
+
+    column: str
+    share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RejectionMetric(Metric):
+    """A figure of matcher x rejector; `needs_chances` where it takes a confidence for a probability.
+
+    `compute(answers, weights=...)` takes `decisions.Answers` of N queries and weights of shape (N,).
+    """
+
+    compute: Callable[..., float]
+    needs_chances: bool = False
+    has_interval: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThresholdMetric(Metric):
+    """A share of queries at the threshold that kept false fixes at `risk` on calibration places."""
+
+    risk: float
+    is_of_accepted: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostMetric(Metric):
+    """What the answers of one matcher take; by track, or of all tracks together."""
+
+    compute: Callable[[cost.Costs], float]
+    is_by_track: bool = False
+
+
+def errors_of(scores: pd.DataFrame) -> PoseErrors:
+    """Return errors of scored rows; infinite where there is nothing to be right about, which is never counted."""
+    columns = (scores[name].to_numpy(float) for name in ("position_error_m", "yaw_error_deg", "log_scale_error"))
+    position_m, yaw_deg, log_scale = (np.where(np.isnan(column), np.inf, column) for column in columns)
+    return PoseErrors(position_m=position_m, yaw_deg=yaw_deg, log_scale=log_scale)
+
+
+def ranks_of(scores: pd.DataFrame) -> Ranks:
+    """Return ranks of scored rows."""
+    above, tied, right = (scores[name].to_numpy(np.int64) for name in ("above", "tied", "right"))
+    return Ranks(above=above, tied=tied, right=right)
+
+
+def is_present(scores: pd.DataFrame) -> Bools:
+    """Return which rows have a place to be right about."""
+    return scores["is_present"].to_numpy(bool)
+
+
+def is_absent(scores: pd.DataFrame) -> Bools:
+    """Return which rows have none: any answer is a false fix."""
+    return ~is_present(scores)
+
+
+def _successes(scores: pd.DataFrame, within_m: float, within_deg: float = 5.0) -> Floats:
+    return successes(errors_of(scores), within_m, within_deg).astype(float)
+
+
+def _hits(scores: pd.DataFrame, k: int) -> Floats:
+    return hits(ranks_of(scores), k)
+
+
+def _answers(scores: pd.DataFrame) -> Floats:
+    return scores["is_answered"].to_numpy(float)
+
+
+_LOCALIZATION, _RETRIEVAL = ("localization",), ("retrieval",)
+_mean = partial(MeanMetric, better="higher", counts=is_present)
+ANSWERED: Final = _mean(
+    name="answered",
+    meaning="Share of present places that were answered, rightly or not",
+    source="share of queries",
+    tracks=("localization", "retrieval"),
+    values=_answers,
+)
+FALSE_ABSENT: Final = MeanMetric(
+    name="answered_absent",
+    meaning="Share of absent places that were answered; each such answer is a false fix",
+    source="share of queries",
+    tracks=("localization", "retrieval"),
+    values=_answers,
+    counts=is_absent,
+)
+WITHIN: Final = _mean(  # next to the primary metric: what a wrong heading takes away
+    name="within_25m",
+    meaning="The same as success_25m whatever the heading: what counts as a fix that is not false",
+    source="share of queries within metres",
+    tracks=_LOCALIZATION,
+    values=partial(_successes, within_m=SUCCESS_M[0], within_deg=180.0),
+)
+CHANCE: Final = _mean(  # the same for every matcher, so that a board says what guessing reaches
+    name="chance_1",
+    meaning="What guessing among the candidates reaches",
+    source="1 / number of candidates",
+    tracks=_RETRIEVAL,
+    values=lambda scores: 1.0 / np.maximum(scores["pool"].to_numpy(float), 1.0),
+)
+_MEANS: Final = (
+    *(
+        _mean(
+            name=f"success_{within_m:g}m",
+            meaning=f"Share of queries whose pose is within {within_m:g} m and 5 deg. No answer is a miss",
+            source="share of all queries within metres and 5 deg",
+            tracks=_LOCALIZATION,
+            values=partial(_successes, within_m=within_m),
+            is_primary=within_m == SUCCESS_M[0],
+        )
+        for within_m in SUCCESS_M
+    ),
+    WITHIN,
+    _mean(
+        name="success_auc_50m",
+        meaning="Area under the success rate over its tolerance, up to 50 m",
+        source="exact area of a step function",
+        tracks=_LOCALIZATION,
+        values=lambda scores: area_values(errors_of(scores)),
+    ),
+    *(
+        _mean(
+            name=f"recall_{k}",
+            meaning=f"Share of queries whose right candidate is among the first {k}. Ties count in proportion, no "
+            "answer is a miss",
+            source="ties as in McSherry and Najork, ECIR 2008",
+            tracks=_RETRIEVAL,
+            values=partial(_hits, k=k),
+            is_primary=k == RECALL_AT[0],
+        )
+        for k in RECALL_AT
+    ),
+    CHANCE,
+    _mean(
+        name="mrr",
+        meaning="Mean of one over the rank of the right candidate",
+        source="Voorhees, TREC-8 1999; ties as in McSherry and Najork, ECIR 2008",
+        tracks=_RETRIEVAL,
+        values=lambda scores: reciprocal_ranks(ranks_of(scores)),
+    ),
+    ANSWERED,
+    FALSE_ABSENT,
+)
+_error = partial(QuantileMetric, bounds=(0.0, _INF), source="Hyndman and Fan, American Statistician 1996, type 1")
+QUANTILES: Final = (
+    *(
+        _error(
+            name=f"position_{word}",
+            meaning=f"Position error that {100 * share:g} % of the queries do not exceed; infinite without an answer",
+            unit="m",
+            column="position_error_m",
+            share=share,
+        )
+        for word, share in (("median", 0.5), ("p90", 0.9), ("p99", 0.99))
+    ),
+    _error(
+        name="yaw_median",
+        meaning="Median heading error; infinite without an answer",
+        unit="deg",
+        column="yaw_error_deg",
+        share=0.5,
+    ),
+    _error(
+        name="log_scale_median",
+        meaning="Median of the absolute logarithm of estimated over true scale; infinite without an answer",
+        column="log_scale_error",
+        share=0.5,
+    ),
+)
+REJECTION: Final = (
+    RejectionMetric(
+        name="aurc",
+        meaning="Area under the risk-coverage curve: mean share of false fixes (beyond 25 m, whatever the heading, on "
+        "both tracks) among the surest 1, 2, ..., all queries",
+        source="Geifman and El-Yaniv, NeurIPS 2017; ties averaged",
+        compute=aurc,
+        has_interval=True,
+    ),
+    RejectionMetric(
+        name="e_aurc",
+        meaning="AURC less that of the best order of the same answers",
+        source="Geifman et al., ICLR 2019; exact for N",
+        compute=excess_aurc,
+    ),
+    RejectionMetric(
+        name="augrc",
+        meaning="Area under the generalized risk-coverage curve: the chance of an undetected false fix, averaged over "
+        "coverages",
+        source="Traub et al., NeurIPS 2024",
+        bounds=(0.0, 0.5),
+        compute=augrc,
+        has_interval=True,
+    ),
+    *(
+        RejectionMetric(
+            name=f"false_fix_at_coverage_{share:g}",
+            meaning=f"Share of false fixes among the surest {100 * share:g} % of the queries",
+            source="risk at a coverage; ties in proportion",
+            compute=partial(false_fix_rate, coverage=share),
+        )
+        for share in COVERAGES
+    ),
+    RejectionMetric(
+        name="brier",
+        meaning="Mean square of stated chance less truth, of rejectors that state chances",
+        source="Brier, Monthly Weather Review 1950",
+        compute=brier,
+        needs_chances=True,
+    ),
+    RejectionMetric(
+        name="ece",
+        meaning="Mean distance of stated chance and truth over bins with equally many answers, of rejectors that state "
+        "chances",
+        source="Nguyen and O'Connor, EMNLP 2015; bins of equal mass",
+        compute=calibration_error,
+        needs_chances=True,
+    ),
+    *(
+        RejectionMetric(
+            name=f"cost_{ratio:g}",
+            meaning=f"Mean cost of a query where a false fix costs {ratio:g} and withholding a right one costs 1, if a "
+            f"fix is accepted where its chance to be false is below 1 / (1 + {ratio:g}). Compares rejectors on one "
+            "matcher",
+            source="the SASGeo paper, Eqs. (12)-(14)",
+            bounds=(0.0, ratio),
+            compute=partial(decision_cost, cost_ratio=ratio),
+            needs_chances=True,
+        )
+        for ratio in COST_RATIOS
+    ),
+    *(
+        RejectionMetric(
+            name=f"cost_{ratio:g}_place",
+            meaning=f"The same as cost_{ratio:g}, but every present place without an accepted fix costs 1. Compares "
+            "whole methods",
+            source="the SASGeo paper, Eqs. (12)-(14)",
+            bounds=(0.0, ratio),
+            compute=partial(decision_cost, cost_ratio=ratio, charged="place"),
+            needs_chances=True,
+        )
+        for ratio in COST_RATIOS
+    ),
+)
+THRESHOLDS: Final = tuple(
+    metric
+    for risk in RISKS
+    for metric in (
+        ThresholdMetric(
+            name=f"coverage_at_risk_{risk:g}",
+            meaning=f"Share of queries accepted by the threshold that kept false fixes at {100 * risk:g} % on "
+            "calibration places",
+            source="threshold chosen on other blocks",
+            better="higher",
+            risk=risk,
+            is_of_accepted=False,
+        ),
+        ThresholdMetric(
+            name=f"risk_reached_at_{risk:g}",
+            meaning=f"Share of false fixes among those accepted so, here. Above {risk:g} the promise did not hold",
+            source="threshold chosen on other blocks",
+            risk=risk,
+            is_of_accepted=True,
+        ),
+    )
+)
+_cost = partial(CostMetric, bounds=(0.0, _INF), source="measured by the runner")
+COSTS: Final = (
+    *(
+        _cost(
+            name=f"latency_p{100 * share:g}",
+            meaning=f"Seconds of `match` alone that {100 * share:g} % of the answers do not exceed; a time-out counts "
+            "as infinite",
+            unit="s",
+            compute=partial(cost.latency_quantile, share=share),
+            is_by_track=True,
+        )
+        for share in (0.5, 0.95)
+    ),
+    _cost(
+        name="prepare",
+        meaning="Seconds to make a map ready, once; the longest of all maps",
+        unit="s",
+        compute=partial(cost.most, name="prepare_s"),
+    ),
+    _cost(
+        name="peak_memory",
+        meaning="Memory of all processes of the matcher together, the most of all maps (1 MB = 10^6 bytes)",
+        unit="MB",
+        compute=partial(cost.most, name="peak_rss_mb"),
+    ),
+    _cost(
+        name="index",
+        meaning="Files that the matcher wrote for a map, the most of all maps",
+        unit="MB",
+        compute=partial(cost.most, name="index_mb"),
+    ),
+    _cost(
+        name="map",
+        meaning="Files of a map, the most of all maps",
+        unit="MB",
+        compute=partial(cost.most, name="map_mb"),
+    ),
+    _cost(
+        name="map_per_km2",
+        meaning="Files of the maps and what the matcher wrote for them, over their mapped area (1 kB = 1000 bytes)",
+        unit="kB/km2",
+        compute=cost.map_kb_per_km2,
+    ),
+    _cost(
+        name="cpu_per_fix",
+        meaning="Processor seconds of all queries over those answered",
+        unit="s",
+        compute=cost.cpu_s_per_fix,
+    ),
+    _cost(
+        name="observation_per_fix",
+        meaning="Views of all queries, packed and not compressed, over those answered: what a drone would have to send",
+        unit="kB",
+        compute=cost.sent_kb_per_fix,
+    ),
+)
+METRICS: Final[tuple[Metric, ...]] = (*_MEANS, *QUANTILES, *REJECTION, *THRESHOLDS, *COSTS)
+_BY_NAME: Final = {metric.name: metric for metric in METRICS}
+M = TypeVar("M", bound=Metric)
+
+
+def metric_of(name: str) -> Metric:
+    """Return the metric of a name.
+
+    Raises
+    ------
+    KeyError
+        If there is none.
+
+    Examples
+    --------
+    >>> metric_of("mrr").better
+    'higher'
+    """
+    return _BY_NAME[name]
+
+
+def means_of(track: str) -> tuple[MeanMetric, ...]:
+    """Return the metrics of a track that are means over queries.
+
+    Examples
+    --------
+    >>> [metric.name for metric in means_of("retrieval")]
+    ['recall_1', 'recall_5', 'chance_1', 'mrr', 'answered', 'answered_absent']
+    """
+    return tuple(metric for metric in _MEANS if track in metric.tracks)
+
+
+def primary_of(track: str) -> MeanMetric:
+    """Return the metric that matchers are ranked by.
+
+    Examples
+    --------
+    >>> primary_of("retrieval").name
+    'recall_1'
+    """
+    return next(metric for metric in means_of(track) if metric.is_primary)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of metrics: each row computes what it is named after, and says what a reader needs."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc
+from sasgeo_bench.scoring.metrics import METRICS, QUANTILES, REJECTION, MeanMetric, means_of, metric_of, primary_of
+from tests.scoring.test_tables import scores
+
+SOME = Answers(confidence=[0.9, 0.8, 0.1, 0.0], is_answered=[1] * 4, is_right=[1, 0, 1, 1], is_present=[1] * 4)
+
+
+def test_every_metric_has_a_name_of_its_own_a_meaning_and_a_source():
+    assert len({metric.name for metric in METRICS}) == len(METRICS) > 30
+    for metric in METRICS:
+        assert metric.bounds[0] < metric.bounds[1]
+        assert metric.source
+        assert metric.meaning
+        assert not metric.meaning.endswith(".")
+        assert metric.worst == metric.bounds[metric.better == "lower"]
+        assert metric_of(metric.name) is metric
+
+
+@pytest.mark.parametrize("track", ["localization", "retrieval"])
+def test_each_track_has_one_primary_metric(track):
+    assert [metric for metric in means_of(track) if metric.is_primary] == [primary_of(track)]
+
+
+def test_means_compute_what_they_are_named_after():
+    table = scores([1.0, 7.0, 20.0, math.inf])
+    found = {metric.name: float(metric.values(table).mean()) for metric in means_of("localization")}
+    assert [found[f"success_{name}m"] for name in (5, 10, 25)] == [0.25, 0.5, 0.75]
+    assert found["within_25m"] == 0.75
+    assert found["success_auc_50m"] == pytest.approx((0.98 + 0.86 + 0.6) / 4)
+    assert all(isinstance(metric, MeanMetric) for metric in means_of("retrieval"))
+
+
+def test_quantiles_name_their_share():
+    assert {metric.name: metric.share for metric in QUANTILES} == {
+        "position_median": 0.5,
+        "position_p90": 0.9,
+        "position_p99": 0.99,
+        "yaw_median": 0.5,
+        "log_scale_median": 0.5,
+    }
+
+
+def test_rejection_metrics_compute_what_they_are_named_after():
+    found = {metric.name: metric.compute(SOME, weights=np.ones(4)) for metric in REJECTION}
+    assert found["aurc"] == aurc(SOME)
+    assert found["e_aurc"] == excess_aurc(SOME)
+    assert found["augrc"] == augrc(SOME)
+    assert found["false_fix_at_coverage_0.5"] == 0.5
+    assert found["false_fix_at_coverage_0.8"] == pytest.approx(1 / 3.2)
+    assert found["brier"] == pytest.approx((0.01 + 0.64 + 0.81 + 1.0) / 4)
+    assert (found["cost_20"], found["cost_20_place"]) == (0.75, 1.0)  # none is sure enough to be accepted

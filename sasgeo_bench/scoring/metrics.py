@@ -21,6 +21,7 @@ from sasgeo_bench.scoring.pose import PoseErrors, area_values, successes
 from sasgeo_bench.scoring.ranking import Ranks, hits, reciprocal_ranks
 from sasgeo_bench.scoring.rejection import RISKS
 
+TRACKS: Final = ("localization", "retrieval")
 SUCCESS_M: Final = (25.0, 10.0, 5.0)
 RECALL_AT: Final = (1, 5)
 COVERAGES: Final = (0.5, 0.8)
@@ -158,20 +159,19 @@ def _answers(scores: pd.DataFrame) -> Floats:
     return scores["is_answered"].to_numpy(float)
 
 
-_LOCALIZATION, _RETRIEVAL = ("localization",), ("retrieval",)
 _mean = partial(MeanMetric, better="higher", counts=is_present)
 ANSWERED: Final = _mean(
     name="answered",
     meaning="Share of present places that were answered, rightly or not",
     source="share of queries",
-    tracks=("localization", "retrieval"),
+    tracks=TRACKS,
     values=_answers,
 )
 FALSE_ABSENT: Final = MeanMetric(
     name="answered_absent",
     meaning="Share of absent places that were answered; each such answer is a false fix",
     source="share of queries",
-    tracks=("localization", "retrieval"),
+    tracks=TRACKS,
     values=_answers,
     counts=is_absent,
 )
@@ -179,14 +179,14 @@ WITHIN: Final = _mean(  # next to the primary metric: what a wrong heading takes
     name="within_25m",
     meaning="The same as success_25m whatever the heading: what counts as a fix that is not false",
     source="share of queries within metres",
-    tracks=_LOCALIZATION,
+    tracks=TRACKS[:1],
     values=partial(_successes, within_m=SUCCESS_M[0], within_deg=180.0),
 )
 CHANCE: Final = _mean(  # the same for every matcher, so that a board says what guessing reaches
     name="chance_1",
     meaning="What guessing among the candidates reaches",
     source="1 / number of candidates",
-    tracks=_RETRIEVAL,
+    tracks=TRACKS[1:],
     values=lambda scores: 1.0 / np.maximum(scores["pool"].to_numpy(float), 1.0),
 )
 _MEANS: Final = (
@@ -195,7 +195,7 @@ _MEANS: Final = (
             name=f"success_{within_m:g}m",
             meaning=f"Share of queries whose pose is within {within_m:g} m and 5 deg. No answer is a miss",
             source="share of all queries within metres and 5 deg",
-            tracks=_LOCALIZATION,
+            tracks=TRACKS[:1],
             values=partial(_successes, within_m=within_m),
             is_primary=within_m == SUCCESS_M[0],
         )
@@ -206,7 +206,7 @@ _MEANS: Final = (
         name="success_auc_50m",
         meaning="Area under the success rate over its tolerance, up to 50 m",
         source="exact area of a step function",
-        tracks=_LOCALIZATION,
+        tracks=TRACKS[:1],
         values=lambda scores: area_values(errors_of(scores)),
     ),
     *(
@@ -215,7 +215,7 @@ _MEANS: Final = (
             meaning=f"Share of queries whose right candidate is among the first {k}. Ties count in proportion, no "
             "answer is a miss",
             source="ties as in McSherry and Najork, ECIR 2008",
-            tracks=_RETRIEVAL,
+            tracks=TRACKS[1:],
             values=partial(_hits, k=k),
             is_primary=k == RECALL_AT[0],
         )
@@ -226,7 +226,7 @@ _MEANS: Final = (
         name="mrr",
         meaning="Mean of one over the rank of the right candidate",
         source="Voorhees, TREC-8 1999; ties as in McSherry and Najork, ECIR 2008",
-        tracks=_RETRIEVAL,
+        tracks=TRACKS[1:],
         values=lambda scores: reciprocal_ranks(ranks_of(scores)),
     ),
     ANSWERED,

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.scoring.metrics import primary_of
+from sasgeo_bench.scoring.metrics import TRACKS, primary_of
 from sasgeo_bench.scoring.strata import CONTROL, STRESS, control_name, step_name
 
 GROUP: Final = ("suite", "track", "prior_group")
@@ -44,7 +44,7 @@ def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]
 
 def primary_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows of the figure of each track that matchers are ranked by."""
-    wanted = {track: primary_of(track).name for track in rows["track"].unique()}
+    wanted = {track: primary_of(track).name for track in TRACKS}
     return rows[(rows["metric"] == rows["track"].map(wanted)).to_numpy(bool)]
 
 

@@ -359,8 +359,8 @@ def test_a_board_of_hostile_names_is_a_table_of_them_in_every_format(tmp_path):
         board.assign(
             matcher=board["matcher"].map({name: f"m{at:02d}" for at, name in enumerate(dict.fromkeys(names))})
         ),
-        about_of([entry_of(f"m{at}", set_apart="x") for at in range(3)]),
-        verdicts=[Verdict(control="c", matcher="m0", n=4, found=1, expected=0, p=0.0, holds=False)],
+        about_of([entry_of(f"m{at:02d}", set_apart="x") for at in range(3)]),
+        verdicts=[Verdict(control="c", matcher="m00", n=4, found=1, expected=0, p=0.0, holds=False)],
     )
     assert [one.type for one in parsed(text)] == [one.type for one in parsed(plain_text)]
     assert not {"link_open", "image", "html_inline"} & {

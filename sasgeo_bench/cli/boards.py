@@ -21,10 +21,12 @@ from sasgeo_bench.cli.console import (
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.leaderboard.board_tables import Book, contrast_table, summary
 from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
-from sasgeo_bench.leaderboard.text import control_lines, finding_table, summary, warnings_of
+from sasgeo_bench.leaderboard.tables import text_of
+from sasgeo_bench.leaderboard.text import control_lines, warnings_of
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.submissions import submissions_for
 from sasgeo_bench.scoring.draws import DRAWS
@@ -216,14 +218,12 @@ def _check_controls(board: Board) -> None:
 
 def show_board(board: Board) -> None:
     """Print what a board says in short, one table for each track and prior group."""
-    tables = [*summary(board.table)]
-    if board.findings:
-        tables.append(("Registered contrasts", finding_table(board.findings)))
-    for title, short in tables:
-        say(title)
-        shown = Table(*map(str, short.columns), box=None, pad_edge=False)
-        for row in short.itertuples(index=False):
-            shown.add_row(*map(str, row))
+    tables = (*summary(Book.of(board.table, {})), contrast_table(board.findings))
+    for table in (one for one in tables if one.rows):
+        say(table.title)
+        shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
+        for row in table.rows:
+            shown.add_row(*map(text_of, row.cells))
         print_table(shown)
     for line in (*control_lines(board.verdicts), *warnings_of(board.table)):
         tell(line)

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A leaderboard as tables for a paper."""
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.reproduction import seed_table
-from sasgeo_bench.leaderboard.text import DAGGER, control_table, finding_table, tables_of
+from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
+from sasgeo_bench.leaderboard.text import tables_of
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.scoring.contrasts import Finding
-from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.texts import tex
 
 _HEAD: Final = (
@@ -21,46 +18,23 @@ _HEAD: Final = (
 )
 
 
-def board_latex(
-    board: pd.DataFrame,
-    about: Mapping[str, Any],
-    findings: Sequence[Finding] = (),
-    verdicts: Sequence[Verdict] = (),
-) -> str:
-    """The tables of the board for a paper; needs the package booktabs.
-
-    Parameters
-    ----------
-    board : pandas.DataFrame
-        The leaderboard.
-    about : mapping
-        What `board.json` says.
-    findings, verdicts : sequence
-        Registered contrasts and controls; each a table where there are any.
-    """
-    lines = [f"% {tex(about['made_by'])}, scorer version {about['scorer_version']}; {ATTRIBUTION}", *_HEAD]
-    if findings:
-        lines += _table("Registered contrasts", "contrasts", finding_table(findings))
-    seeds = seed_table(about)
-    if len(seeds):
-        lines += _table("Public and private seed", "seeds", seeds)
-    for title, table in tables_of(board):
-        lines += _table(title, title.partition(" (")[0], table)
-    if verdicts:
-        lines += _table("Controls", "controls", control_table(verdicts))
-    return "\n".join(lines) + "\n"
+def board_latex(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -> str:  # noqa: ANN401 - see tables_of
+    """Return the tables of a board for a paper, which needs the package booktabs; arguments as of `text.tables_of`."""
+    head = f"% {tex(about['made_by'])}, scorer version {about['scorer_version']}; {ATTRIBUTION}"
+    tables = tables_of(board, about, **more)
+    return "\n".join((head, *_HEAD, *(line for table in tables for line in _lines(table)))) + "\n"
 
 
-def _table(title: str, name: str, table: pd.DataFrame) -> Iterator[str]:
-    """One table; its label is its name in letters, digits and hyphens."""
-    rows = [" & ".join(map(tex, row)) + r" \\" for row in table.itertuples(index=False)]
+def _lines(table: Table) -> Iterator[str]:
+    """Yield one table; its label is its name."""
+    rows = [" & ".join(tex(text_of(cell)) for cell in row.cells) + r" \\" for row in table.rows]
     dagger = f" {tex(DAGGER)} Wilson's interval over sites." if any(tex(DAGGER) in row for row in rows) else ""
     yield r"\begin{table}"
-    yield rf"\caption{{{tex(title)}.{dagger} Data: {tex(ATTRIBUTION)}.}}"
-    yield rf"\label{{tab:{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-')}}}"
+    yield rf"\caption{{{tex(table.title)}.{dagger} Data: {tex(ATTRIBUTION)}.}}"
+    yield rf"\label{{tab:{table.name}}}"
     yield rf"\begin{{tabular}}{{{'l' * len(table.columns)}}}"
     yield r"\toprule"
-    yield " & ".join(map(tex, table.columns)) + r" \\"
+    yield " & ".join(tex(column.name) for column in table.columns) + r" \\"
     yield r"\midrule"
     yield from rows
     yield r"\bottomrule"

@@ -20,8 +20,8 @@ from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_co
 from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.integrity import SLOW_DRAWS
 from sasgeo_bench.scoring.intervals import bootstrap_means, effective_count, share_interval
-from sasgeo_bench.scoring.pose import rank_pose
 from sasgeo_bench.scoring.metrics import RECALL_AT, primary_of, ranks_of
+from sasgeo_bench.scoring.pose import rank_pose
 from sasgeo_bench.scoring.ranking import Ranks, hits
 from sasgeo_bench.scoring.rejection import answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES

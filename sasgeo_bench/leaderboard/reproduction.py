@@ -232,33 +232,3 @@ def seed_lines(about: Mapping[str, Any]) -> list[str]:
         f"Seeds: rows were held against the same pipeline on {words}.",
         *(f"{name}: {row['verdict']} ({row['why']})." for name, row in said if row),
     ]
-
-
-def seed_table(about: Mapping[str, Any]) -> pd.DataFrame:
-    """Figures on both seeds in words: of all suites, and whatever is shown to be worse; empty without any.
-
-    Examples
-    --------
-    >>> len(seed_table({"entries": []}))
-    0
-    """
-    rows = []
-    for entry in about.get("entries", ()):
-        for item in (entry.get("private") or {}).get("figures", ()):
-            if item["suite"] == ALL_SUITES or item["is_worse"]:
-                blocks = f"{item['blocks_public']} and {item['blocks_private']}, {item['blocks_shared']} in both"
-                rows.append(
-                    {
-                        "matcher": entry["name"],
-                        "suite": item["suite"],
-                        "track": item["track"],
-                        "figure": item["metric"],
-                        "public": f"{item['public']:.3f}",
-                        "private": f"{item['private']:.3f}",
-                        "private less public": f"{item['difference']:.3f} [{item['lo']:.3f}, {item['hi']:.3f}]",
-                        "n": f"{item['n_public']} and {item['n_private']}",
-                        "blocks": blocks,
-                        "verdict": "worse" if item["is_worse"] else "not shown to be worse",
-                    }
-                )
-    return pd.DataFrame(rows)

@@ -9,22 +9,28 @@ from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader
 
-from sasgeo_bench.leaderboard.reproduction import seed_lines
-from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
-from sasgeo_bench.publishing.site_board import Book, contrasts_of, control_table, sections_of, seeds_of
-from sasgeo_bench.publishing.site_pages import (
+from sasgeo_bench.leaderboard.board_tables import (
+    Book,
+    control_table,
     cost_table,
+    rejection_tables,
+    sections_of,
+    seed_table,
+)
+from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE
+from sasgeo_bench.leaderboard.reproduction import seed_lines
+from sasgeo_bench.leaderboard.tables import file_stem
+from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
+from sasgeo_bench.publishing.site_board import contrasts_of
+from sasgeo_bench.publishing.site_pages import (
     figures_by_kind,
     matchers_of,
     protection_tables,
     rate_table,
     region_table,
-    rejection_tables,
     suites_of,
 )
 from sasgeo_bench.publishing.site_source import Case, SiteSource
-from sasgeo_bench.publishing.site_table import file_stem
-from sasgeo_bench.publishing.site_words import MARKS, MEANINGS, NOTE
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.texts import plain
 
@@ -70,7 +76,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         No page names another host but as a link, and each can be read without the script.
     """
     templates = _environment()
-    book = Book.of(source)
+    book = Book.of(source.board, source.about, source.scores)
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
     there = set(_NAMES)
@@ -95,7 +101,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
             "controls_held": bool(controls) and all(item.holds for item in controls),
             "has_controls": bool(controls),
             "seed_line": seed_lines(source.about)[0],
-            "seeds": seeds_of(source.about),
+            "seeds": seed_table(source.about),
             "warnings": warnings_of(source.board),
             "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
             "counts": _counts(source, book),

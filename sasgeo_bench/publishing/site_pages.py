@@ -10,24 +10,22 @@ import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.text import interval_text
-from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.publishing.site_board import Book, group_table
-from sasgeo_bench.publishing.site_source import Picture, SiteFigure, SiteSource, Spot
-from sasgeo_bench.publishing.site_table import (
+from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, rejection_of, strata_tables, suite_table
+from sasgeo_bench.leaderboard.columns import column, prior_words
+from sasgeo_bench.leaderboard.tables import (
     Cell,
     Key,
-    Record,
     Row,
     Table,
     figure_cell,
     file_stem,
+    interval_text,
     number_cell,
     plain_cell,
     rank_cell,
 )
-from sasgeo_bench.publishing.site_words import column, prior_words
-from sasgeo_bench.scoring.integrity import AS_DRAWN
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.publishing.site_source import Picture, SiteFigure, SiteSource, Spot
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
@@ -35,16 +33,7 @@ from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.suites.base import SuiteCard
 
-_JUDGED: Final = (
-    *("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
-    *("brier", "ece", "cost_20", "cost_20_place"),
-)
-_COSTS: Final = (
-    *("latency_p50", "latency_p95", "prepare", "peak_memory"),
-    *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
-)
 _AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
-MOST_COLUMNS: Final = 8  # matchers beside each other: as many as a screen of 1280 px holds
 KINDS: Final = {  # of figures, by how their names begin, in the order they are shown
     "contrast": "Registered contrasts, place by place",
     "stress": "Success under stress",
@@ -116,41 +105,11 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
         page=page,
         card=None if suite is None else suite.card,
         tables=tuple(
-            table for key in keys for table in (group_table(book, key, book.matchers[key]), *_strata_tables(book, key))
+            table for key in keys for table in (suite_table(book, key, book.matchers[key]), *strata_tables(book, key))
         ),
         figures=tuple(item for item in source.figures if item.file.startswith(starts)),
         pictures=tuple(item for item in source.pictures.suites if item.of == name),
         regions=tuple(sorted({base_of(region) for region in tasks})),
-    )
-
-
-def _strata_tables(book: Book, key: Key) -> Iterator[Table]:
-    """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
-    names = book.matchers[key]
-    for first in range(0, len(names), MOST_COLUMNS):
-        yield _strata_table(book, key, names[first : first + MOST_COLUMNS], number=first // MOST_COLUMNS + 1)
-
-
-def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) -> Table:
-    suite, track, prior_group = key
-    primary = primary_of(track).name
-    more = "" if number == 1 else f", table {number}"
-    rows = []
-    for stratum in book.strata[key]:
-        found = {name: book.pick(key, name, primary, stratum) for name in names}
-        counts = sorted({int(row["n"]) for row in found.values() if row is not None})
-        if counts:
-            first = Cell(text=stratum)
-            cells = [figure_cell(row) for row in found.values()]
-            rows.append(Row(cells=(first, Cell(text="-".join(map(str, counts)), key=float(counts[0])), *cells)))
-    meaning = column(primary).meaning
-    columns = [column(primary, title=name) for name in names]
-    return Table(
-        name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
-        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
-        columns=(column("part", is_number=False), column("n"), *columns),
-        rows=tuple(rows),
-        notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),
     )
 
 
@@ -170,17 +129,16 @@ class MatcherPage:
     taught: tuple[str, ...]
     cannot: tuple[str, ...]
     results: tuple[Table, ...]
-    judged: Table | None
+    rejection: Table | None
     costs: tuple[tuple[str, str, str], ...]
 
 
 def matchers_of(source: SiteSource, book: Book) -> tuple[MatcherPage, ...]:
     """A page for each contestant of the board."""
-    judged = dict(tuple(_judged_rows(source.board).groupby("matcher", sort=True))) if len(source.board) else {}
-    return tuple(_matcher(name, book, judged.get(name)) for name in book.matcher_pages)
+    return tuple(_matcher(name, book, source.board) for name in book.matcher_pages)
 
 
-def _matcher(name: str, book: Book, judged: pd.DataFrame | None) -> MatcherPage:
+def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
     entry = book.entries.get(name, {})
     card = entry.get("card") or {}
     results = [_results_table(book, name, group, keys) for group, keys in _groups(book).items()]
@@ -194,7 +152,7 @@ def _matcher(name: str, book: Book, judged: pd.DataFrame | None) -> MatcherPage:
         taught=tuple(_taught(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
-        judged=None if judged is None else _judged_table(judged, "judged", "Rejection, all suites"),
+        rejection=rejection_of(board, name),
         costs=tuple(_costs_of(book, name)),
     )
 
@@ -274,76 +232,12 @@ def _costs_of(book: Book, name: str) -> Iterator[tuple[str, str, str]]:
     """What answers cost: figure, its value with its unit, what it means."""
     for key, row in book.figures.items():
         suite, track, _, matcher, _, metric = key
-        if suite == ALL_SUITES and matcher == name and metric in _COSTS:
+        if suite == ALL_SUITES and matcher == name and metric in SHOWN_COSTS:
             cell = number_cell(float(row["value"]), str(row["unit"]))
             yield (metric if track == "all" else f"{metric}, {track}", cell.text, column(metric).meaning)
 
 
-def cost_table(book: Book) -> Table:
-    """What the answers of all contestants cost, a figure a column."""
-    found = {key: row for key, row in book.figures.items() if key[0] == ALL_SUITES and key[-1] in _COSTS}
-    kinds = sorted({(_COSTS.index(key[-1]), key[-1], key[1]) for key in found})
-    by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
-    units = {key[-1]: str(row["unit"]) for key, row in found.items()}
-    names = sorted({key[3] for key in found})
-    rows = []
-    for name in names:
-        mine = [by_kind.get((name, metric, track)) for _, metric, track in kinds]
-        values = [number_cell(math.nan if row is None else float(row["value"])) for row in mine]
-        rows.append(Row(cells=(book.name_cell(name), *values)))
-    columns = [
-        column(metric, title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})")
-        for _, metric, track in kinds
-    ]
-    notes = ("Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",)
-    first = column("matcher", is_number=False)
-    return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
-
-
-# --- rejection --------------------------------------------------------------------------------------------------------
-
-
-def _judged_rows(board: pd.DataFrame) -> pd.DataFrame:
-    return board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
-
-
-def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Matcher x rejector over all suites, a table for each track and prior group."""
-    if not len(board):
-        return ()
-    found = _judged_rows(board).groupby(["track", "prior_group"], sort=True)
-    return tuple(
-        _judged_table(part, file_stem("rejection", *map(str, key)), f"{key[0]}, {prior_words(str(key[1]))}")
-        for key, part in found
-    )
-
-
-def _judged_table(part: pd.DataFrame, name: str, title: str) -> Table:
-    rows = []
-    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
-        matcher, rejector, track, prior_group = map(str, key)
-        by_name: dict[str, Record] = {
-            str(row["metric"]): {str(field): row[field] for field in row} for row in mine.to_dict("records")
-        }
-        where = () if name != "judged" else (Cell(text=f"{track}, {prior_group}"),)
-        figures = [figure_cell(by_name.get(metric)) for metric in _JUDGED]
-        cells = (Cell(text=matcher), Cell(text=rejector), *where, *figures, plain_cell(int(mine["n"].iloc[0])))
-        surest = by_name.get("aurc")
-        rows.append((math.inf if surest is None else float(surest["value"]), matcher, rejector, Row(cells=cells)))
-    rows.sort(key=lambda row: row[:3])
-    where_columns = () if name != "judged" else (column("track", is_number=False, title="queries"),)
-    return Table(
-        name=name,
-        title=title,
-        columns=(
-            column("matcher", is_number=False),
-            column("rejector", is_number=False),
-            *where_columns,
-            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_JUDGED, "n")),
-        ),
-        rows=tuple(row for *_, row in rows),
-        notes=("Brier, ECE and costs have no interval on this board: they decide nothing.",),
-    )
+# --- protection ------------------------------------------------------------------------------------------------------
 
 
 def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:

@@ -14,13 +14,14 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments.pipeline import plan_pipeline
 from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_tables import seed_table
 from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.leaderboard.reproduction import compare_seeds, seed_lines, seed_table, verdict_of
+from sasgeo_bench.leaderboard.reproduction import compare_seeds, seed_lines, verdict_of
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
-from sasgeo_bench.publishing.site_words import marks_of
 from sasgeo_bench.running import sandbox
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
@@ -163,7 +164,7 @@ def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_bo
     )
     text = (tmp_path / "board" / "leaderboard.md").read_text(encoding="utf-8")
     assert "| redrawer | clean | localization | success_25m | 1.000 | 0.000 | -1.000 [-1.000, -" in text
-    assert "| redrawer | not reproduced | 1.000 [" in text
+    assert "| redrawer (not reproduced) | 1.000 [" in text
     assert "Public and private seed" in (tmp_path / "board" / "leaderboard.tex").read_text(encoding="utf-8")
     publish(tmp_path / "board", tell=silent)
     page = (tmp_path / "board" / "site" / "index.html").read_text(encoding="utf-8")
@@ -178,7 +179,7 @@ def test_without_a_private_seed_a_row_says_run_here(made, tmp_path):
     assert entry_of(tmp_path / "board")["how"] == "run here"
     assert not {"private", "private_seed"} & about.keys()
     assert "so none is reproduced" in seed_lines(about)[0]
-    assert seed_table(about).empty
+    assert seed_table(about) is None
 
 
 @has_landlock

@@ -10,12 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook_file import load_ratebook
-from sasgeo_bench.publishing.site_board import Book, contrasts_of, group_table, places_of, sections_of
+from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
+from sasgeo_bench.leaderboard.columns import MEANINGS
+from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
+from sasgeo_bench.publishing.site_board import contrasts_of, places_of
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import SiteSource, Spot
-from sasgeo_bench.publishing.site_table import file_stem, page_names, ties_of
-from sasgeo_bench.publishing.site_words import MEANINGS
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame
 from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame
 from tests.handmade import HOSTILE, MARKUP, about_of, asked, card_of, entry_of, many_rows
@@ -49,6 +50,10 @@ def source(table=None, findings=(), entries=(), **changes):
     about = about_of([entry_of(name, **said) for name, said in dict(entries).items()])
     made = SiteSource(name="mine", title="Mine", about=about, board=board, rates=load_ratebook())
     return replace(made, contrasts=contrast_frame(findings), **changes)
+
+
+def book_of(given):
+    return Book.of(given.board, given.about, given.scores)
 
 
 @given(st.lists(st.text(max_size=80), unique=True, max_size=12))
@@ -87,7 +92,7 @@ def test_controls_and_those_without_a_rank_are_in_no_tie():
 
 
 def test_a_table_is_sorted_by_its_figure_and_says_who_is_tied():
-    book = Book.of(source())
+    book = book_of(source())
     (section,) = sections_of(book)
     texts = [[cell.text for cell in row.cells] for row in section.table.rows]
     assert [row[0] for row in texts] == [HOSTILE, MARKUP, *(f"matcher-{at:03d}" for at in range(4))]
@@ -95,13 +100,13 @@ def test_a_table_is_sorted_by_its_figure_and_says_who_is_tied():
     assert section.table.rows[0].cells[2].marks[0].text == "tie"
     assert section.table.notes[0].startswith(f"Tied: {HOSTILE}, {MARKUP}, matcher-000")
     assert section.table.notes[0].endswith("share ranks 1 to 6.")
-    assert {column.name for column in section.table.columns} <= MEANINGS.keys()
+    assert {column.term for column in section.table.columns} <= MEANINGS.keys()
 
 
 def test_prior_groups_and_tracks_are_never_in_one_table():
     other = many_rows(6).assign(prior_group="rnone-unknown-s15")
     table = pd.concat([many_rows(6), other], ignore_index=True)
-    sections = sections_of(Book.of(source(table)))
+    sections = sections_of(book_of(source(table)))
     assert [item.prior_group for item in sections] == ["r500-weak-s3", "rnone-unknown-s15"]
     assert [len(item.table.rows) for item in sections] == [6, 6]
     assert len({item.table.name for item in sections}) == 2
@@ -109,11 +114,11 @@ def test_prior_groups_and_tracks_are_never_in_one_table():
 
 def test_who_is_set_apart_stands_in_a_table_below_with_the_reason():
     said = {"matcher-000": {"set_apart": "trained on the test place vaduz"}, "matcher-001": {}, "elsewhere": {}}
-    (section,) = sections_of(Book.of(source(entries=said)))
+    (section,) = sections_of(book_of(source(entries=said)))
     assert "matcher-000" not in [row.cells[0].text for row in section.table.rows]
     assert [row.cells[0].text for row in section.apart.rows] == ["matcher-000"]
     assert section.apart.notes == ("matcher-000: trained on the test place vaduz.",)
-    assert section.table.notes[-1] == "Not on this table, for not asked here: elsewhere."
+    assert section.table.notes[-1] == "Not asked here: elsewhere."
 
 
 def test_a_matcher_that_cannot_has_words_and_no_figure():
@@ -121,7 +126,7 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
     table.loc[0, "is_applicable"] = False
     table.loc[0, ["value", "lo", "hi"]] = float("nan")
     table.loc[0, ["rank_best", "rank_worst"]] = pd.NA
-    shown = group_table(Book.of(source(table)), KEY, [HOSTILE, MARKUP])
+    shown = suite_table(book_of(source(table)), KEY, [HOSTILE, MARKUP])
     assert [[cell.text for cell in row.cells[1:3]] for row in shown.rows] == [
         ["0.667 [0.567, 0.767]", "1-3"],
         ["not applicable", "-"],
@@ -246,7 +251,7 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
 def test_places_that_a_card_names_are_words_and_not_letters(said, words):
     card = card_of("graph", trained_on=said)
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"card": card}})
-    (page,) = matchers_of(given, Book.of(given))
+    (page,) = matchers_of(given, book_of(given))
     assert page.trained == words
 
 
@@ -260,7 +265,7 @@ def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
     scores = pd.DataFrame(rows)
     scores.loc[2, "status"] = "timeout"
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {}}, scores=scores)
-    (section,) = sections_of(Book.of(given))
+    (section,) = sections_of(book_of(given))
     assert section.counted == "S1"
     assert section.table.notes == (
         "One alone is ranked.",
@@ -272,5 +277,5 @@ def test_what_a_matcher_was_taught_is_told_by_region_for_tasks_are_hundreds():
     learned = {"file": "a.json", "trained_on": ["porto"], "pairs": 24}
     learned["asked"] = ["alias/vaduz+alias", "clean/vaduz", "real-age/eschen@2015-07-27"]
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"learned": [learned]}})
-    (page,) = matchers_of(given, Book.of(given))
+    (page,) = matchers_of(given, book_of(given))
     assert page.taught == ("Learnt from 24 queries of porto; asked so in 3 tasks on eschen, vaduz.",)

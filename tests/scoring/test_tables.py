@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.errors import MetricError
+from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.latex import board_latex
-from sasgeo_bench.leaderboard.text import board_markdown, summary, tables_of, warnings_of
+from sasgeo_bench.leaderboard.tables import text_of
+from sasgeo_bench.leaderboard.text import board_markdown, tables_of, warnings_of
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
@@ -22,6 +24,7 @@ from sasgeo_bench.scoring.rows import COLUMNS, Contestant, to_frame, with_contes
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
 from sasgeo_bench.scoring.tables import cost_rows, leaderboard
+from sasgeo_bench.texts import markdown
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
 
@@ -71,6 +74,12 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
     return table.assign(**changes)[list(SCORED)]
 
 
+def column_of(table, term):
+    """Texts of a column, from top to bottom."""
+    at = [column.term for column in table.columns].index(term)
+    return [text_of(row.cells[at]) for row in table.rows]
+
+
 def pick(board, matcher, metric, stratum="all"):
     rows = board[(board["matcher"] == matcher) & (board["metric"] == metric) & (board["stratum"] == stratum)]
     assert len(rows) == 1
@@ -102,8 +111,8 @@ def test_a_fix_that_is_near_and_turned_is_no_success_and_yet_within():
     board = leaderboard({"mine": table}, draws=200)
     assert pick(board, "mine", "success_25m")["value"] == 0.25
     assert pick(board, "mine", "within_25m")["value"] == 0.75 == table["is_right"].mean()
-    ((_, shown),) = tables_of(board)
-    assert shown["within_25m"].iloc[0].startswith("0.750 [")
+    (shown,) = tables_of(board, {})
+    assert column_of(shown, "within_25m")[0].startswith("0.750 [")
 
 
 def test_recall_counts_ties_in_proportion():
@@ -211,13 +220,10 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
         assert ranks(mine) == ranks(before)
         assert mine["detectable"] == before["detectable"]
     said = {name: Contestant("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
-    titles = {title: set(table["matcher"]) for title, table in tables_of(with_contestants(board, said))}
-    assert {frozenset(names) for title, names in titles.items() if title.startswith("Set apart: ")} == {
-        frozenset({"best"})
-    }
-    assert {frozenset(names) for title, names in titles.items() if not title.startswith("Set apart: ")} == {
-        frozenset({"good", "bad"})
-    }
+    first, apart = tables_of(with_contestants(board, said), {})
+    assert set(column_of(first, "matcher")) == {"good (as submitted)", "bad (as submitted)"}
+    assert column_of(apart, "matcher") == ["best (as submitted) (set apart)"]
+    assert apart.notes == ("best: for a reason.",)
 
 
 @pytest.mark.parametrize(("blocks", "expected"), [(5, {(None, None)}), (6, {(1, 1), (2, 2)})])
@@ -304,11 +310,12 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     latex = board_latex(board, ABOUT)
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
-    ((title, short),) = summary(board)
-    assert title == "success_25m [95 %] (rank), localization, prior group r500-weak-s3"
+    (short,) = summary(Book.of(board, {}))
+    assert short.title.startswith("success_25m [95 %] (rank), localization, within 500 m")
     one, none = wilson(1, 4), wilson(0, 4)
     expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
-    shown = short["occlusion, n = 4"].tolist()
+    assert [column.name for column in short.columns] == ["matcher", "occlusion, n = 4"]
+    shown = [row.cells[1].text for row in short.rows]
     assert shown[1] == expected[1]
     assert shown[0].endswith("] (-)")
     assert f"| {none.value:.3f} [0.000, {none.hi:.3f}]† |" in text
@@ -320,8 +327,8 @@ def test_two_versions_of_a_control_are_controls_both():
     board = leaderboard({name: scores([1.0, 99.0] * 10, blocks=6) for name in names}, draws=200)
     found = {name: ranks(pick(board, name, "success_25m")) for name in names}
     assert found == {names[0]: (None, None), names[1]: (None, None), "mine": (1, 1)}
-    ((_, short),) = summary(board)
-    assert sorted(cell.partition("] ")[2] for cell in short["occlusion, n = 20"]) == ["(1)", "(control)", "(control)"]
+    (short,) = summary(Book.of(board, {}))
+    assert sorted(row.cells[1].text.partition("] ")[2] for row in short.rows) == ["(1)", "(control)", "(control)"]
 
 
 def test_no_name_breaks_a_table():
@@ -329,7 +336,7 @@ def test_no_name_breaks_a_table():
     board = leaderboard({name: scores([1.0, 99.0])}, draws=200)
     (row,) = (line for line in board_markdown(board, ABOUT).splitlines() if "mine 1" in line)
     assert r"mine 1\|2 &lt;b>" in row
-    assert row.replace(r"\|", "").count("|") == 10
+    assert row.replace(r"\|", "").count("|") == 7
     assert "[U+2122]" in board_latex(leaderboard({"mine \u2122": scores([1.0])}, draws=200), ABOUT)
     expected = r"mine 1$|$2 $<$b$>$ \textbackslash{}\$ \{x\} \textasciitilde{} \textasciicircum{}"
     assert expected in board_latex(board, ABOUT)
@@ -343,12 +350,11 @@ def test_the_board_says_what_each_of_its_columns_is():
     rows += integrity_rows("mine", "own", own_word(tables["mine"]))
     board = pd.concat([leaderboard(tables, draws=200), to_frame(rows)], ignore_index=True)
     text = board_markdown(board, ABOUT).split("## How to read")[1]
-    told = {name for line in text.splitlines() if line for name in line.split("**")[1].split(", ")}
-    shown = {str(column) for _, table in tables_of(board) for column in table.columns}
-    names = {column.split(",")[0].split(" (")[0].removesuffix("_p50").removesuffix("_p95") for column in shown}
-    assert names - told == {"matcher"}
-    assert "rejector" in shown
-    assert "false fixes" in shown
+    terms = {line.split("**")[1] for line in text.splitlines() if line}
+    shown = {column.term for table in tables_of(board, {}) for column in table.columns}
+    assert {markdown(name) for name in shown} <= terms
+    assert {"rejector", "false fixes", "latency_p50"} <= shown
+    assert "no meaning" not in text
 
 
 def test_one_query_of_a_kind_and_none_of_another_are_told_as_they_are():
@@ -380,10 +386,9 @@ def test_of_candidates_a_board_says_what_guessing_is_worth():
     found = {"above": [0, 1, 0, 0], "tied": 1, "right": 1}
     board = leaderboard({"mine": scores([math.nan] * 4, track="retrieval", pool=[10, 10, 50, 50], **found)}, draws=200)
     assert pick(board, "mine", "chance_1")["value"] == pytest.approx((0.1 + 0.02) / 2)
-    ((title, _),) = tables_of(board)
-    assert title.endswith(" (chance: 0.060)")
-    ((_, short),) = summary(board)
-    assert short.columns[1] == "occlusion, n = 4, chance 0.060"
+    assert "chance 0.060 (n = 4)" in board_markdown(board, ABOUT)
+    (short,) = summary(Book.of(board, {}))
+    assert short.columns[1].name == "occlusion, n = 4, chance 0.060"
 
 
 def test_a_paper_gets_contrasts_controls_labels_and_where_data_are_from():
@@ -391,9 +396,9 @@ def test_a_paper_gets_contrasts_controls_labels_and_where_data_are_from():
     contrast = Contrast(name="first_one", first="mine", second="other", suites=("occlusion",))
     findings = hold_contrasts([contrast], tables, {}, draws=200)
     verdict = Verdict(control="twins", matcher="mine", n=4, found=2.0, expected=2.0, p=math.nan, holds=True)
-    latex = board_latex(leaderboard(tables, draws=200), ABOUT, findings, [verdict])
+    latex = board_latex(leaderboard(tables, draws=200), ABOUT, findings=findings, verdicts=[verdict])
     labels = re.findall(r"label{tab:(.*)}", latex)
-    assert labels == ["contrasts", "occlusion-localization-prior-group-r500-weak-s3", "controls"]
+    assert labels == ["contrasts", "board-occlusion-localization-r500-weak-s3", "controls"]
     captions = [line for line in latex.splitlines() if line.startswith(r"\caption")]
     assert all("(c) OpenStreetMap contributors, ODbL" in line for line in captions)
     assert [r"$^\dagger$ Wilson" in line for line in captions] == [False, True, False]

@@ -36,15 +36,19 @@ def paper_markdown(
     source = f"{about['trials']}. Made by {about['made_by']}. Data: {about['data']}."
     lines = ["# The paper's experiment", "", source, "", _interval_note(summary), ""]
     if known:
-        lines += ["## Beside the paper's Table II", "", *markdown_table(_beside(summary, known)), ""]
+        lines += ["## Beside the paper's Table II", "", *_table(_beside(summary, known)), ""]
         lines += ["## Each difference", "", *(f"- {line}" for line in difference_lines(summary)), ""]
     steps = _steps(findings)
     if len(steps):
-        lines += ["## From variant to variant", "", *markdown_table(steps), ""]
+        lines += ["## From variant to variant", "", *_table(steps), ""]
     if others:
-        lines += ["## Controls and other matchers", "", *markdown_table(_beside(summary, others)), ""]
+        lines += ["## Controls and other matchers", "", *_table(_beside(summary, others)), ""]
     lines += ["## Figures", "", *(f"- [{caption}](figures/{name})" for name, caption in figures.items()), ""]
     return "\n".join(lines)
+
+
+def _table(table: pd.DataFrame) -> Iterator[str]:
+    return markdown_table(map(str, table.columns), (map(str, row) for row in table.itertuples(index=False)))
 
 
 def _interval_note(summary: pd.DataFrame) -> str:

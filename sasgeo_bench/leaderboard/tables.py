@@ -1,22 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of a site as values: cells with what they sort by, columns with what they mean."""
+"""Tables as values, which Markdown, LaTeX, a terminal and the site show: columns, cells, ties, text of numbers."""
 
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.text import figure_text, number_text, rank_text
+from sasgeo_bench.scoring.compare import RankInterval
 from sasgeo_bench.scoring.rows import is_unranked
 
 Record = Mapping[str, Any]  # a row of the leaderboard
 Key = tuple[str, str, str]  # suite, track, prior group
 
+DAGGER: Final = "†"  # of an interval that Wilson's reaches beyond the draws
 _PLAIN: Final = re.compile(r"[^a-z0-9]+")
 _MOST_LETTERS: Final = 60  # of a part of a file name
+
+
+def figure_text(row: Record) -> str:
+    """Return a figure with its interval, as in "0.63 [0.55, 0.70]"; a dagger where that is Wilson's."""
+    mark = DAGGER if row["interval"] == "wilson" else ""
+    return interval_text(row["value"], row["lo"], row["hi"]) + mark
+
+
+def interval_text(value: float, lo: float, hi: float) -> str:
+    """Return a figure with the ends of its interval, or alone where it has none.
+
+    Examples
+    --------
+    >>> interval_text(0.63, 0.55, 0.7), interval_text(0.63, math.nan, math.nan)
+    ('0.630 [0.550, 0.700]', '0.630')
+    """
+    return number_text(value) if math.isnan(lo) else f"{number_text(value)} [{number_text(lo)}, {number_text(hi)}]"
+
+
+def number_text(value: float) -> str:
+    """Return a number with three digits; "-" for NaN."""
+    if math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "inf"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"  # noqa: PLR2004 - a digit less from ten on
+
+
+def tally_text(value: float) -> str:
+    """Return a count, or an expected count, never as a power of ten.
+
+    Examples
+    --------
+    >>> tally_text(3072.0), tally_text(3.0), tally_text(0.13636)
+    ('3072', '3', '0.136')
+    """
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"  # noqa: PLR2004 - three digits either way
+
+
+def rank_text(row: Record) -> str:
+    """Return a rank interval; controls have no rank, nor have entries that are set apart."""
+    if pd.isna(row["rank_best"]):
+        is_set_apart = pd.notna(row.get("set_apart"))
+        return "control" if is_unranked(row["matcher"]) else "set apart" if is_set_apart else "-"
+    return RankInterval(best=int(row["rank_best"]), worst=int(row["rank_worst"])).text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +91,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
-    """A word beside a name, and what it says."""
+    """A word next to a name, and its meaning."""
 
     text: str
     meaning: str
@@ -65,8 +111,12 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """Name and meaning of a column; `order` is how the table comes sorted by it, as `aria-sort` says it."""
+    """A column: the term that it is looked up by, its name in the table, its meaning.
 
+    `order` is how the table is sorted by it, in the words of `aria-sort`.
+    """
+
+    term: str
     name: str
     meaning: str
     is_number: bool = True
@@ -91,21 +141,41 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
 
-    def without_empty(self, *names: str) -> "Table":
-        """The same without those of the named columns that say nothing in any row."""
+    def without_empty(self, *terms: str) -> "Table":
+        """Return the table without those of the named columns that are "-" in every row."""
         lost = {
             at
             for at, column in enumerate(self.columns)
-            if column.name in names and all(row.cells[at].text == "-" for row in self.rows)
+            if column.term in terms and all(row.cells[at].text == "-" for row in self.rows)
         }
         keep = [at for at in range(len(self.columns)) if at not in lost]
-        return Table(
-            name=self.name,
-            title=self.title,
+        return replace(
+            self,
             columns=tuple(self.columns[at] for at in keep),
             rows=tuple(Row(cells=tuple(row.cells[at] for at in keep), tone=row.tone) for row in self.rows),
-            notes=self.notes,
         )
+
+
+def text_of(cell: Cell) -> str:
+    """Return a cell as plain text; a mark that praises or warns stands in brackets.
+
+    Examples
+    --------
+    >>> text_of(Cell(text="mine", marks=(Mark(text="as submitted", meaning="", tone="warn"),)))
+    'mine (as submitted)'
+    """
+    return " ".join((cell.text, *(f"({mark.text})" for mark in cell.marks if mark.tone != "plain")))
+
+
+def text_cells(*texts: str) -> tuple[Cell, ...]:
+    """Return cells of plain text.
+
+    Examples
+    --------
+    >>> [cell.text for cell in text_cells("a", "b")]
+    ['a', 'b']
+    """
+    return tuple(Cell(text=str(text)) for text in texts)
 
 
 def plain_cell(value: object) -> Cell:

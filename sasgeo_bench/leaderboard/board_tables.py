@@ -1,0 +1,591 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every table of a board as a value: Markdown, LaTeX, a terminal and the site show the same ones."""
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Self
+
+import pandas as pd
+
+from sasgeo_bench.errors import counted
+from sasgeo_bench.leaderboard.columns import column, marks_of, prior_words, words
+from sasgeo_bench.leaderboard.reproduction import SEEDS_NOTE
+from sasgeo_bench.leaderboard.tables import (
+    Cell,
+    Key,
+    Mark,
+    Record,
+    Row,
+    Table,
+    Tie,
+    figure_cell,
+    file_stem,
+    interval_text,
+    number_cell,
+    number_text,
+    page_names,
+    plain_cell,
+    rank_cell,
+    rank_text,
+    tally_text,
+    text_cells,
+    ties_of,
+)
+from sasgeo_bench.scoring.contrasts import Finding
+from sasgeo_bench.scoring.falsifiers import Falsifier
+from sasgeo_bench.scoring.integrity import AS_DRAWN
+from sasgeo_bench.scoring.metrics import CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
+from sasgeo_bench.scoring.steps import GROUP
+from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS
+
+_REJECTION: Final = (  # metrics of the tables of rejectors
+    *("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
+    *("brier", "ece", "cost_20", "cost_20_place"),
+)
+SHOWN_COSTS: Final = (  # and of the table of costs
+    *("latency_p50", "latency_p95", "prepare", "peak_memory"),
+    *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
+)
+_SOUND: Final = ("ok", "not applicable")  # all else is a miss
+_PRIOR_ALONE: Final = "prior_centre"
+MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1280 px holds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Book:
+    """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
+
+    `counted` are the kinds of stress that the first figure of a table counts, `lost` the entries without a sound
+    answer, and how often; both are empty without scored queries.
+    """
+
+    figures: Mapping[tuple[str, ...], Record]
+    matchers: Mapping[Key, tuple[str, ...]]
+    strata: Mapping[Key, tuple[str, ...]]
+    entries: Mapping[str, Mapping[str, Any]]
+    matcher_pages: Mapping[str, str]
+    suite_pages: Mapping[str, str]
+    counted: Mapping[Key, tuple[str, ...]]
+    lost: Mapping[Key, str]
+
+    @classmethod
+    def of(cls, board: pd.DataFrame, about: Mapping[str, Any], scores: pd.DataFrame | None = None) -> Self:
+        """Index a leaderboard with the content of its `board.json`, which may be empty, and its scored queries."""
+        entries = {str(entry["name"]): entry for entry in about.get("entries", ())}
+        for row in board.drop_duplicates("matcher").to_dict("records") if "set_apart" in board else ():
+            reason = None if pd.isna(row["set_apart"]) else row["set_apart"]
+            entries.setdefault(row["matcher"], {"how": row["how"], "set_apart": reason})
+        scored = pd.DataFrame() if scores is None else scores
+        plain = board[board["rejector"] == ""] if len(board) else board
+        figures: dict[tuple[str, ...], Record] = {}
+        matchers: dict[Key, dict[str, None]] = {}
+        strata: dict[Key, dict[str, None]] = {}
+        for row in plain.to_dict("records"):
+            suite, track, prior = (str(row[name]) for name in GROUP)
+            name, stratum = str(row["matcher"]), str(row["stratum"])
+            figures[suite, track, prior, name, stratum, str(row["metric"])] = {str(key): row[key] for key in row}
+            if suite != ALL_SUITES:
+                matchers.setdefault((suite, track, prior), {})[name] = None
+                strata.setdefault((suite, track, prior), {})[stratum] = None
+        names = [*entries, *(name for found in matchers.values() for name in found)]
+        return cls(
+            figures=figures,
+            matchers={key: tuple(matchers[key]) for key in sorted(matchers)},
+            strata={key: tuple(found) for key, found in strata.items()},
+            entries=entries,
+            matcher_pages=page_names("matcher", names),
+            suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
+            counted={key: _counted(rows) for key, rows in _by_group(scored)},
+            lost={key: _lost(rows) for key, rows in _by_group(scored)},
+        )
+
+    def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
+        """Return one figure; None where the board does not have it."""
+        return self.figures.get((*key, matcher, stratum, metric))
+
+    def main(self, key: Key, matcher: str, metric: str) -> Record | None:
+        """Return the figure under stress, or of all queries where nothing is stressed."""
+        return self.pick(key, matcher, metric, STRESS) or self.pick(key, matcher, metric)
+
+    def name_cell(self, matcher: str) -> Cell:
+        """Return the name of a matcher with its marks and a link to its page."""
+        entry = self.entries.get(matcher, {})
+        marks = marks_of(entry, is_control=is_unranked(matcher))
+        return Cell(text=matcher, href=self.matcher_pages.get(matcher, ""), marks=marks)
+
+    def suite_cell(self, suite: str) -> Cell:
+        """Return the name of a suite with a link to its page."""
+        return Cell(text=suite, href=self.suite_pages.get(suite, ""))
+
+    def is_set_apart(self, matcher: str) -> bool:
+        """Return whether the board sets an entry apart."""
+        return bool(self.entries.get(matcher, {}).get("set_apart"))
+
+
+def _by_group(scores: pd.DataFrame) -> Iterator[tuple[Key, pd.DataFrame]]:
+    if len(scores):
+        for (suite, track, prior), rows in scores.groupby(list(GROUP), sort=True):
+            yield (str(suite), str(track), str(prior)), rows
+
+
+def _counted(rows: pd.DataFrame) -> tuple[str, ...]:
+    """Return the kinds of stress with the place on the map, which the first figure counts, if there are any."""
+    kinds = rows.loc[(rows["role"] == STRESS) & rows["is_present"].astype(bool), "kind"]
+    return tuple(sorted(map(str, kinds.unique())))
+
+
+def _lost(rows: pd.DataFrame) -> str:
+    counts = rows.loc[~rows["status"].isin(_SOUND), ["matcher", "status"]].value_counts(sort=False).sort_index()
+    named = (f"{key[0]} {count} ({key[1]})" for key, count in counts.items() if isinstance(key, tuple))
+    return ", ".join(named)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """One suite, track and prior group: its table, and that of contestants that are set apart, if any."""
+
+    suite: str
+    track: str
+    prior_group: str
+    prior: str
+    suite_page: str
+    counted: str
+    for_nothing: str
+    table: Table
+    apart: Table | None = None
+
+    @property
+    def context(self) -> str:
+        """Say which queries the table counts, and what they are worth without a method."""
+        texts = [f"Prior group {self.prior_group}."]
+        texts += [f"Stress that is counted: {self.counted}."] if self.counted else []
+        texts += [f"Without looking at the view: {self.for_nothing}."] if self.for_nothing else []
+        return " ".join(texts)
+
+
+def sections_of(book: Book) -> tuple[Section, ...]:
+    """Return the tables of a board's suites; prior groups are never mixed in one."""
+    return tuple(_section(book, key) for key in book.matchers)
+
+
+def _section(book: Book, key: Key) -> Section:
+    suite, track, prior_group = key
+    names = book.matchers[key]
+    apart = [name for name in names if book.is_set_apart(name)]
+    table = suite_table(book, key, [name for name in names if name not in apart])
+    unasked = [name for name in book.entries if name not in names]
+    lost = book.lost.get(key, "")
+    lines = [*table.notes, *([f"Without a sound answer, which is a miss: {lost}."] if lost else [])]
+    lines += [f"Not asked here: {', '.join(unasked)}."] if unasked else []
+    return Section(
+        suite=suite,
+        track=track,
+        prior_group=prior_group,
+        prior=prior_words(prior_group),
+        suite_page=book.suite_pages[suite],
+        counted=", ".join(book.counted.get(key, ())),
+        for_nothing=_for_nothing(book, key),
+        table=replace(table, notes=tuple(lines)),
+        apart=_apart(book, key, apart) if apart else None,
+    )
+
+
+def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
+    table = suite_table(book, key, names)
+    reasons = tuple(f"{name}: {book.entries[name]['set_apart']}." for name in names)
+    title = "Set apart: not to be compared with those above"
+    return replace(table, name=f"{table.name}-apart", title=title, notes=reasons)
+
+
+def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
+    """Return the table of one suite, track and prior group: a matcher a line, the best first, ties marked.
+
+    Parameters
+    ----------
+    book : Book
+        All figures.
+    key : (str, str, str)
+        Suite, track and prior group.
+    names : sequence of str
+        Matchers to show; one without a figure is left out.
+    """
+    suite, track, prior_group = key
+    primary = primary_of(track).name
+    found = {name: row for name in names if (row := book.main(key, name, primary)) is not None}
+    order = sorted(found, key=lambda name: (-_value(found[name]), name))
+    ties = ties_of(list(found.values()))
+    ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
+    rows = tuple(_row(book, key, found[name], _tie_of(ties, name), ranked) for name in order)
+    titles = (primary, "rank", "within_25m", "control", "false fixes", "detectable", "n", "missing", "blocks")
+    table = Table(
+        name=file_stem("board", suite, track, prior_group),
+        title=f"{suite}: {track}, {prior_words(prior_group)}",
+        columns=(
+            column("matcher", is_number=False),
+            *(column(name, order="descending" if name == primary else "none") for name in titles),
+        ),
+        rows=rows,
+        notes=_notes(ties, found, ranked),
+    )
+    return table.without_empty(WITHIN.name, "false fixes", "control", "detectable", "missing")
+
+
+def _value(row: Record) -> float:
+    value = float(row["value"])
+    return -math.inf if math.isnan(value) else value
+
+
+def _tie_of(ties: Sequence[Tie], name: str) -> int | None:
+    """Number of the tie that a matcher is in."""
+    return next((number for number, tie in enumerate(ties) if name in tie.names), None)
+
+
+def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Row:
+    name, stratum = str(main["matcher"]), str(main["stratum"])
+    primary = str(main["metric"])
+    mark = None if tie is None else Mark(text="tie", meaning="shares ranks with others, named below the table")
+    tone = "control" if is_unranked(name) else "plain" if tie is None else ("tied" if tie % 2 == 0 else "other-tie")
+    places = counted(int(main["places"]), "place")
+    return Row(
+        cells=(
+            book.name_cell(name),
+            figure_cell(main, has_bar=True),
+            rank_cell(main, ranked=ranked, mark=mark),
+            figure_cell(book.pick(key, name, WITHIN.name, stratum)),
+            figure_cell(book.pick(key, name, primary, CONTROL)),
+            figure_cell(book.pick(key, name, FALSE_ABSENT.name)),
+            number_cell(float(main["detectable"])),
+            plain_cell(int(main["n"])),
+            plain_cell(int(main["missing"])) if main["missing"] else Cell(text="-", key=0.0),
+            Cell(text=f"{main['blocks']} in {places}", key=float(main["blocks"])),
+        ),
+        tone=tone,
+    )
+
+
+def _notes(ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tuple[str, ...]:
+    if not found:
+        return ("Nobody has a figure here.",)
+    if ranked:
+        lines = [f"Tied: {tie.to_text()}." for tie in ties]
+        return tuple(lines or (["No two share a rank."] if ranked > 1 else ["One alone is ranked."]))
+    rivals = [name for name in found if not is_unranked(name)]
+    if not rivals:
+        return ("Only controls answered.",)
+    return ("Nobody is ranked here: the order is that of the figure, and decides nothing.",)
+
+
+def _for_nothing(book: Book, key: Key) -> str:
+    """Return what the prior alone and guessing reach."""
+    _, track, _ = key
+    primary = primary_of(track).name
+    alone = next((name for name in book.matchers[key] if name_alone(name) == _PRIOR_ALONE), None)
+    found = {
+        "the prior alone": None if alone is None else book.main(key, alone, primary),
+        "chance": book.main(key, book.matchers[key][0], CHANCE.name),
+    }
+    texts = [f"{name} {number_text(row['value'])} (n = {row['n']})" for name, row in found.items() if row is not None]
+    return ", ".join(texts)
+
+
+def strata_tables(book: Book, key: Key) -> Iterator[Table]:
+    """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
+    names = book.matchers[key]
+    for first in range(0, len(names), MOST_COLUMNS):
+        yield _strata_table(book, key, names[first : first + MOST_COLUMNS], number=first // MOST_COLUMNS + 1)
+
+
+def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) -> Table:
+    suite, track, prior_group = key
+    primary = primary_of(track).name
+    more = "" if number == 1 else f", table {number}"
+    rows = []
+    for stratum in book.strata[key]:
+        found = {name: book.pick(key, name, primary, stratum) for name in names}
+        counts = sorted({int(row["n"]) for row in found.values() if row is not None})
+        if counts:
+            first = Cell(text=stratum)
+            cells = [figure_cell(row) for row in found.values()]
+            rows.append(Row(cells=(first, Cell(text="-".join(map(str, counts)), key=float(counts[0])), *cells)))
+    meaning = column(primary).meaning
+    columns = [column(primary, title=name) for name in names]
+    return Table(
+        name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
+        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
+        columns=(column("part", is_number=False), column("n"), *columns),
+        rows=tuple(rows),
+        notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),
+    )
+
+
+def cost_table(book: Book) -> Table:
+    """Return the costs of all entries, a metric a column; no rows where the board has none."""
+    found = {key: row for key, row in book.figures.items() if key[0] == ALL_SUITES and key[-1] in SHOWN_COSTS}
+    kinds = sorted({(SHOWN_COSTS.index(key[-1]), key[-1], key[1]) for key in found})
+    by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
+    units = {key[-1]: str(row["unit"]) for key, row in found.items()}
+    names = sorted({key[3] for key in found})
+    rows = []
+    for name in names:
+        mine = [by_kind.get((name, metric, track)) for _, metric, track in kinds]
+        values = [number_cell(math.nan if row is None else float(row["value"])) for row in mine]
+        rows.append(Row(cells=(book.name_cell(name), *values)))
+    columns = [
+        column(metric, title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})")
+        for _, metric, track in kinds
+    ]
+    notes = ("Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",)
+    first = column("matcher", is_number=False)
+    return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
+
+
+def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return matcher x rejector over all suites, a table for each track and prior group."""
+    found = _rejection_rows(board).groupby(["track", "prior_group"], sort=True)
+    return tuple(
+        _rejection_table(
+            part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
+        )
+        for key, part in found
+    )
+
+
+def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
+    """Return the rejectors of one matcher over all suites, every track and prior group a line; None without any."""
+    rows = _rejection_rows(board)
+    mine = rows[rows["matcher"] == matcher]
+    return None if mine.empty else _rejection_table(mine, "rejection", "Rejection, all suites", has_queries=True)
+
+
+def _rejection_rows(board: pd.DataFrame) -> pd.DataFrame:
+    return board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
+
+
+def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: bool = False) -> Table:
+    """Return rejectors, the best first; `has_queries` adds a column of the track and prior group of each line."""
+    rows = []
+    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
+        matcher, rejector, track, prior_group = map(str, key)
+        by_name: dict[str, Record] = {
+            str(row["metric"]): {str(field): row[field] for field in row} for row in mine.to_dict("records")
+        }
+        queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
+        figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
+        cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
+        surest = by_name.get("aurc")
+        rows.append((math.inf if surest is None else float(surest["value"]), matcher, rejector, Row(cells=cells)))
+    rows.sort(key=lambda row: row[:3])
+    return Table(
+        name=name,
+        title=title,
+        columns=(
+            *words("matcher", "rejector"),
+            *((column("track", is_number=False, title="queries"),) if has_queries else ()),
+            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
+        ),
+        rows=tuple(row for *_, row in rows),
+        notes=("Brier, ECE and costs have no interval on this board: they decide nothing.",),
+    )
+
+
+def seed_table(about: Mapping[str, Any]) -> Table | None:
+    """Return figures on the public and on a private seed: of all suites, and whatever is shown to be worse.
+
+    None where no row was compared with a private seed.
+    """
+    rows = [
+        Row(
+            cells=text_cells(
+                entry["name"],
+                item["suite"],
+                item["track"],
+                item["metric"],
+                number_text(item["public"]),
+                number_text(item["private"]),
+                interval_text(item["difference"], item["lo"], item["hi"]),
+                f"{item['n_public']} and {item['n_private']}",
+                f"{item['blocks_public']} and {item['blocks_private']}, {item['blocks_shared']} in both",
+                "worse" if item["is_worse"] else "not shown to be worse",
+            )
+        )
+        for entry in about.get("entries", ())
+        for item in (entry.get("private") or {}).get("figures", ())
+        if item["suite"] == ALL_SUITES or item["is_worse"]
+    ]
+    if not rows:
+        return None
+    numbers = tuple(map(column, ("public", "private", "private less public", "n", "blocks")))
+    columns = (*words("matcher", "suite", "track", "figure"), *numbers, *words("shown"))
+    title = "Public and private seed"
+    return Table(name="seeds", title=title, columns=columns, rows=tuple(rows), notes=(SEEDS_NOTE,))
+
+
+def control_table(controls: pd.DataFrame) -> Table | None:
+    """Return every control of every matcher, from `controls.verdict_frame`; None where none was drawn."""
+    if not len(controls):
+        return None
+    rows = tuple(
+        Row(
+            cells=(
+                *text_cells(row["control"], row["matcher"]),
+                plain_cell(int(row["n"])),
+                Cell(text=tally_text(float(row["found"])), key=float(row["found"])),
+                Cell(text=tally_text(float(row["expected"])), key=float(row["expected"])),
+                number_cell(float(row["p"])),
+                Cell(text="held" if row["holds"] else "FAILED"),
+            )
+        )
+        for row in controls.to_dict("records")
+    )
+    first = column("control query", is_number=False, title="control")
+    columns = (first, *words("matcher"), *map(column, ("n", "found", "expected", "p")), *words("outcome"))
+    return Table(name="controls", title="Controls, one by one", columns=columns, rows=rows, notes=(_CONTROLS_NOTE,))
+
+
+_CONTROLS_NOTE: Final = (
+    "The right score of these queries is known beforehand. At chance: views of a shuffled map, of a map turned by "
+    "half, and of one of two places that are the same."
+)
+_FALSIFIERS_NOTE: Final = (
+    "The entries of each contrast where the difference between them is taken away: at the same places without the "
+    "stress (`control`), and on the falsifiers of each suite. A gain here as well is not caused by what the contrast "
+    "is named for."
+)
+
+
+def contrast_table(findings: Sequence[Finding]) -> Table:
+    """Return the registered contrasts."""
+    rows = tuple(
+        Row(
+            cells=(
+                Cell(text=item.name),
+                *_sides(item),
+                number_cell(item.p_holm),
+                Cell(text=f"{item.first_only} and {item.second_only}"),
+                number_cell(item.detectable),
+                Cell(text=f"{item.n} in {counted(item.blocks, 'block')}", key=float(item.n)),
+                Cell(text=item.verdict),
+            )
+        )
+        for item in findings
+    )
+    names = ("first", "second", "difference", "p (Holm)", "discordant", "detectable", "n")
+    columns = (*words("contrast"), *map(column, names), *words("verdict"))
+    return Table(name="contrasts", title="Registered contrasts", columns=columns, rows=rows)
+
+
+def falsifier_table(found: Sequence[Falsifier]) -> Table:
+    """Return the entries of each contrast where they should not differ."""
+    rows = tuple(
+        Row(
+            cells=(
+                *text_cells(item.contrast, item.suite, item.kind),
+                *_sides(item.finding),
+                Cell(text=f"{item.finding.first_only} and {item.finding.second_only}"),
+                Cell(text=f"{item.finding.n} in {counted(item.finding.blocks, 'block')}", key=float(item.finding.n)),
+                Cell(text=item.verdict),
+            )
+        )
+        for item in found
+    )
+    numbers = tuple(map(column, ("first", "second", "difference", "discordant", "n")))
+    columns = (*words("contrast", "suite", "kind"), *numbers, *words("verdict"))
+    return Table(name="falsifiers", title="Falsifiers", columns=columns, rows=rows, notes=(_FALSIFIERS_NOTE,))
+
+
+def _sides(item: Finding) -> tuple[Cell, ...]:
+    """Return what both entries of a contrast reach, and their difference."""
+    return (
+        Cell(text=f"{item.first}: {number_text(item.first_value)}", key=_sort_key(item.first_value)),
+        Cell(text=f"{item.second}: {number_text(item.second_value)}", key=_sort_key(item.second_value)),
+        Cell(text=interval_text(item.difference, item.lo, item.hi), key=_sort_key(item.difference)),
+    )
+
+
+def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:
+    """Yield success along each ladder of strengths: a matcher a line, a step a column; strength 0 is the control.
+
+    Parameters
+    ----------
+    steps : pandas.DataFrame
+        From `steps.steps_frame`.
+    ages : mapping, optional
+        From `plot_tables.age_names`: steps that are ages of a map are named by the ages that their maps have.
+    """
+    named = ages or {}
+    for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
+        suite, track, prior_group, kind, unit = map(str, key)
+        records: list[Record] = [{str(field): row[field] for field in row} for row in part.to_dict("records")]
+        counts: dict[tuple[int, float], int] = {}
+        for row in sorted(records, key=lambda row: (row["view_cells"], row["strength"])):
+            step = (row["view_cells"], row["strength"])
+            counts[step] = max(counts.get(step, 0), int(row["n"]))
+        order = part.groupby("matcher")["value"].mean().sort_index().sort_values(ascending=False, kind="stable")
+        by_step = {(row["matcher"], row["view_cells"], row["strength"]): row for row in records}
+        rows = tuple(
+            Row(cells=(Cell(text=str(name)), *(figure_cell(by_step.get((name, *step))) for step in counts)))
+            for name in order.index
+        )
+        titles = [
+            f"{named.get((suite, track, prior_group, strength, size), f'{strength:g}')}, {size} cells, n = {n}"
+            for (size, strength), n in counts.items()
+        ]
+        primary = primary_of(track).name
+        yield Table(
+            name=file_stem("steps", suite, track, prior_group, kind),
+            title=f"{suite}: {track}, {prior_words(prior_group)}, step by step: {kind} ({unit})",
+            columns=(*words("matcher"), *(column(primary, title=title) for title in titles)),
+            rows=rows,
+        )
+
+
+def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
+    """Yield what a terminal shows of some suites, or of all: a matcher a line, a suite a column, figure and rank."""
+    groups = sorted({key[1:] for key in book.matchers if not suites or key[0] in suites})
+    for track, prior_group in groups:
+        primary = primary_of(track).name
+        keys = [key for key in book.matchers if key[1:] == (track, prior_group) and (not suites or key[0] in suites)]
+        found = {
+            name: [book.main(key, name, primary) for key in keys] for key in keys for name in sorted(book.matchers[key])
+        }
+        shown = [at for at in range(len(keys)) if any(rows[at] is not None for rows in found.values())]
+        order = sorted(found, key=lambda name: (-_mean_value(found[name]), name))
+        yield Table(
+            name=file_stem("summary", track, prior_group),
+            title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+            columns=(*words("matcher"), *(column(primary, title=_heading(book, keys[at], primary)) for at in shown)),
+            rows=tuple(
+                Row(cells=(replace(book.name_cell(name), href=""), *(_short_cell(found[name][at]) for at in shown)))
+                for name in order
+                if any(row is not None for row in found[name])
+            ),
+        )
+
+
+def _mean_value(rows: Sequence[Record | None]) -> float:
+    values = [float(row["value"]) for row in rows if row is not None and not math.isnan(row["value"])]
+    return sum(values) / len(values) if values else -1.0
+
+
+def _heading(book: Book, key: Key, primary: str) -> str:
+    """Return a suite with its number of queries, and what guessing among candidates reaches."""
+    rows = [book.main(key, name, primary) for name in book.matchers[key]]
+    n = max(int(row["n"]) for row in rows if row is not None)
+    chance = next(filter(None, (book.main(key, name, CHANCE.name) for name in book.matchers[key])), None)
+    return f"{key[0]}, n = {n}" + ("" if chance is None else f", chance {number_text(chance['value'])}")
+
+
+def _short_cell(row: Record | None) -> Cell:
+    """Return a cell as in "0.750 [0.30, 0.95] (2-3)"."""
+    if row is None:
+        return Cell(text="-")
+    if not row["is_applicable"]:
+        return Cell(text="n/a")
+    ends = "" if math.isnan(row["lo"]) else f" [{row['lo']:.2f}, {row['hi']:.2f}]"
+    return Cell(text=f"{number_text(row['value'])}{ends} ({rank_text(row)})", key=_sort_key(float(row["value"])))
+
+
+def _sort_key(value: float) -> float | None:
+    return None if math.isnan(value) else value

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns of tables, and the words next to names: what each means, for boards, the site and the documentation."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS
+from sasgeo_bench.scoring.metrics import METRICS
+from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, REPRODUCED, RUN_HERE
+from sasgeo_bench.tasks.query import PriorGroup
+
+_UNKNOWN: Final = "no meaning is written down for this column"
+_OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
+    "matcher": "Name of the entry. Controls have no rank: they show what a figure means that nobody earned",
+    "rank": "Ranks that the matcher can have, all pairs compared at once. Matchers that share a rank cannot be "
+    f"distinguished. With fewer than {LEAST_BLOCKS} blocks nobody is ranked (-)",
+    "control": "The same figure at the same places without the stress",
+    "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
+    "detectable": "Smallest difference from the best other matcher that these queries can show (5 %, power 80 %); inf "
+    "if none, - where nobody is ranked",
+    "n": "Queries in the denominator, the same for every matcher",
+    "missing": "Queries without a row; they count as misses",
+    "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
+    "them",
+    "suite": "What is done to a view or a map",
+    "part": "Which of the suite's queries: a role, a kind of stress, one of its steps at one size of view, or a bin "
+    "of what was measured at the truth",
+    "kind": "Kind of stress, or of its absence",
+    "rejector": "Estimates of each answer how likely it is false; own: the matcher's own confidence, fitted to nothing",
+    "track": "localization: find the place on the map; retrieval: pick it among candidates",
+    "contrast": "Pair of entries that was registered before anything was run",
+    "first": "First entry of the pair, and what it reaches",
+    "second": "Second entry of the pair, and what it reaches",
+    "difference": "First less second on the same queries, with its 95 % interval",
+    "p (Holm)": "Chance of a difference as large if there were none, counting blocks; adjusted by Holm for the number "
+    "of registered contrasts",
+    "discordant": "Queries that only the first got right, and only the second",
+    "verdict": "Which is better at 5 %; null where neither is shown to be, with or without ruling out a difference "
+    f"that matters; not decided with fewer than {LEAST_BLOCKS} blocks",
+    "control query": "Queries whose right score is known beforehand",
+    "outcome": "held, or FAILED: then do not trust this board",
+    "found": "How many were right, or were answered where none must be",
+    "expected": "How many are right by guessing, or how many there must be",
+    "p": "Chance of finding as many or more by guessing; a control fails below 0.0001",
+    "figure": "Success or recall under stress, or false fixes at absent places",
+    "public": "The figure on the public seed of this board",
+    "private": "The same on a private seed, whose queries nobody else can draw",
+    "private less public": "Difference with its interval; all intervals of a matcher hold at once (95 %)",
+    "shown": "Whether the private figure is shown to be worse",
+    "class": "Semantic class of the map",
+    "place": "Where maps of several dates were compared",
+    "years": "From the first map to the last",
+    "things": "Things of the class on the first map and on the last",
+    "vanishes": "Share of what the map shows that is gone after a year, with its 95 % interval, over all dates",
+    "appears": "Share of a newer map that one a year older lacks, with its 95 % interval; late mapping is in it",
+    "re-drawn": "Of the older amount: kept, but moved by more than 1 m between the first map and the last",
+    "shift": "How far what was kept moved, median; of areas that of the centroid",
+    "no.": "As on the map above",
+    "half or part": "What the split keeps apart: one half trains and calibrates for the other, or train, calibration "
+    "and test",
+    "regions": "Maps of this board that lie there",
+    "dates": "Dates of the maps",
+    "suites": "Suites that were drawn there",
+    "scenes": "Kind of place, as its region file says",
+    "method": "How the level is computed",
+    "risk": "How often the error may exceed the level, as was promised",
+    "available": "Share of queries whose level is within the alert limit, with its 95 % interval",
+    "misleading": "Share that is available and has an error beyond its level, with its 95 % interval",
+    "hazardous": "Share that is misleading and has an error beyond the alert limit, with its 95 % interval",
+    "exceeded": "Share with an error beyond the level, available or not, with its 95 % interval",
+    "supports": "Risk that the misleading ones among the available support",
+}
+MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS
+NOTE: Final = (
+    "Intervals are 95 %: a bootstrap over blocks, then sites ({draws} draws), and never narrower than Wilson's with as "
+    f"many trials as there are sites; {DAGGER} marks those where Wilson's is wider. The first figure of a suite counts "
+    "the stressed queries, or all where nothing is stressed; matchers are ranked by it. A rank is an interval: "
+    "matchers that share one cannot be distinguished. Nothing is ranked across prior groups."
+)
+TERMS: Final = {  # what tables show that is no column
+    DAGGER: "Wilson's interval: of a few sites, or where all answers are right, draws alone would be too narrow",
+    "-": "nothing to show: no such query, no rank, nobody to compare with",
+    "the prior alone": "what `prior_centre` reaches, which looks at nothing: it answers with the middle of the prior's "
+    "disc, or of the map without one; of candidates with the one nearest to the middle of all",
+    "chance": "what guessing among the candidates reaches",
+    "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
+}
+MARKS: Final[dict[str, str]] = {  # words next to names and ranks
+    RUN_HERE: "the matcher's code was run here, on queries of a public seed, which code can draw again",
+    REPRODUCED: "it was run on a private seed of 128 bits too, and no figure is shown to be worse there",
+    NOT_REPRODUCED: "it was run on a private seed too, and is shown to be worse there: do not trust the row",
+    AS_SUBMITTED: "a file of answers; nobody here has run its code",
+    "trained on": "the places that its parameters come from",
+    "set apart": "in a table of its own and in no rank, for the reason stated there",
+    "tie": "shares ranks with others, who are named below the table; neighbouring ties differ in colour",
+}
+CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure means that nobody earned")
+_TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn"}
+_HEADINGS: Final = {"known": "to 5 deg", "weak": "to 20 deg", "unknown": "unknown"}
+
+
+def column(term: str, *, is_number: bool = True, order: str = "none", title: str = "") -> Column:
+    """Return the column of a term with its meaning; `title` where it is shown under another name.
+
+    Examples
+    --------
+    >>> column("n").meaning
+    'Queries in the denominator, the same for every matcher'
+    """
+    meaning = MEANINGS.get(term, _UNKNOWN)
+    return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)
+
+
+def words(*terms: str) -> tuple[Column, ...]:
+    """Return columns of text.
+
+    Examples
+    --------
+    >>> [one.is_number for one in words("matcher", "suite")]
+    [False, False]
+    """
+    return tuple(column(term, is_number=False) for term in terms)
+
+
+def prior_words(name: str) -> str:
+    """Describe a prior group in words.
+
+    Examples
+    --------
+    >>> prior_words("r500-weak-s3")
+    'within 500 m, heading known to 20 deg, scale to 3 %'
+    >>> prior_words("rnone-unknown-s15"), prior_words("another")
+    ('anywhere on the map, heading unknown, scale to 15 %', 'another')
+    """
+    try:
+        group = PriorGroup.parse(name)
+    except ConfigError:
+        return name
+    place = "anywhere on the map" if group.radius_m is None else f"within {group.radius_m:g} m"
+    known = _HEADINGS[group.yaw]
+    heading = f"heading {known}" if group.yaw == "unknown" else f"heading known {known}"
+    return f"{place}, {heading}, scale to {100 * group.scale_sigma:g} %"
+
+
+def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:
+    """Return the words next to an entry's name: control, how its answers were made, what it was trained on.
+
+    Examples
+    --------
+    >>> [mark.text for mark in marks_of({"how": "as submitted", "trained_on": ["porto"]}, is_control=False)]
+    ['as submitted', 'trained on 1 place']
+    """
+    if is_control:
+        return (CONTROL,)
+    how = str(entry.get("how") or "")
+    how = RUN_HERE if how == REPRODUCED and not entry.get("private") else how  # older boards had no private seed
+    marks = [Mark(text=how, meaning=MARKS.get(how, "as the board says"), tone=_TONES.get(how, "plain"))] if how else []
+    places = [str(place) for place in entry.get("trained_on") or ()]
+    if places:
+        meaning = f"its parameters come from {', '.join(places)}"
+        marks.append(Mark(text=f"trained on {counted(len(places), 'place')}", meaning=meaning))
+    if entry.get("set_apart"):
+        marks.append(Mark(text="set apart", meaning=str(entry["set_apart"]), tone="warn"))
+    return tuple(marks)

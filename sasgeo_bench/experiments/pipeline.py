@@ -46,7 +46,7 @@ MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is co
 
 @dataclass(frozen=True, kw_only=True)
 class PipelinePlan:
-    """What a pipeline will do; `requests` in the order of the file, `controls` those of every board.
+    """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
     With a private seed all is below `out`, which then is the root of private runs.
     """
@@ -60,7 +60,7 @@ class PipelinePlan:
     private: PrivateSeed | None = None
 
     def to_text(self) -> str:
-        """What of each stage is up to date; every matcher is loaded to find out what it was asked.
+        """Return which parts of each stage are up to date; every matcher is loaded to find out.
 
         Raises
         ------
@@ -120,7 +120,7 @@ class _Stage:
 
 
 def _stage(name: str, requests: Sequence[Request]) -> _Stage:
-    """What of some requests is up to date."""
+    """Return which of some requests are up to date."""
     found = [(request, made_tasks(request)) for request in requests]
     return _Stage(
         name=name,
@@ -134,7 +134,7 @@ def _stage(name: str, requests: Sequence[Request]) -> _Stage:
 
 
 def _paper_stage(plan: PipelinePlan) -> _Stage:
-    """What of the paper's experiment is up to date: a task for each seed."""
+    """Return which tasks of the paper's experiment are up to date, one for each seed."""
     paper = plan.spec.paper
     if paper is None:
         return _Stage(name="", made=(), lacking=())
@@ -188,13 +188,13 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
 
 
 def _count_rows(run: Path, suite: str, region: str) -> int:
-    """How many answers the folder of a matcher's runs holds to queries of a suite on a region, whenever drawn."""
+    """Count the answers in a matcher's runs to queries of a suite on a region, whenever drawn."""
     folders = [path for path in (run / suite).glob(f"{region}*") if path.is_dir() and is_of_region(path.name, region)]
     return sum(len({(tie.query_id, tie.asked) for tie in prediction_files.read_ties(folder)}) for folder in folders)
 
 
 def board_folder(plan: PipelinePlan) -> Path:
-    """Where the board goes."""
+    """Return the folder of the board."""
     return plan.out / "boards" / plan.spec.id
 
 
@@ -443,7 +443,7 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
 
 
 def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
-    """Whether a matcher is asked on a suite: controls of all, all of the controls, else as the file says."""
+    """Return whether a matcher is asked on a suite: controls on all, all on the controls, else by the file."""
     return suite in {CONTROLS, PAPER_SUITE} or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
 
 
@@ -457,7 +457,7 @@ def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
 
 
 def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest:
-    """What one matcher is asked."""
+    """Return the run of one matcher."""
     return RunRequest(
         spec=spec,
         tasks=tasks,

@@ -38,7 +38,7 @@ class ContrastSaid(_Said):
 
 
 class PipelineSaid(_Said):
-    """Which pipeline a board is of."""
+    """The pipeline of a board."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -47,13 +47,13 @@ class PipelineSaid(_Said):
 
 
 class VersionSaid(_Said):
-    """Which schema a file is of; whatever else it says is for those who know that schema."""
+    """The schema version of a file; other fields are read once the schema is known."""
 
     schema_version: int
 
 
 class PackSaid(_Said):
-    """What `pack.json` says, and nothing else: how the results were scored, and the hash of every file.
+    """All of `pack.json`: how the results were scored, and the hash of every file.
 
     Examples
     --------
@@ -164,7 +164,7 @@ class _Task(_Said):
 
 
 class BoardSaid(_Said):
-    """What `board.json` says, as far as pages go through it.
+    """The fields of `board.json` that pages use.
 
     Examples
     --------
@@ -208,7 +208,7 @@ class _Case(_Picture):
 
 
 class PicturesSaid(_Said):
-    """What `pictures.json` says.
+    """The content of `pictures.json`.
 
     Examples
     --------
@@ -222,7 +222,7 @@ class PicturesSaid(_Said):
 
 
 def parse_said(data: bytes | str, model: type[Model]) -> Model:
-    """JSON that anybody may have written.
+    """Parse JSON from an untrusted source.
 
     Raises
     ------

@@ -75,7 +75,7 @@ def draw_line(chart: Axes, mine: pd.DataFrame, at: Floats, number: int) -> None:
 
 
 def draw_bars_of(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
-    """A bar with its interval for each matcher that has a row."""
+    """Draw a bar with its interval for each matcher that has a row."""
     for at, name in enumerate(names):
         for row in mine[mine["matcher"] == name].to_dict("records"):
             chart.barh(at, row["value"], height=0.72, color=look_of(at).colour, alpha=0.75)

@@ -123,7 +123,7 @@ def _file_name(*parts: str) -> str:
 def _each(
     name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., None], shown: Sequence[str]
 ) -> Named:
-    """A figure for each group of rows; prior groups are never together."""
+    """Yield a figure for each group of rows; prior groups are never together."""
     for key, part in rows.groupby(list(columns), sort=True):
         yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
 
@@ -152,7 +152,7 @@ def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
 
 
 def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named:
-    """A panel for each matcher and method: of few matchers, those of contrasts first; nobody reads forty panels."""
+    """Yield a panel for each matcher and method, of few matchers, those of contrasts first."""
     found: dict[tuple[str, float], dict[tuple[str, str], ToldLevels]] = {}
     for matcher in (name for name in shown if name in board.scores):
         for item in told_levels(board.scores[matcher], board.predictions[matcher], split):

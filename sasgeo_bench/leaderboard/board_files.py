@@ -172,7 +172,7 @@ def _version(path: Path) -> str:
 
 
 def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """What `board.json` says, and the leaderboard.
+    """Read `board.json` and the leaderboard.
 
     Raises
     ------

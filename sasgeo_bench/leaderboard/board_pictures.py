@@ -152,7 +152,7 @@ def _kept(folder: Path, tell: Tell, failures: pd.DataFrame | None) -> Extra:
 
 
 def base_region(name: str) -> str:
-    """A region without what a date or a suite made of it.
+    """Return a region without the date or suite that changed it.
 
     Examples
     --------
@@ -205,7 +205,7 @@ def _example(about: Mapping[str, Any], root: Path) -> bytes:
 
 
 def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
-    """A control and the strongest stress of its site; where no site has both, the strongest stress and another query.
+    """Return a control and the strongest stress of its site, or the strongest stress and another query.
 
     Examples
     --------
@@ -297,7 +297,7 @@ def _cases(
 
 
 def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
-    """What rejectors say of one answer: how likely it is false, or only in which order; and whether they accept it.
+    """Describe what rejectors state of one answer: chance to be false or rank, and whether they accept it.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ _STYLE: Final[dict[Any, Any]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """How one of several things that are drawn beside each other looks."""
+    """Colour, dash and marker of one of several things drawn together."""
 
     colour: str
     dash: str
@@ -76,7 +76,7 @@ def look_of(number: int) -> Look:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Page:
-    """What is around the panels of a figure, and how large these are.
+    """Title, notes and size of a figure around its panels.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _share_of(box: tuple[float, float, float, float], width: float, height: floa
 
 
 def _keys_across(keys: Sequence[str], width: float) -> int:
-    """How many keys of a legend stand beside each other."""
+    """Return the number of legend entries in a row."""
     longest = max((len(name) for name in keys), default=1)
     return max(1, min(len(keys), int(width / (0.6 + 0.075 * longest))))
 

@@ -63,7 +63,7 @@ def check_shape(name: str, table: pd.DataFrame) -> None:
 
 
 def _is_of(values: "pd.Series[Any]", kind: object) -> bool:
-    """Whether a column holds texts, yes and no, or whole numbers, without a gap; or numbers with gaps."""
+    """Return whether a column holds texts, booleans or whole numbers without a gap, or numbers with gaps."""
     if kind is str:
         return bool(values.map(lambda one: isinstance(one, str)).all())
     if kind is bool:

@@ -53,7 +53,7 @@ _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated"
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRequest:
-    """What is to be put on a board.
+    """A request for a board.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
 
 
 def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress) -> Board | None:
-    """A board of all that have not failed; None where one fails only now, and was counted with the others."""
+    """Return the board of all entries that have not failed; None if one fails only now, after it was counted."""
     rules = rules_of(request.rejectors, request.split)
     entries = leave_out(find_entries(request.predictions, request.submissions, failures=failures), request.without)
     names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
@@ -262,7 +262,7 @@ def _costs(
     failures: Failures,
     tell: Tell,
 ) -> list[pd.DataFrame]:
-    """What the answers of each contestant took; how many there are is told."""
+    """Return the costs of each entry, and report how many answers it gave."""
     views = {name: size for task in tasks for name, size in task.view_bytes.items()}
     areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
     rows = []
@@ -281,7 +281,7 @@ Judgement = dict[tuple[str, str], pd.DataFrame]
 def _all_judged(
     judgings: Sequence[Judging], request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress
 ) -> tuple[Judgement, list[pd.DataFrame]]:
-    """What rejectors say by matcher and rejector, and rows of the board."""
+    """Return the results of rejectors by matcher and rejector, and their rows of the board."""
     said: Judgement = {}
     rows: list[pd.DataFrame] = []
     progress.begin(JUDGED, len(judgings))
@@ -344,7 +344,7 @@ def _judgings(
     rules: Mapping[str, Rule],
     split: Split | None,
 ) -> list[Judging]:
-    """What rejectors are to judge: the answers of each contestant."""
+    """Return the answers of each entry that rejectors estimate."""
     return [
         Judging(
             matcher=entry.name,
@@ -361,7 +361,7 @@ def _judgings(
 def _apart(
     entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None, tell: Tell
 ) -> dict[str, str]:
-    """Why rows are set apart; told, too."""
+    """Return and report why rows are set apart."""
     found = set_apart(entries, scores, split)
     for name, why in found.items():
         tell(f"{name}: set apart, {why}")
@@ -375,7 +375,7 @@ def _on_private(
     tasks: Sequence[ScoredTask],
     tell: Tell,
 ) -> OnPrivate:
-    """What came of the rows on a private seed: of the board that is named, else as stored results say."""
+    """Return the rows of the private board that is named, or those that stored results keep."""
     if request.private is None:
         return OnPrivate() if request.without else kept_private(request.kept, entries, request.root)
     found = hold_private(
@@ -406,7 +406,7 @@ def _check_some(scores: Mapping[str, pd.DataFrame]) -> None:
 
 
 def _remarks(all_judged: Mapping[tuple[str, str], pd.DataFrame], tell: Tell) -> tuple[str, ...]:
-    """What rejectors said of their fits; told, too."""
+    """Return and report remarks of rejectors on their fits."""
     judged = ((key, frame) for key, frame in all_judged.items() if key[1] != OWN)
     said = tuple(f"{name} on {matcher}: {item}" for (matcher, name), frame in judged for item in remarks_of(frame))
     for remark in said:
@@ -430,7 +430,7 @@ def _protection(
 
 
 def _in_words(scores: pd.DataFrame) -> str:
-    """How many queries of a contestant have a fix, and what became of the others."""
+    """Return how many queries of an entry have a fix, and the status of the others."""
     answered = scores["is_answered"].to_numpy(bool)
     rest = scores.loc[~answered, "status"].replace("ok", "withheld").value_counts()
     others = "".join(f", {count} {status}" for status, count in sorted(rest.items()))
@@ -482,7 +482,7 @@ def _leaderboards(
 
 
 def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
-    """What `board.json` says."""
+    """Return the content of `board.json`."""
     seed = seed_of(board.tasks)
     return {
         "scorer_version": SCORER_VERSION,

@@ -73,7 +73,7 @@ class Case:
 
     @property
     def error_m(self) -> float | None:
-        """How far the answer is from where the view was taken; None where either is not known."""
+        """Return the distance of the answer from the true place; None if either is unknown."""
         fix, true = self.fix, self.truth.pose
         if fix is None or true is None:
             return None
@@ -81,7 +81,7 @@ class Case:
 
 
 def said_of(case: Case) -> dict[str, float | str]:
-    """What is known of a case, as plain numbers and words; what is not known is left out.
+    """Return the known facts of a case as plain numbers and words.
 
     `error_m` is the distance from where the view was taken, also of absent places; `score_margin` the score of the
     first pose less that of the second; `p_false_<rejector>` (`order_<rejector>` where it is no probability) and
@@ -117,12 +117,12 @@ def _is_told(value: object) -> bool:
 
 
 def _plain(value: float | str) -> float | str:
-    """A number as JSON has it, with no more digits than tell something."""
+    """Return a number as JSON, rounded to meaningful digits."""
     return value if isinstance(value, str) else float(f"{float(value):.6g}")
 
 
 def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePicture:
-    """What the picture of a case shows.
+    """Read the map, evidence and poses that the picture of a case shows.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _disc(query: Query) -> tuple[float, float, float] | None:
 
 
 def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
-    """Row, column, rows and columns of the piece of the map that is drawn: square, but where the map ends."""
+    """Return row, column, rows and columns of the part of the map to draw, square unless the map ends."""
     side_m = max(case.query.evidence.size_m)
     poses = [pose for pose in (case.truth.pose, case.fix) if pose is not None]
     if not poses:
@@ -196,7 +196,7 @@ def _map_part(layers: NDArray[np.uint8], grid: Grid, manifest: Manifest) -> MapP
 
 
 def _seen_at(pose: Pose | None, case: Case, bits: LayerBits, grid: Grid, manifest: Manifest) -> Evidence | None:
-    """What the map shows at a place, of the classes that were looked for."""
+    """Return the map at a place, of the classes that were looked for."""
     if pose is None:
         return None
     view = case.query.evidence
@@ -215,7 +215,7 @@ def _title(case: Case) -> str:
 
 
 def _lines(case: Case) -> list[str]:
-    """What a picture says of an answer: what came of it, what rejectors say, what it told of itself."""
+    """Return the lines of a picture about an answer: result, rejectors, diagnostics."""
     said = said_of(case)
     lines = ["what is known of the answer", f"status: {said['status']}"]
     if case.error_m is not None:
@@ -240,7 +240,7 @@ def _lines(case: Case) -> list[str]:
 
 
 def _short(name: str) -> str:
-    """A name that does not reach into the map beside it."""
+    """Shorten a name so that it does not reach into the map next to it."""
     return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 3]}..."
 
 
@@ -249,7 +249,7 @@ def _alias(case: Case) -> str:
 
 
 def _right_candidate(case: Case) -> str:
-    """Where the right candidate stands in the answer."""
+    """Return the position of the right candidate in the answer."""
     candidates, right = case.query.candidates, case.truth.candidate
     if not 0 <= right < len(candidates):
         return f"none of {len(candidates)}"

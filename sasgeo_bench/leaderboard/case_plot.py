@@ -46,7 +46,7 @@ class MapPart:
 
 @dataclass(frozen=True, kw_only=True)
 class CasePicture:
-    """What the picture of a query shows.
+    """Content of the picture of one query.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _draw_map(chart: Axes, case: CasePicture) -> None:
 
 
 def _key(case: CasePicture) -> str:
-    """What is drawn on the map, in words."""
+    """Describe what is drawn on the map."""
     shown = [("true place solid" if case.is_present else "where it was taken solid", case.true is not None)]
     shown += [("answer dashed", bool(case.modes)), ("search dotted", case.disc is not None)]
     return ", ".join(name for name, is_there in shown if is_there)
@@ -178,7 +178,7 @@ def _outline(chart: Axes, pose: Pose, size_m: tuple[float, float], part: MapPart
 
 
 def _offset(chart: Axes, case: CasePicture, part: MapPart) -> None:
-    """A line between both places, with its length."""
+    """Draw a line between both places, with its length."""
     if case.true is None:
         return
     ends = np.array([_at(case.true, part), _at(case.modes[0][0], part)])

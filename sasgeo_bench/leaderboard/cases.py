@@ -127,7 +127,7 @@ def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None =
 
 
 def _accepted(scores: pd.DataFrame, judged: pd.DataFrame | None) -> tuple[Bools, Bools]:
-    """Which answers are accepted, and of which a threshold says so."""
+    """Return which answers are accepted, and for which a threshold exists."""
     answered = scores["is_answered"].to_numpy(bool)
     if judged is None:
         return answered, np.zeros(len(scores), dtype=bool)
@@ -148,7 +148,7 @@ def _controls(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def sample_cases(cases: pd.DataFrame, *, each: int, most: int = MOST_CASES) -> pd.DataFrame:
-    """A few failures of each class and matcher; which ones hangs on nothing but their names.
+    """Return a few failures of each class and matcher; the choice depends on their names only.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def _mark(matcher: str, query_id: str) -> str:
 
 
 def count_cases(cases: pd.DataFrame) -> dict[str, int]:
-    """How many failures of each class there are.
+    """Count the failures of each class.
 
     Examples
     --------

@@ -216,7 +216,7 @@ def _shares(view: Evidence) -> NDArray[np.float64]:
 
 
 def _terms(glance: Glance, poses: tuple[Pose, ...]) -> pd.DataFrame:
-    """Raster, graph, contradiction and their sum; an arm without a graph has the first alone."""
+    """Return raster, graph, contradiction and their sum; the first alone for a variant without a graph."""
     terms = glance.terms(poses, glance.verified(poses))
     classes = len(glance.reader.region.classes)
     raster, rest = terms[:, :classes].sum(axis=1), terms[:, classes:]

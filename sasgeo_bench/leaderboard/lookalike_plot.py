@@ -41,7 +41,7 @@ _NOTE_CHARS: Final = 100
 
 @dataclass(frozen=True, kw_only=True)
 class LookalikeSheet:
-    """What the picture shows.
+    """Content of the picture.
 
     Parameters
     ----------

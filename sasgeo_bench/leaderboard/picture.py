@@ -25,7 +25,7 @@ _DPI: Final = 100
 
 
 def pixels_of(figure: Figure) -> NDArray[np.uint8]:
-    """A figure as pixels, shape (rows, cols, 3), blue first."""
+    """Return a figure as pixels, shape (rows, cols, 3), blue first."""
     canvas: Any = FigureCanvasAgg(figure)  # without types
     canvas.draw()
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba(), dtype=np.uint8)[..., 2::-1])
@@ -88,7 +88,7 @@ def _encoded(kind: str, pixels: NDArray[np.uint8], settings: list[int]) -> bytes
 
 
 def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A region as a small picture, with its attribution below; pixels as of `pixels_of`.
+    """Return a region as a small picture with its attribution below; pixels as of `pixels_of`.
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ class PaperSpec(Document):
 
 
 class LearningSpec(Document):
-    """What matchers that have a `learn` learn from: queries of these suites, at most so many, on the other half.
+    """Queries that matchers with a `learn` are trained on: suites, number, on the other half.
 
     `oracles` learn from the half that they are asked on: yardsticks of what rates known in advance would be worth.
 
@@ -87,7 +87,7 @@ class LearningSpec(Document):
 
 
 class PipelineFile(NamedDocument):
-    """What a pipeline file says: suites on regions of a split, the paper's experiment, or both.
+    """A pipeline file: suites on regions of a split, the paper's experiment, or both.
 
     Examples
     --------
@@ -124,7 +124,7 @@ class PipelineFile(NamedDocument):
 
     @property
     def said(self) -> dict[str, str]:
-        """Which pipeline it is, as `board.json` says it."""
+        """Return the pipeline as `board.json` holds it."""
         return {"id": self.id, "sha256": self.sha256}
 
     @model_validator(mode="after")

@@ -167,7 +167,7 @@ def _curves(said: Mapping[str, Any], some: Answers, *, is_pooled: bool) -> Itera
 
 
 def _thinned(coverage: Floats) -> Ints:
-    """Which points of a curve are drawn: all of a few, else those nearest to even steps, the first and the last."""
+    """Return which points of a curve are drawn: all of a few, else those nearest to even steps, first and last."""
     if len(coverage) <= _MOST_POINTS:
         return np.arange(len(coverage))
     wanted = np.linspace(0.0, coverage[-1], _MOST_POINTS)
@@ -177,7 +177,7 @@ def _thinned(coverage: Floats) -> Ints:
 def reliability_frame(
     judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
 ) -> pd.DataFrame:
-    """How often answers are false, by how likely they were said to be; all suites of a track and prior group together.
+    """Return how often answers are false by stated chance, over all suites of a track and prior group.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def reliability_frame(
 def calibrated_parts(
     judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
 ) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
-    """What is judged by probabilities, track by track and prior group by prior group, and what each part is of."""
+    """Yield the answers with probabilities by track and prior group, with their keys."""
     for (matcher, rejector), frame in judged.items():
         if matcher in shown and (matcher, rejector) in calibrated:
             for (track, prior_group), part in frame.groupby(["track", "prior_group"], sort=True):
@@ -257,7 +257,7 @@ def _middles(values_m: Floats) -> Floats:
 
 
 def stanford_areas(told: ToldLevels, limit_m: float) -> dict[str, int]:
-    """How many queries are available, unavailable, misleading and hazardously misleading.
+    """Count queries that are available, unavailable, misleading and hazardously misleading.
 
     Misleading ones are those within the alert limit, so that the four add up.
 

@@ -116,7 +116,7 @@ def _draw_lines(
 
 
 def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
-    """How many queries each step has, at the foot of a panel."""
+    """Write the number of queries of each step at the foot of a panel."""
     for at, part in mine.groupby(column, sort=True):
         counts = sorted(set(part["n"]))
         text = f"n {counts[0]:g}" if len(counts) == 1 else f"n {counts[0]:g}-{counts[-1]:g}"
@@ -279,7 +279,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
 
 
 def _counts(mine: pd.DataFrame) -> str:
-    """How many queries and answers a panel has; of each line where they differ."""
+    """Return the number of queries and answers of a panel, of each line where they differ."""
     found = mine.drop_duplicates("rejector")[["n", "answered"]].drop_duplicates().to_numpy().tolist()
     return "; ".join(f"n {n}, {answered} answered" for n, answered in found)
 
@@ -340,7 +340,7 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
 
 
 def _bin_counts(mine: pd.DataFrame) -> str:
-    """How many answers there are, and in each bin."""
+    """Return the number of answers, in all and in each bin."""
     counts = mine["n"]
     return f"n {counts.sum():g}, {counts.min():g}-{counts.max():g} in each of {len(mine)} bins" if len(mine) else ""
 
@@ -413,7 +413,7 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_
 
 
 def _available(item: ToldLevels | None, limit_m: float) -> str:
-    """How many queries there are, and of how many there is a level that holds and can be flown with."""
+    """Return the number of queries, and of those with a level that holds and is available."""
     if item is None:
         return "tells none"
     total, count = len(item.level_m), stanford_areas(item, limit_m)["available"]

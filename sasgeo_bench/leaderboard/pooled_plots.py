@@ -78,7 +78,7 @@ def draw_ablation(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
 
 
 def _title(chart: Axes, name: str, counts: str) -> None:
-    """A panel's title: a name that is cut where it would run into the next panel, and how much it is of."""
+    """Return a panel's title: a name cut to the width of the panel, and its number of queries."""
     short = name if len(name) <= _LETTERS else f"{name[: _LETTERS - 3]}..."
     chart.set_title(f"{short}\n{counts}", fontsize=8, loc="left")
 
@@ -88,7 +88,7 @@ def _counts(row: pd.Series) -> str:
 
 
 def _suite_page(rows: pd.DataFrame, names: Sequence[str], *, title: str, note: str, below: str) -> Page:
-    """A page with a panel for each suite."""
+    """Draw a page with a panel for each suite."""
     first = rows.iloc[0]
     down, across = panels_across(rows["suite"].nunique())
     return Page(
@@ -318,7 +318,7 @@ _PRICES: Final = {
 
 
 def _left_out(rows: pd.DataFrame) -> str:
-    """Who has no point because nobody knows what its answers took."""
+    """Return the matchers without a point, because the cost of their answers is unknown."""
     lacking = [
         f"{label.partition(' ')[0]} of {', '.join(rows.loc[~np.isfinite(rows[name].to_numpy(float)), 'matcher'])}"
         for name, label in _PRICES.items()

@@ -63,12 +63,12 @@ def _alike(frames: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 
 
 def _is_able(frame: pd.DataFrame) -> bool:
-    """Whether there is a query, and the matcher's card does not say that it cannot."""
+    """Return whether there is a query that the matcher's card does not exclude."""
     return bool((frame["status"] != NOT_APPLICABLE).any())
 
 
 def _is_whole(first: pd.DataFrame) -> Bools:
-    """Which rows a panel of a suite is of: present places under stress, or all present ones of a suite without."""
+    """Return the rows of a suite's panel: present places under stress, or all present ones without stress."""
     present = first["is_present"].to_numpy(bool)
     stress = present & (first["role"] == STRESS).to_numpy(bool)
     return stress if stress.any() else present
@@ -127,7 +127,7 @@ def ablation_frame(scores: Scores, contrasts: Sequence[Contrast], shown: Sequenc
 
 
 def _pools(contrasts: Sequence[Contrast], scores: Scores) -> Iterator[Contrast]:
-    """A contrast for each pool, under the names of all that are over the same queries."""
+    """Yield a contrast for each pool of queries, under the names of all that share them."""
     means = [item for item in contrasts if item.metric == "primary"]
     names: dict[tuple[object, ...], list[Contrast]] = {}
     for item in means:
@@ -152,7 +152,7 @@ def recall_frame(
     truths: Mapping[str, Truth],
     shown: Sequence[str],
 ) -> pd.DataFrame:
-    """Recall@K: how often the right place is among the first K of an answer.
+    """Return recall@K: the share of answers with the right place among the first K.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ COSTS: Final = {"latency_p50": "latency_s", "latency_p95": "slow_s", "map_per_km
 
 
 def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd.DataFrame:
-    """What answers are worth beside what they take: a row for each matcher, on the queries that all of them were asked.
+    """Return accuracy against cost: a row for each matcher, on the queries that all of them were asked.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]
 
 
 def front_of(cost: Floats, value: Floats) -> Bools:
-    """Which of some methods no other one beats: none is both at least as cheap and at least as good, and better in one.
+    """Return the Pareto front: methods that no other one beats in cost and accuracy.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ _TASK: Final = ("suite", "region", "map_date")
 
 @dataclass(frozen=True, kw_only=True)
 class OnPrivate:
-    """What a private board says of the rows of a public one.
+    """Results of a private board for the rows of a public one.
 
     `seed` are commitment and bits, `rows` what `board.json` is to say of each entry, by name; a board that nobody held
     against a private one has neither.
@@ -37,7 +37,7 @@ class OnPrivate:
     rows: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def how(self, entry: Entry) -> str:
-        """How an entry's answers came, and what became of them on the private seed."""
+        """Return how an entry's answers were made, and how they fared on the private seed."""
         return str(self.rows[entry.name]["verdict"]) if entry.name in self.rows else entry.how
 
 
@@ -146,7 +146,7 @@ def hold_private(
 
 
 def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
-    """What `board.json` says of a private board that rows of a pipeline can be held against.
+    """Read the `board.json` of a private board that rows of a pipeline are compared with.
 
     Raises
     ------
@@ -186,12 +186,12 @@ def _is_of(scores: pd.DataFrame, named: set[tuple[str, ...]]) -> "pd.Series[bool
 
 
 def _whose(name: str, said: Mapping[str, Any]) -> tuple[str, ...]:
-    """Name, version, and hash of code and settings: who is the same on both boards."""
+    """Return name, version, and hash of code and settings, which identify an entry on both boards."""
     return (name_alone(name), *(str(said.get(item)) for item in _WHOSE))
 
 
 def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
-    """Why a private board vouches for nobody's row, or not for this one; empty where it can."""
+    """Return why a private board vouches for nobody's row, or not for this one; empty where it can."""
     if seed["bits"] < REPRODUCING_BITS:
         return f"the private seed has {seed['bits']} bits, {REPRODUCING_BITS} are needed"
     if entry is None:
@@ -203,7 +203,7 @@ def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
 
 
 def kept_private(about: Mapping[str, Any], entries: Sequence[Entry], root: Path) -> OnPrivate:
-    """What stored results say of a private seed, for entries whose answers all come from them.
+    """Return what stored results keep of a private seed, for entries whose answers all come from them.
 
     Parameters
     ----------

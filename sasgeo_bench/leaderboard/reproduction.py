@@ -55,7 +55,7 @@ class SeedFigure(SeedSaid):
 
     @property
     def is_decided(self) -> bool:
-        """Whether there are blocks enough to say anything."""
+        """Return whether there are enough blocks to decide."""
         return min(self.blocks_public, self.blocks_private) >= LEAST_BLOCKS
 
     def to_text(self) -> str:
@@ -177,7 +177,7 @@ def _seed(pair: _Pair) -> int:
 
 
 def verdict_of(figures: Sequence[SeedFigure]) -> tuple[str, str]:
-    """What a row says of itself by its figures on both seeds, and why.
+    """Return the label of a row by its figures on both seeds, and the reason.
 
     Parameters
     ----------
@@ -209,12 +209,12 @@ def verdict_of(figures: Sequence[SeedFigure]) -> tuple[str, str]:
 
 
 def said_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[str, Any]:
-    """What `board.json` says of one matcher on both seeds."""
+    """Return the entry of `board.json` on both seeds of one matcher."""
     return {"verdict": verdict, "why": why, "figures": [item.model_dump() for item in figures]}
 
 
 def seed_lines(about: Mapping[str, Any]) -> list[str]:
-    """Whether the rows of a board were held against a private seed, and what came of each.
+    """Return whether the rows of a board were compared with a private seed, and the result of each.
 
     Examples
     --------

@@ -68,13 +68,13 @@ class RunCases:
 
 
 def root_of(run: Path, out: Path) -> Path:
-    """Where tasks, truths and regions of a run lie: beside its runs/, else where it is said."""
+    """Return the folder of tasks, truths and regions of a run: next to its runs/, unless given."""
     above = (folder.parent for folder in run.resolve().parents if folder.name == "runs")
     return next((root for root in above if (root / "tasks").is_dir()), out)
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder is a run, or holds those of a matcher.
+    """Return whether a folder is a run, or holds those of a matcher.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def _judged(
     split: Split | None,
     rejectors: Sequence[str],
 ) -> dict[tuple[str, str], pd.DataFrame]:
-    """What the matcher's own word and some rejectors say, where they can say something."""
+    """Return the results of the matcher's own confidence and of some rejectors, where they apply."""
     usable = scores[~is_control(scores)].reset_index(drop=True)
     is_taught = any(LearnedSaid.of(about) is not None for about in entry.runs)
     found = {OWN: own_word(usable, split, is_taught=is_taught)}

@@ -100,7 +100,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """What one cell shows; `key` is what it sorts by where that is not its text."""
+    """Text of one cell; `key` is its sort key where that is not its text."""
 
     text: str
     key: float | None = None
@@ -179,7 +179,7 @@ def text_cells(*texts: str) -> tuple[Cell, ...]:
 
 
 def plain_cell(value: object) -> Cell:
-    """A cell of a text or a whole number; "-" where there is none.
+    """Return a cell of a text or a whole number; "-" where there is none.
 
     Examples
     --------
@@ -191,7 +191,7 @@ def plain_cell(value: object) -> Cell:
 
 
 def number_cell(value: float, unit: str = "") -> Cell:
-    """A cell of one number, with its unit if it has one.
+    """Return a cell of one number, with its unit if it has one.
 
     Examples
     --------
@@ -204,7 +204,7 @@ def number_cell(value: float, unit: str = "") -> Cell:
 
 
 def figure_cell(row: Record | None, *, has_bar: bool = False) -> Cell:
-    """A cell of a figure with its interval, drawn or not; "-" for none, in words where the matcher cannot."""
+    """Return a cell of a figure with its interval; "-" for none, in words where the matcher cannot."""
     if row is None:
         return Cell(text="-")
     if not row["is_applicable"]:
@@ -215,7 +215,7 @@ def figure_cell(row: Record | None, *, has_bar: bool = False) -> Cell:
 
 
 def rank_cell(row: Record, *, ranked: int, mark: Mark | None = None) -> Cell:
-    """A cell of a rank interval, drawn as the part of all ranks that it covers; not where one matcher alone is ranked.
+    """Return a cell of a rank interval, with a bar of the ranks it covers unless one matcher alone is ranked.
 
     Examples
     --------

@@ -34,7 +34,7 @@ _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
 
 def warnings_of(board: pd.DataFrame) -> list[str]:
-    """What a reader must know before reading on."""
+    """Return what a reader must know before reading on."""
     said = []
     if len(board):
         blocks, places = int(board["blocks"].max()), int(board["places"].max())
@@ -53,7 +53,7 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
 
 
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
-    """Whether the controls of a board held, failures one by one.
+    """Return whether the controls of a board held, failures one by one.
 
     Examples
     --------
@@ -69,7 +69,7 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def training_lines(about: Mapping[str, Any]) -> list[str]:
-    """Whose rows are set apart, and who of a board has learnt from which places.
+    """Return which rows are set apart, and which entries were trained on which places.
 
     Examples
     --------

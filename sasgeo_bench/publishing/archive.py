@@ -38,7 +38,7 @@ from sasgeo_bench.tasks.task_files import read_ids
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stored:
-    """What came of storing a board."""
+    """Result of storing a board."""
 
     folder: Path
     packed: Packed
@@ -131,7 +131,7 @@ def _settings_of(request: ScoreRequest) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How results were scored that are stored; without any, how anything is."""
+    """Settings that stored results were scored with; the defaults without any."""
 
     split: str | None = None
     rejectors: Sequence[str] = ()
@@ -142,7 +142,7 @@ class Settings:
 
 
 def stored_settings(predictions: Sequence[Path]) -> Settings:
-    """How the stored results among some predictions were scored.
+    """Read the settings of the stored results among some predictions.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def request_of(
     folders: Sequence[Path] = (),
     rejectors: Sequence[str] = (),
 ) -> ScoreRequest:
-    """What is asked of a board, set as the stored results among its predictions were; as ever where there are none.
+    """Return the request for a board, with the settings of stored results among its predictions, if any.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def request_of(
 
 
 def _failed_before(stored: Path | None) -> dict[str, str]:
-    """Who failed when stored results were made: contrasts may name them, and they hold no answer of theirs."""
+    """Return entries that failed when results were stored: contrasts may name them, and they hold no answer."""
     return dict(read_board(stored)[0].get("failed", {})) if stored is not None and (stored / BOARD).is_file() else {}
 
 

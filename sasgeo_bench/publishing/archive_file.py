@@ -60,7 +60,7 @@ _NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskFolders:
-    """Where a task, its truths and the map it is searched in lie; the map need not be there."""
+    """Folders of a task, its truths and its map; the map need not exist."""
 
     task: Path
     truth: Path
@@ -78,7 +78,7 @@ class StoredRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Packed:
-    """What was written: bytes in all, those of predictions and how many they are, and what was left out to be small."""
+    """Result of writing: bytes in all, bytes and number of predictions, and what was left out to be small."""
 
     total_bytes: int
     prediction_bytes: int
@@ -166,14 +166,14 @@ def write_pack(
 
 
 def _reason(error: OSError) -> str:
-    """Why something could not be written; of a folder that was copied the first file's reason is told for all."""
+    """Return why a file could not be written; for a copied folder the reason of its first file."""
     if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list) and error.args[0]:
         return one_line(str(error.args[0][0][-1]))
     return one_line(str(error.strerror or error))
 
 
 def _with(dropped: str, more: str) -> str:
-    """What was left out, and one thing more, each once."""
+    """Return what was left out with one more item, each once."""
     return _AND.join(dict.fromkeys(filter(None, (*dropped.split(_AND), more))))
 
 
@@ -252,7 +252,7 @@ def _numbered(table: pa.Table, number: int) -> pa.Table:
 
 
 def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
-    """What each run says, and what was learnt for it, each text once."""
+    """Write the record of each run and its training, each text once."""
     rows = []
     for name, listed in runs.items():
         for run in listed:
@@ -271,7 +271,7 @@ def _file_of(about: Mapping[str, Any]) -> str:
 
 
 def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
-    """A file for each contestant, its runs one after the other; how many bytes they are."""
+    """Write a file for each entry, its runs one after the other, and return the bytes."""
     place = folder / PREDICTIONS
     place.mkdir(exist_ok=True)
     for listed in runs.values():

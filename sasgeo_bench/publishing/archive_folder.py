@@ -41,7 +41,7 @@ _OLD_FILES: Final = (  # of results that list none
 
 
 def is_pack(folder: Path) -> bool:
-    """Whether a folder holds stored results.
+    """Return whether a folder holds stored results.
 
     Examples
     --------
@@ -52,7 +52,7 @@ def is_pack(folder: Path) -> bool:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """How stored results were scored.
+    """Read the settings that stored results were scored with.
 
     Raises
     ------

@@ -185,7 +185,7 @@ def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast,
 
 
 def _spots() -> dict[str, Spot]:
-    """Where the shipped regions lie."""
+    """Return the places of the shipped regions."""
     found = {}
     for name, path in list_region_files().items():
         spec = read_region_file(path)

@@ -71,7 +71,7 @@ FEATURE_TEXTS: Final = {
 
 
 def shown(texts: dict[str, str]) -> str:
-    """A table of columns in Markdown.
+    """Return a table of columns in Markdown.
 
     Examples
     --------

@@ -94,7 +94,7 @@ def write_croissant(folder: Path, release: Release) -> None:
 
 
 def cite_as(release: Release) -> str:
-    """How a release is cited, as BibTeX."""
+    """Return the citation of a release as BibTeX."""
     year = release.published[:4]
     return (
         f"@misc{{sasgeo_bench_{year}, title = {{sasgeo-bench, dataset release {release.version}}}, "

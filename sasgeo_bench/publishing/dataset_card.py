@@ -43,7 +43,7 @@ def card_text(release: Release) -> str:
 
 
 def _head(release: Release) -> Iterator[str]:
-    """YAML for the Hub and for `datasets.load_dataset(folder, configuration)`."""
+    """Yield YAML for the Hub and for `datasets.load_dataset(folder, configuration)`."""
     size = next((name for most, name in _SIZES if release.queries < most), "n>1M")
     yield "license: odbl"
     yield "pretty_name: sasgeo-bench"

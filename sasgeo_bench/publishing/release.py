@@ -49,7 +49,7 @@ _EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseRequest:
-    """What a user asks for.
+    """A request for a release.
 
     Parameters
     ----------

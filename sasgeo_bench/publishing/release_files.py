@@ -99,7 +99,7 @@ class ReleaseTask:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all its queries are of one part, so that its file is released as it is."""
+        """Return whether all its queries are of one part, so that its file is released as it is."""
         return len(self.parts) == 1
 
     def file_of(self, part: str, *, kind: str = "queries") -> str:
@@ -111,7 +111,7 @@ class ReleaseTask:
 
 @dataclass(frozen=True, kw_only=True)
 class Release:
-    """What is in a release, before and after it is written.
+    """Content of a release, before and after it is written.
 
     `published` is a day as in 2026-01-31, `url` where it will be found, `with_truth` whether all truths are in it;
     `files` says size and hash of each file of maps and tasks by its path, once they are copied.
@@ -129,7 +129,7 @@ class Release:
 
     @property
     def version(self) -> str:
-        """How maps are made, then how queries are: as in 1.1.0; not which regions there are."""
+        """Return the versions of data and tasks, as in 1.1.0; regions do not count."""
         return f"{DATA_VERSION}.{TASK_VERSION}.0"
 
     @property
@@ -139,7 +139,7 @@ class Release:
 
     @property
     def queries(self) -> int:
-        """How many queries there are in all."""
+        """Return the number of queries in all."""
         return sum(sum(task.parts.values()) for task in self.tasks)
 
     @property
@@ -161,7 +161,7 @@ class Release:
 
 
 def count_parts(task_folder: Path) -> dict[str, int]:
-    """How many queries of a task each part has; no view is read.
+    """Count the queries of each part of a task; no view is read.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def count_parts(task_folder: Path) -> dict[str, int]:
 
 
 def has_images(task_folder: Path) -> bool:
-    """Whether any query of a task holds an image, as the file's own counts say it."""
+    """Return whether any query of a task holds an image, by the counts of its file."""
     with open_table(task_folder / task_files.QUERIES, mend="make the queries again", is_whole=False) as source:
         metadata = source.metadata
     columns = [

@@ -138,7 +138,7 @@ def _environment() -> Environment:
 
 
 def _shown(value: object) -> object:
-    """What a page is given, without characters that a browser would not show or that turn the writing round."""
+    """Remove characters that a browser would not show or that reverse the direction of text."""
     return plain(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
@@ -163,7 +163,7 @@ def _verdicts(source: SiteSource) -> list[Verdict]:
 
 
 def _counts(source: SiteSource, book: Book) -> dict[str, int]:
-    """How much the board is of."""
+    """Count matchers, suites, queries, blocks and places of the board."""
     board, scores = source.board, source.scores
     queries = scores["query_id"].nunique() if "query_id" in scores else 0
     return {

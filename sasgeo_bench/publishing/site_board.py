@@ -90,7 +90,7 @@ def _headline(row: Record, verdict: str, outcome: str) -> str:
 
 
 def _sentence(row: Record, least: float) -> str:
-    """What was seen, with its interval, in words that say which way is good."""
+    """Return the difference with its interval, in words that say which way is good."""
     if not int(row["n"]):
         return "No query of this board counts for it."
     difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
@@ -100,7 +100,7 @@ def _sentence(row: Record, least: float) -> str:
 
 
 def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
-    """How both sides fare without the stress, all suites together: the first row of a contrast."""
+    """Return how both sides fare without the stress, all suites together: the first row of a contrast."""
     mine = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
     return None if mine.empty else {str(name): value for name, value in mine.iloc[0].items()}
 
@@ -146,7 +146,7 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
 
 
 def places_of(contrast: Contrast, scores: pd.DataFrame, n: int) -> int:
-    """How many places the queries of a contrast are from; 0 where the scored rows are not those that were tested."""
+    """Count the places of a contrast's queries; 0 if the scored rows are not those that were tested."""
     if not len(scores) or "matcher" not in scores:
         return 0
     whose = [side.partition(" x ")[0] for side in (contrast.first, contrast.second)]

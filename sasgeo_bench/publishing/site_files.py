@@ -83,7 +83,7 @@ class Drawn:
 
 @dataclass(frozen=True, kw_only=True)
 class BoardFiles:
-    """What a board's folder holds for a site.
+    """Files of a board's folder that a site shows.
 
     `tables` are contrasts, controls, scores and protection, empty where there is none; `figures` by file name;
     `downloads` the bytes to be offered, by file name, with what each is; `pictures` what `pictures.json` says;
@@ -172,7 +172,7 @@ def _read_figures(folder: Path) -> dict[str, Drawn]:
 
 
 def _figure_of(path: Path, data: bytes) -> Drawn:
-    """A figure that draws and does nothing else: a page leads to it."""
+    """Return a figure whose SVG only draws; pages link to it."""
     try:
         text = data.decode()
         fault = svg_fault(text)
@@ -197,7 +197,7 @@ def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
 
 
 def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """What `pictures.json` says of regions, suites and cases, every file of it held against the folder."""
+    """Read regions, suites and cases of `pictures.json`, and check each file against the folder."""
     said = folder / f"{PICTURES}.json"
     if not said.is_file():
         return {}
@@ -231,7 +231,7 @@ def _check_picture(folder: Path, name: str) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Written:
-    """What was written: the folder, its bytes without pictures and those of pictures, and how many pages."""
+    """Result of writing a site: folder, bytes without and of pictures, number of pages."""
 
     folder: Path
     site_bytes: int

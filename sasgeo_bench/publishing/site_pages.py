@@ -91,7 +91,7 @@ class SuitePage:
 
 
 def suites_of(source: SiteSource, book: Book) -> tuple[SuitePage, ...]:
-    """A page for each suite on the board."""
+    """Return a page for each suite on the board."""
     return tuple(_suite(name, page, source, book) for name, page in book.suite_pages.items())
 
 
@@ -134,7 +134,7 @@ class MatcherPage:
 
 
 def matchers_of(source: SiteSource, book: Book) -> tuple[MatcherPage, ...]:
-    """A page for each contestant of the board."""
+    """Return a page for each entry of the board."""
     return tuple(_matcher(name, book, source.board) for name in book.matcher_pages)
 
 
@@ -158,7 +158,7 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
 
 
 def _trained(said: object) -> str:
-    """What a card says of places that taught its method: "none", some, or some for each half."""
+    """Return the training places that a card names: "none", some, or some for each half."""
     if isinstance(said, Mapping):
         return "; ".join(f"half {half}: {_trained(places)}" for half, places in said.items())
     places = [] if isinstance(said, str) or not isinstance(said, Sequence) else list(map(str, said))
@@ -166,7 +166,7 @@ def _trained(said: object) -> str:
 
 
 def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
-    """What the runner taught a contestant, and where it was asked so: regions, for tasks are hundreds."""
+    """Yield the training of an entry by the runner, and the regions it was asked on so: tasks are hundreds."""
     for one in entry.get("learned") or ():
         verb = "Learnt" if one["file"] else "Could not learn"
         regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
@@ -177,7 +177,7 @@ def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _cannot(book: Book, name: str, card: Mapping[str, Any]) -> Iterator[str]:
-    """What a contestant says that it cannot, and what the board shows of it."""
+    """Yield the limits that an entry states, and those that the board shows."""
     if card.get("limits"):
         yield str(card["limits"])
     if card.get("needs"):
@@ -229,7 +229,7 @@ def _results_table(book: Book, name: str, group: tuple[str, str], keys: Sequence
 
 
 def _costs_of(book: Book, name: str) -> Iterator[tuple[str, str, str]]:
-    """What answers cost: figure, its value with its unit, what it means."""
+    """Yield the costs of answers: metric, value with unit, meaning."""
     for key, row in book.figures.items():
         suite, track, _, matcher, _, metric = key
         if suite == ALL_SUITES and matcher == name and metric in SHOWN_COSTS:
@@ -241,7 +241,7 @@ def _costs_of(book: Book, name: str) -> Iterator[tuple[str, str, str]]:
 
 
 def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
-    """How protection levels fared, a table for each prior group; of one alert limit, for three fill a page thrice."""
+    """Return how protection levels fared at one alert limit, a table for each prior group."""
     if not len(protection):
         return ()
     limits = sorted(set(protection["alert_limit_m"]))

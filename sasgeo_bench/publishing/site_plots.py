@@ -135,5 +135,5 @@ def _draw_rate(chart: Axes, rate: Estimate, at: float, number: int) -> None:
 
 
 def _within(per_year: float) -> float:
-    """A rate in per cent, where the axis can show it."""
+    """Return a rate in per cent, clipped to the axis."""
     return float(np.clip(100 * per_year, *_RATES))

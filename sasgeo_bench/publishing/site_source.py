@@ -50,7 +50,7 @@ class Case:
     said: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> dict[str, str]:
-        """What is said of it, for a page: a line for each rejector, and no protection levels, which are a dozen.
+        """Return the facts of a case for a page: a line for each rejector, without protection levels.
 
         Examples
         --------
@@ -72,7 +72,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """What a board's folder holds in `pictures/`; none of anything where there is none."""
+    """Pictures in a board's folder `pictures/`; empty if there is none."""
 
     regions: tuple[Picture, ...] = ()
     suites: tuple[Picture, ...] = ()
@@ -81,7 +81,7 @@ class Pictures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spot:
-    """Where a region lies, as its shipped file says."""
+    """Place of a region, from its shipped file."""
 
     region: str
     title: str

@@ -33,7 +33,7 @@ FOLDER: Final = Path("submissions")  # where they lie, unless said otherwise
 
 @dataclass(frozen=True, kw_only=True)
 class SubmitRequest:
-    """What is to be submitted.
+    """A request for a submission.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> Non
 
 
 def _hint(unknown: str, split: Split | None) -> str:
-    """What was meant by a place that the split does not know."""
+    """Suggest the place that was meant by one that the split does not know."""
     if split is None:
         return "and this board has no split"
     home = split.places_in(unknown)
@@ -178,7 +178,7 @@ def _runs_in(predictions: Path) -> Iterator[Mapping[str, Any]]:
 
 
 def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> None:
-    """What the runner has taught a matcher must stand on the card, for the half it was asked about."""
+    """Check that the card states the runner's training, for the half it was asked about."""
     said = about.get("learned")
     taught = said.get("trained_on", ()) if isinstance(said, dict) else ()
     region = str(about["region"]).split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
@@ -234,7 +234,7 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
 
 
 def _remarks(said: Submission) -> Iterator[str]:
-    """What an author should know before anyone else does."""
+    """Yield what an author should know before anyone else does."""
     queries, answered = (sum(getattr(task, name) for task in said.tasks) for name in ("queries", "answered"))
     yield f"{said.card.name}: {answered} of {counted(queries, 'query', 'queries')} of the board {said.board} have a row"
     if answered < queries:
@@ -307,7 +307,7 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
 
 
 def _board_said(folder: Path, board: str) -> str:
-    """Which board a submission is for; of one that cannot be read the board that is made, which says that it failed."""
+    """Read the board that a submission is for; an unreadable one becomes the board that says that it failed."""
     try:
         return read_submission(folder).board
     except (StoreError, ConfigError):

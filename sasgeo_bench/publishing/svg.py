@@ -23,7 +23,7 @@ _WITHIN: Final = re.compile(r"#|data:image/(png|jpeg|webp);base64,")
 
 
 def svg_fault(text: str) -> str | None:
-    """What an SVG holds that a figure has no need of: scripts, handlers of events, links to elsewhere; None if nothing.
+    """Return what an SVG holds that a figure does not need: scripts, event handlers, links; None if nothing.
 
     Raises
     ------

@@ -44,7 +44,7 @@ _STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def _page(path: Path, width: float, height: float, title: str, note: str, data: str) -> Iterator[Figure]:
-    """A figure with its title above, a note and where its data are from below; written when the block ends."""
+    """Yield a figure with a title above and a note and sources below; it is written when the block ends."""
     with mpl.rc_context(_STYLE):
         figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
@@ -58,7 +58,7 @@ def _page(path: Path, width: float, height: float, title: str, note: str, data: 
 
 
 def _wrapped(title: str) -> str:
-    """A variant's name in two lines where it is long."""
+    """Return a variant's name, in two lines where it is long."""
     first, _, rest = title.partition(" + ")
     return f"{first}\n+ {rest}" if rest and len(title) > 18 else title  # noqa: PLR2004 - letters over a panel
 

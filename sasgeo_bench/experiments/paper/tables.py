@@ -68,7 +68,7 @@ def in_order(matchers: Sequence[str]) -> list[str]:
 
 
 def title_of(matcher: str) -> str:
-    """A variant's name in the paper's table; any other matcher's own."""
+    """Return a variant's name in the paper's table, or any other matcher's own."""
     return next((item.title for item in PUBLISHED if item.matcher == matcher), matcher)
 
 
@@ -191,7 +191,7 @@ def summary_frame(trials: pd.DataFrame, board: pd.DataFrame) -> pd.DataFrame:
 
 
 def _said(paper: Published | None, metric: str) -> dict[str, float]:
-    """What the paper says of one figure; it gives an interval of Recall@1 alone."""
+    """Return the paper's figure; it gives an interval of Recall@1 alone."""
     if paper is None:
         return {"paper": math.nan, "paper_lo": math.nan, "paper_hi": math.nan, "paper_n": 0}
     lo, hi = (paper.lo, paper.hi) if metric == "recall_1" else (math.nan, math.nan)
@@ -213,7 +213,7 @@ def used_interval(row: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def robustness_frame(trials: pd.DataFrame) -> pd.DataFrame:
-    """Recall@1 of each matcher in quarters of the range of map-change probability, with Wilson's interval.
+    """Return Recall@1 of each matcher in quarters of map-change probability, with Wilson's interval.
 
     Returns
     -------
@@ -275,7 +275,7 @@ def example_of(truths: Sequence[Truth]) -> Truth:
     middle = {"occlusion_share": 0.24 / 2, "change_probability": CHANGE_EDGES[-1] / 2}
 
     def away(item: Truth) -> float:
-        """How far from the middle, in ranges."""
+        """Return the distance from the middle, in ranges."""
         return sum(abs(item.measured[name] / (2 * value) - 0.5) for name, value in middle.items())
 
     return min(turned or truths, key=lambda item: (away(item), item.query_id))

@@ -151,7 +151,7 @@ def region_name(seed: int) -> str:
 
 
 def _spec(seed: int) -> RegionFile:
-    """Where the mosaic lies, as a region file would say it."""
+    """Return the place of the mosaic as a region specification."""
     grid = mosaic_grid()
     west_m, south_m, east_m, north_m = grid.bounds_m
     to_lonlat = pyproj.Transformer.from_crs(EPSG, 4326, always_xy=True)
@@ -184,7 +184,7 @@ def _generated(seed: int, seeds: Seeds) -> Reading:
 
 
 def _about(region: Region) -> dict[str, Any]:
-    """What `task.json` says of how the queries came to be; nothing of where they lie."""
+    """Return the `task.json` of the queries, without their places."""
     return {
         "suite": SUITE,
         "suite_version": VERSION,
@@ -278,7 +278,7 @@ def _density(view: View) -> float:
 
 
 def _measured(done: Transformation, view: View) -> dict[str, float]:
-    """What was done and what came of it."""
+    """Return what was done to a view and what it caused."""
     return {
         "rotation_deg": done.rotation_deg,
         "scale": done.scale,

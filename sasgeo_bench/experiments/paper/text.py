@@ -52,7 +52,7 @@ def _table(table: pd.DataFrame) -> Iterator[str]:
 
 
 def _interval_note(summary: pd.DataFrame) -> str:
-    """What the intervals are, and what they do not say."""
+    """Explain the intervals and their limits."""
     first = summary.iloc[0]
     if first["cluster"] == "tile":
         return (
@@ -68,7 +68,7 @@ def _interval_note(summary: pd.DataFrame) -> str:
 
 
 def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
-    """A matcher a line: each figure of the paper's and ours; of Recall@1 the other interval too."""
+    """Return a matcher a line: each figure of the paper and ours; of Recall@1 the other interval too."""
     rows = []
     for matcher in matchers:
         mine = _by_metric(summary, matcher)
@@ -93,7 +93,7 @@ def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]
 
 
 def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
-    """A figure as the paper prints it.
+    """Return a figure as the paper prints it.
 
     Examples
     --------
@@ -106,7 +106,7 @@ def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
 
 
 def difference_lines(summary: pd.DataFrame) -> Iterator[str]:
-    """A line for each of the paper's variants: how far each figure is from the paper's, and where that lies."""
+    """Yield a line for each of the paper's variants: the distance of each figure from the paper's."""
     for item in PUBLISHED:
         mine = _by_metric(summary, item.matcher)
         if mine:

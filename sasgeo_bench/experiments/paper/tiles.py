@@ -145,7 +145,7 @@ def _turned(points: list[Point] | Line, heading: float) -> Line:
 
 
 def _crossing(sketch: Sketch, heading: float, offset_m: float, sway_m: float) -> Line:
-    """A bent line from edge to edge of the tile."""
+    """Return a bent line from edge to edge of the tile."""
     across = offset_m + sketch.rng.uniform(-sway_m, sway_m, 4)
     along = np.linspace(-_BEYOND, _BEYOND, 4)
     return curve(_turned(np.column_stack((across, along)), heading).tolist())
@@ -165,7 +165,7 @@ def _pieces(shape: shapely.Geometry) -> list[Line]:
 
 
 def _main_roads(sketch: Sketch, heading: float) -> list[Line]:
-    """A main road through the middle part; in one tile of three another one across it."""
+    """Return a main road through the middle part; in one tile of three another one across it."""
     rng = sketch.rng
     lines = [_crossing(sketch, heading, float(rng.uniform(-45, 45)), 14.0)]
     if rng.random() < 1 / 3:
@@ -177,7 +177,7 @@ def _main_roads(sketch: Sketch, heading: float) -> list[Line]:
 
 
 def _water(sketch: Sketch, heading: float, main: list[Line]) -> shapely.Geometry:
-    """A river along the valley or, in every other tile, some ponds; nothing is built there."""
+    """Return a river along the valley or, in every other tile, some ponds; nothing is built there."""
     rng = sketch.rng
     shapes: list[shapely.Geometry] = []
     ponds = int(rng.integers(0, 2))
@@ -203,7 +203,7 @@ def _water(sketch: Sketch, heading: float, main: list[Line]) -> shapely.Geometry
 
 
 def _streets(sketch: Sketch, heading: float, village: shapely.Geometry, wet: shapely.Geometry) -> list[Line]:
-    """A loose net of streets in the village, some pieces missing, and a lane or two out into the fields."""
+    """Return a loose net of streets in the village, some pieces missing, and a lane or two into the fields."""
     rng = sketch.rng
     net_heading = heading + float(rng.uniform(-0.15, 0.15))
     ground = shapely.difference(shapely.intersection(village, sketch.square), wet.buffer(6))

@@ -35,7 +35,7 @@ _LONGEST: Final = 2.0  # sides of an occluding rectangle at most
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transformation:
-    """What is done to the view of one trial; with the values given here, nothing.
+    """Changes to the view of one trial; with the default values, none.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def rectangle(shape: tuple[int, int], share: float, rng: np.random.Generator) ->
 
 
 def map_change(probability: float) -> Ageing:
-    """What makes the world another one than the map: things vanish, and as many new ones appear.
+    """Change the world against the map: things vanish, and as many new ones appear.
 
     Examples
     --------
@@ -148,7 +148,7 @@ def map_change(probability: float) -> Ageing:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What is seen in one trial: the evidence, the map at the same pose, and the world there before any is hidden.
+    """One trial: the evidence, the map at the same pose, and the world there before any is hidden.
 
     `occlusion_share` and `retained_share` are those of the cells that the rectangle covers and the crop leaves.
     """

@@ -66,7 +66,7 @@ class Windows:
         return np.array(found, dtype=np.int64)
 
     def meets(self, index: int, others: list[int]) -> NDArray[np.bool_]:
-        """Whether a window shares ground with each of some others."""
+        """Return whether a window overlaps each of some others."""
         apart_m = np.abs(self.points_m[others] - self.points_m[index]).max(axis=1)
         return np.asarray(apart_m < WINDOW_M)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which numbers and texts an answer may hold, the same for a plugin, a file, a submission and stored results."""
+"""Bounds of numbers and texts in an answer, the same for a plugin, a file, a submission and stored results."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -30,7 +30,7 @@ BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
 
 
 def is_line(text: str, most: int) -> bool:
-    """Whether a text is one line of printable characters, `most` of them at most; it may be empty.
+    """Return whether a text is one line of printable characters, at most `most` of them; it may be empty.
 
     Examples
     --------
@@ -41,35 +41,23 @@ def is_line(text: str, most: int) -> bool:
 
 
 def bounds_text(name: str) -> str:
-    """The bounds of a number, as an error says them.
-
-    Examples
-    --------
-    >>> bounds_text("scale"), bounds_text("confidence")
-    ('0.001..1000', '0..1')
-    """
+    """Format the bounds of a number for an error."""
     least, most = BOUNDS[name]
     return f"{least:g}..{most:g}"
 
 
 def one_line(text: str) -> str:
-    """Any text in one line of at most `MOST_MESSAGE` printable characters.
-
-    Examples
-    --------
-    >>> one_line(chr(10).join(("first", "  second")))
-    'first second'
-    """
+    """Return any text in one line of at most `MOST_MESSAGE` printable characters."""
     line = plain(" ".join(text.split()))
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 
-def told(error: BaseException) -> str:
-    """What kind of error it is and what it says, in one line; the kind alone where it cannot say anything.
+def message_of(error: BaseException) -> str:
+    """Return class and text of an error in one line; only the class if its text cannot be made.
 
     Examples
     --------
-    >>> told(ValueError("no index today"))
+    >>> message_of(ValueError("no index today"))
     'ValueError: no index today'
     """
     try:

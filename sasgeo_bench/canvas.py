@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one kind of figure that is drawn: its texts are data, and nothing in them is mathematics."""
+"""The one kind of figure: its texts are data, and nothing in them is mathematics."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from sasgeo_bench.texts import plain, plain_lines
 
 
 class PlainFigure(Figure):
-    r"""A figure that shows each text letter by letter, dollar signs among them, and writes no control characters.
+    r"""A figure that shows each text letter by letter, dollar signs included, and writes no control characters.
 
     Examples
     --------
@@ -23,7 +23,7 @@ class PlainFigure(Figure):
     """
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw it, after a look at every text that any part of it holds, ticks and legends among them."""
+        """Draw the figure with every text of it, ticks and legends included, as plain text."""
         for item in self.findobj(Text):
             if isinstance(item, Text):
                 item.set_parse_math(False)
@@ -31,7 +31,7 @@ class PlainFigure(Figure):
         super().draw(renderer)
 
     def savefig(self, fname: Any, **options: Any) -> None:  # noqa: ANN401 - as the figure's own
-        """Write it; what its metadata say is one line each."""
-        said = options.pop("metadata", None) or {}
-        kept = {name: plain(value) if isinstance(value, str) else value for name, value in said.items()}
+        """Write the figure; each entry of its metadata is one line."""
+        given = options.pop("metadata", None) or {}
+        kept = {name: plain(value) if isinstance(value, str) else value for name, value in given.items()}
         super().savefig(fname, metadata=kept, **options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TOML text into a frozen pydantic model, with every fault told in one line."""
+"""Parse TOML into a frozen pydantic model, with every fault on one line."""
 
 import difflib
 import json
@@ -20,14 +20,14 @@ _LONGEST: Final = 300
 
 
 def _printable(text: str) -> str:
-    """Refuse what could not be shown as one line of text: breaks, controls, marks that turn the writing round."""
+    """Refuse text that cannot be shown on one line: breaks, controls, bidirectional marks."""
     if not text.isprintable():
         message = "must be one line of printable characters"
         raise ValueError(message)
     return text
 
 
-def _said(text: str) -> str:
+def _not_blank(text: str) -> str:
     if not text.strip():
         message = "must be one line of printable characters"
         raise ValueError(message)
@@ -35,54 +35,30 @@ def _said(text: str) -> str:
 
 
 Prose = Annotated[str, Field(max_length=2000), AfterValidator(_printable)]  # which may be empty
-Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable), AfterValidator(_said)]
-Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_printable), AfterValidator(_said)]
+Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable), AfterValidator(_not_blank)]
+Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_printable), AfterValidator(_not_blank)]
 
 
 Kind = Literal["regions", "splits", "pipelines"]
 
 
 class Document(BaseModel):
-    """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion.
-
-    Examples
-    --------
-    >>> class Town(Document):
-    ...     seed: int
-    >>> parse_toml("seed = 3", Town, source="town.toml")
-    Town(seed=3)
-    """
+    """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 class NamedDocument(Document):
-    """Base of what ships as files that are named by their id."""
+    """Base of the models of shipped files, which are named by their id."""
 
     id: str
 
 
 def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
-    """Parse and validate one TOML document.
+    """Parse and validate one TOML document; `source` names it in an error.
 
-    Parameters
-    ----------
-    text : str
-        The TOML text.
-    model : type
-        A `Document`.
-    source : str
-        What to call the file in an error.
-
-    Returns
-    -------
-    Model
-        The validated document.
-
-    Raises
-    ------
-    ConfigError
-        If the text is no TOML, a key is unknown, a type is wrong or a value out of range; all faults on one line.
+    Raise `ConfigError`, with all faults on one line, if the text is no TOML, a key is unknown, a type is wrong or a
+    value out of range.
 
     Examples
     --------
@@ -102,20 +78,7 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
 
 
 def check_document(content: object, model: type[Model], *, source: str) -> Model:
-    """Hold what a file says, whatever its format, to a model.
-
-    Raises
-    ------
-    ConfigError
-        As `parse_toml` does; all faults on one line.
-
-    Examples
-    --------
-    >>> class Town(Document):
-    ...     seed: int
-    >>> check_document({"seed": 3}, Town, source="town.json")
-    Town(seed=3)
-    """
+    """Validate the content of a file, whatever its format; raise `ConfigError` as `parse_toml` does."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -125,10 +88,10 @@ def check_document(content: object, model: type[Model], *, source: str) -> Model
 
 
 def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic's own error record
-    """One pydantic error as a clause; unknown keys get the nearest known one."""
+    """Describe one pydantic error as a clause; suggest the nearest known key for an unknown one."""
     where = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        known = _keys_beside(item["loc"], model)
+        known = _known_keys(item["loc"], model)
         near = difflib.get_close_matches(str(item["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
         return f"unknown key {where!r}, {hint}"
@@ -141,13 +104,13 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
 
 
 def _short(value: object) -> str:
-    """A value as it is quoted: a table or text may be as long as the file."""
+    """Quote a value, cut to a bounded length: a table or text may be as long as the file."""
     text = repr(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
-    """The keys a model knows at the level where an unknown key was met."""
+def _known_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
+    """Return the keys that a model knows at the level of an unknown key."""
     current: Any = model
     for part in location[:-1]:
         if isinstance(part, int):
@@ -164,7 +127,7 @@ def _keys_beside(location: tuple[int | str, ...], model: type[BaseModel]) -> lis
 
 
 def _model_inside(annotation: Any) -> type[BaseModel] | None:  # noqa: ANN401 - any type annotation
-    """The model within `list[M]`, `M | None` or `M` itself."""
+    """Return the model within `list[M]`, `M | None` or `M` itself."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     inner = (_model_inside(part) for part in getattr(annotation, "__args__", ()))
@@ -172,26 +135,14 @@ def _model_inside(annotation: Any) -> type[BaseModel] | None:  # noqa: ANN401 - 
 
 
 def shipped_dir(kind: Kind) -> Path:
-    """Folder of the shipped files: inside an installed package, at the top of a checkout otherwise.
-
-    Examples
-    --------
-    >>> shipped_dir("regions").name
-    'regions'
-    """
+    """Return the folder of the shipped files: inside an installed package, at the top of a checkout otherwise."""
     package = Path(__file__).parent
     installed = package / "shipped" / kind
     return installed if installed.is_dir() else package.parent / kind
 
 
 def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
-    """Read a file of a kind that ships.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be read or a value in it is wrong; all faults on one line.
-    """
+    """Read a file of a kind that ships; raise `ConfigError`, with all faults on one line, if it is wrong."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark of its byte order
     except (OSError, UnicodeDecodeError) as error:
@@ -208,12 +159,9 @@ def _parsed(text: str, model: type[Model], source: str) -> Model:
 
 
 def list_documents(kind: Kind, model: type[NamedDocument], folders: Sequence[Path]) -> dict[str, Path]:
-    """Id -> file of a kind, of the given folders and those shipped.
+    """Return id -> file of a kind, from the given folders and the shipped ones.
 
-    Raises
-    ------
-    ConfigError
-        If a folder is missing, a file is wrong, or two files have one id.
+    Raise `ConfigError` if a folder is missing, a file is wrong, or two files have one id.
     """
     noun = kind.removesuffix("s")
     found: dict[str, Path] = {}
@@ -231,13 +179,7 @@ def list_documents(kind: Kind, model: type[NamedDocument], folders: Sequence[Pat
 
 
 def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[], dict[str, Path]]) -> Path:
-    """Find a file by its id, or take the path of one.
-
-    Raises
-    ------
-    ConfigError
-        If there is none; the line suggests the nearest id.
-    """
+    """Find a file by its id, or return the path of one; raise `ConfigError`, which suggests an id, if there is none."""
     if id_or_path.endswith(".toml"):
         path = Path(id_or_path)
         if not path.is_file():

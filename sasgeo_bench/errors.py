@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors users meet: every one is a `SasgeoError` and fits on one line that names the fault and the mend."""
+"""Errors of users: each is a `SasgeoError` on one line that names the cause and the fix."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,7 +10,7 @@ MOST_MESSAGE: Final = 2000  # characters
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """How many of something, as a line says it; the plural is `one` with an s unless it is given.
+    """Return a count with its noun; the plural is `one` with an s by default.
 
     Examples
     --------
@@ -21,7 +21,7 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 
 def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
-    """How many of something, and the first of them by name.
+    """Return a count with its noun, and the first few by name.
 
     Examples
     --------
@@ -33,27 +33,25 @@ def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
 
 
 class SasgeoError(Exception):
-    """Base of all errors that are the input's fault; the command line prints its text and exits with 2.
+    """Base of all errors caused by the input; the command line prints its text and exits with 2.
 
-    Its text is one printable line of a bounded length, also where it quotes a file or a library that says more.
+    Its text is one printable line of a bounded length, even if it quotes a file or a library.
 
     Examples
     --------
-    >>> issubclass(GridError, (SasgeoError, ValueError))
-    True
     >>> str(StoreError(f"a.json: line 1{chr(10)}line 2"))
     'a.json: line 1 line 2'
     """
 
     def __str__(self) -> str:
-        """The text on one line, cut in its middle: it begins with the fault and ends with the mend."""
+        """Return the text on one line, cut in its middle: keep the cause and the fix."""
         text = plain(" ".join(super().__str__().split()))
         half = MOST_MESSAGE // 2
         return text if len(text) <= MOST_MESSAGE else f"{text[: half - 5]} ... {text[-half:]}"
 
 
 class GridError(SasgeoError, ValueError):
-    """A grid, bounds or cell size that cannot be used."""
+    """Unusable grid, bounds or cell size."""
 
 
 class ShapeError(SasgeoError, ValueError):
@@ -61,7 +59,7 @@ class ShapeError(SasgeoError, ValueError):
 
 
 class PoseError(SasgeoError, ValueError):
-    """A pose, prior or increment with a value outside its range."""
+    """A pose or prior with a value outside its range."""
 
 
 class ConfigError(SasgeoError, ValueError):
@@ -69,7 +67,7 @@ class ConfigError(SasgeoError, ValueError):
 
 
 class ExtractError(SasgeoError, OSError):
-    """An OpenStreetMap file that is missing, damaged or not what its hash says."""
+    """An OpenStreetMap file that is missing, damaged or contradicts its hash."""
 
 
 class CoverageError(SasgeoError, ValueError):
@@ -77,16 +75,16 @@ class CoverageError(SasgeoError, ValueError):
 
 
 class StoreError(SasgeoError, OSError):
-    """A folder or file of ours that cannot be written, or is not what its manifest says."""
+    """A folder or file of ours that cannot be written, or contradicts its manifest."""
 
 
 class PerturbError(SasgeoError, ValueError):
-    """A perturbation with a strength out of range, or asked for what it must not do."""
+    """A perturbation with a strength out of range, or used where it must not be."""
 
 
 class MatchError(SasgeoError, ValueError):
-    """An answer, a card or a plugin that is not what the door asks for."""
+    """An answer, a card or a plugin that breaks its protocol."""
 
 
 class MetricError(SasgeoError, ValueError):
-    """Values, weights or a level that no figure can be computed from."""
+    """Values, weights or a level from which a metric cannot be computed."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same work for many things, by several processes."""
+"""Apply a function to many items in several processes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,26 +12,10 @@ Found = TypeVar("Found")
 
 
 def spread(work: Callable[[Item], Found], items: Sequence[Item], *, jobs: int = 1) -> Iterator[Found]:
-    """Do one thing for each of many, by several processes where there are several jobs and items.
+    """Yield `work(item)` for each item, in order, computed by several processes if there are several jobs and items.
 
-    Parameters
-    ----------
-    work : callable
-        What another process can import and name. In this process it is called as it is.
-    items : sequence
-        What it is done for; sent to the processes, as what is found is sent back.
-    jobs : int
-        Processes.
-
-    Yields
-    ------
-    object
-        What came of each item, in their order. The first error that is met is raised here.
-
-    Examples
-    --------
-    >>> list(spread(abs, [-1, 2]))
-    [1, 2]
+    Another process must be able to import `work`, and to receive items and send results. The first error is raised
+    here.
     """
     if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
         yield from map(work, items)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a long piece of work is: as a line now and then, or as whatever a terminal shows."""
+"""Show the progress of long work: as a line now and then, or as a terminal shows it."""
 
 import time
 from collections.abc import Callable
@@ -11,7 +11,7 @@ Tell = Callable[[str], None]
 
 
 class Progress(Protocol):
-    """Shows how far a piece of work is; called by one thread at a time."""
+    """Progress of a piece of work; called by one thread at a time."""
 
     def begin(self, label: str, total: int) -> None:
         """Begin a piece of work with so many items."""
@@ -37,19 +37,19 @@ class Lines:
         self._tell, self._every_s = tell, every_s
         self._begun: dict[str, tuple[float, int]] = {}
         self._done: dict[str, int] = {}
-        self._told = time.monotonic()
+        self._last_s = time.monotonic()
 
     def begin(self, label: str, total: int) -> None:
         """Begin to count."""
         self._begun[label], self._done[label] = (time.monotonic(), total), 0
 
     def advance(self, label: str, count: int) -> None:
-        """Print how far it is, how fast, and how long it will take, if the last line is old enough."""
+        """Print progress, speed and time left, if the last line is old enough."""
         now, (begun, total) = time.monotonic(), self._begun[label]
         self._done[label] += count
-        if now - self._told < self._every_s:
+        if now - self._last_s < self._every_s:
             return
-        self._told = now
+        self._last_s = now
         done = self._done[label]
         rate = done / max(now - begun, 1e-9)
         self._tell(f"{label}: {done} of {total}, {rate:.1f} a second, {(total - done) / rate:.0f} s left")

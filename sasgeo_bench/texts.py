@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text from outside as data: a function for each kind of file that it is written to, so that nothing there parses it.
+"""Escape untrusted text: one function for each format it is written to, so that nothing there interprets it.
 
-Figures, the terminal and pages have theirs where they are made: `canvas.py`, `cli/console.py`, `publishing/site.py`.
+Figures, the terminal and pages have their own: `canvas.py`, `cli/console.py`, `publishing/site.py`.
 """
 
 import json
@@ -38,7 +38,7 @@ _NO_GLYPH: Final = frozenset("«»ÐÞðþĄąĐđĘęĦħĮįĸĿŀŉŊŋŦŧŲ
 
 
 def plain(text: str) -> str:
-    r"""One line of printable characters: breaks become spaces, controls and marks that turn the writing round "?".
+    r"""Return one line of printable characters: breaks become spaces, controls and bidirectional marks "?".
 
     Examples
     --------
@@ -51,18 +51,12 @@ def plain(text: str) -> str:
 
 
 def plain_lines(text: str) -> str:
-    r"""Lines of printable characters; only a line feed ends one.
-
-    Examples
-    --------
-    >>> plain_lines("first\nsecond\x07")
-    'first\nsecond?'
-    """
+    """Return lines of printable characters; only a line feed ends a line."""
     return "\n".join(map(plain, text.split("\n")))
 
 
 def markdown(text: object) -> str:
-    r"""Text within a line or a table cell of Markdown, with nothing in it that is a mark there.
+    r"""Escape text within a line or a table cell of Markdown.
 
     Examples
     --------
@@ -74,7 +68,7 @@ def markdown(text: object) -> str:
 
 
 def markdown_item(text: object) -> str:
-    r"""Text of a list item of Markdown, which begins no other block there.
+    r"""Escape text of a list item of Markdown, so that it begins no other block there.
 
     Examples
     --------
@@ -88,7 +82,7 @@ def markdown_item(text: object) -> str:
 
 
 def markdown_code(name: str) -> str:
-    r"""A name as Markdown shows code; whatever is more than a name as `markdown` shows it.
+    r"""Format a name as Markdown code; escape anything else as `markdown` does.
 
     Examples
     --------
@@ -99,7 +93,7 @@ def markdown_code(name: str) -> str:
 
 
 def tex(text: object) -> str:
-    r"""Text as LaTeX sets it letter by letter; those that pdfTeX has no glyph of by number, for it stops at them.
+    r"""Escape text for LaTeX; letters without a glyph in pdfTeX become their code point, for it stops at them.
 
     Examples
     --------
@@ -107,8 +101,10 @@ def tex(text: object) -> str:
     '100 \\% of a\\_b, \\textbackslash{}input\\{x\\}'
     """
     letters = _LIGATURE.sub("\0", plain(str(text)))
-    said = "".join("{}" if letter == "\0" else _tex_letter(letter) for letter in letters)
-    return "{}" + said if said.startswith(("[", "*")) else said  # which belong to the end of the row before, else
+    escaped = "".join("{}" if letter == "\0" else _tex_letter(letter) for letter in letters)
+    return (
+        "{}" + escaped if escaped.startswith(("[", "*")) else escaped
+    )  # which belong to the end of the row before, else
 
 
 def _tex_letter(letter: str) -> str:
@@ -117,7 +113,7 @@ def _tex_letter(letter: str) -> str:
 
 
 def csv_cell(value: object) -> object:
-    """A cell that a spreadsheet takes for text where it is one: what would begin a formula gets an apostrophe.
+    """Return a cell that a spreadsheet reads as text: text that would begin a formula gets an apostrophe.
 
     Examples
     --------
@@ -132,7 +128,7 @@ def csv_cell(value: object) -> object:
 
 
 def quoted(text: str) -> str:
-    r"""Text in double quotes as TOML and YAML read them.
+    r"""Return text in double quotes as TOML and YAML read them.
 
     Examples
     --------
@@ -143,7 +139,7 @@ def quoted(text: str) -> str:
 
 
 def json_text(content: Any) -> str:  # noqa: ANN401 - whatever JSON can say
-    r"""A JSON document of printable characters and line feeds, with the same data.
+    r"""Return a JSON document of printable characters and line feeds, with the same data.
 
     Examples
     --------
@@ -157,5 +153,5 @@ def json_text(content: Any) -> str:  # noqa: ANN401 - whatever JSON can say
 
 
 def _json_letter(letter: str) -> str:
-    """An escape of JSON; half of a pair alone is no character, and readers refuse it."""
+    """Escape a letter for JSON; half of a surrogate pair becomes "?", since readers refuse it."""
     return "?" if "\ud800" <= letter <= "\udfff" else json.dumps(letter)[1:-1]

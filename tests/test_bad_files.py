@@ -14,7 +14,6 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.files import read_ageing
 from sasgeo_bench.ageing.measure import DTYPES
-from sasgeo_bench.ageing.ratebook_file import read_ratebook
 from sasgeo_bench.config import parse_toml, shipped_dir
 from sasgeo_bench.errors import MOST_MESSAGE, SasgeoError
 from sasgeo_bench.files.file_manifest import check_site
@@ -248,7 +246,6 @@ def read_states(file: str) -> Callable[[Path], object]:
     )
 
 
-SHIPPED_RATES = Path(str(resources.files("sasgeo_bench.ageing").joinpath("ratebook.toml")))
 PACK = [
     *("pack.json", "board.json", "tasks.parquet", "runs.parquet", "queries.parquet", "truths.parquet"),
     "predictions/mine-0123456789ab.parquet",
@@ -273,9 +270,6 @@ FORMATS = {
         file="card.toml",
         make=written("card.toml", example_card()),
         read=lambda folder: read_card(folder / "card.toml"),
-    ),
-    "ratebook.toml": Format(
-        file="ratebook.toml", make=copied(SHIPPED_RATES), read=lambda folder: read_ratebook(folder / "ratebook.toml")
     ),
     "learnt.json": Format(
         file="learnt.json",

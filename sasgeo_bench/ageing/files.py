@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ageing.parquet`, `ageing.md`, `ageing.svg`: what was measured of one place, and a table of several places."""
+"""Write `ageing.parquet`, `ageing.md`, `ageing.svg` of one place, and a table of several places."""
 
 import math
 import os
@@ -44,25 +44,7 @@ appeared."""
 
 
 def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
-    """Write table, text and plot into a folder; each file is replaced whole.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    ageing : Ageing
-        What was measured.
-
-    Returns
-    -------
-    tuple of Path
-        The files.
-
-    Raises
-    ------
-    StoreError
-        If the folder or a file cannot be written.
-    """
+    """Write table, text and plot into a folder, each replaced whole; raise `StoreError` if one cannot be written."""
     attrs = {
         "attribution": ATTRIBUTION,
         "licence": LICENCE,
@@ -79,13 +61,7 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
 
 
 def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
-    """Let a function write a scratch file beside the target, then put it in the target's place.
-
-    Raises
-    ------
-    StoreError
-        If the folder or the file cannot be written.
-    """
+    """Let `write` fill a scratch file, then move it to the target; raise `StoreError` if it cannot be written."""
     scratch = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -101,12 +77,7 @@ def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
 
 
 def read_ageing(folder: Path) -> Ageing:
-    """Read what `write_ageing` wrote.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds no `ageing.parquet`, or another one.
+    """Read the output of `write_ageing`; raise `StoreError` if there is none or it is damaged.
 
     Examples
     --------
@@ -132,7 +103,7 @@ def read_ageing(folder: Path) -> Ageing:
 
 
 def ageing_text(ageing: Ageing) -> str:
-    """Markdown of one place: rates, then every pair of dates, class by class."""
+    """Format one place as Markdown: rates, then every pair of dates, class by class."""
     table = ageing.table
     rates = _rate_table(table, by="class")
     spans = table[table["span"] != "pooled"]
@@ -152,17 +123,9 @@ def ageing_text(ageing: Ageing) -> str:
 
 
 def summary_text(places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> str:
-    """Markdown of several places: the rates of each class beside each other, then what controls found.
+    """Format several places as Markdown: the rates of each class, then the result of controls.
 
-    Raises
-    ------
-    ConfigError
-        If two places have one name.
-
-    Examples
-    --------
-    >>> summary_text([]).splitlines()[0]
-    '# How maps aged'
+    Raise `ConfigError` if two places have one name.
     """
     check_names((*places, *controls))
     rows = [_place_cells(place) for place in (*places, *controls)]
@@ -179,17 +142,7 @@ def summary_text(places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> s
 
 
 def check_names(places: Sequence[Ageing]) -> None:
-    """Refuse two tables of one place.
-
-    Raises
-    ------
-    ConfigError
-        If two places have one name.
-
-    Examples
-    --------
-    >>> check_names([])
-    """
+    """Raise `ConfigError` if two places have one name."""
     twice = [name for name, count in Counter(place.place for place in places).items() if count > 1]
     if twice:
         message = f"two tables are of {twice[0]!r}: measure one of them with another --place"
@@ -202,13 +155,13 @@ def _together(places: Sequence[Ageing]) -> pd.DataFrame:
 
 
 def _classes_of(table: pd.DataFrame) -> list[str]:
-    """Names in a table, in the order of their ids."""
+    """Return the class names in a table, in the order of their ids."""
     found = set(table["class"])
     return [name for name in load_taxonomy().names if name in found]
 
 
 def _control_table(controls: Sequence[Ageing]) -> str:
-    """A row for each class, a column for each control."""
+    """Format a row for each class, a column for each control."""
     tables = {control.place: control.table.set_index(["span", "class"]) for control in controls}
     lines = [
         [name, *(_control_cell(table, name) for table in tables.values())] for name in _classes_of(_together(controls))
@@ -222,15 +175,7 @@ def _control_cell(table: pd.DataFrame, name: str) -> str:
 
 
 def write_summary(path: Path, places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> Path:
-    """Write `summary_text` into a file, replaced whole.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be written.
-    ConfigError
-        If two places have one name.
-    """
+    """Write `summary_text` into a file, replaced whole; raise `StoreError` if it cannot be written."""
     text = summary_text(places, controls)
     return replace_file(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
 
@@ -258,7 +203,7 @@ _RATE_HEAD: Final = (
 
 
 def _rate_table(table: pd.DataFrame, *, by: str) -> str:
-    """A row for each class (or place): pooled rates, then shares of the first map against the last."""
+    """Format a row for each class (or place): pooled rates, then shares of the first map against the last."""
     lines = []
     pooled, whole = (table[table["span"] == span].set_index(by) for span in ("pooled", "whole"))
     for name in pooled.index:
@@ -315,7 +260,7 @@ def _percent(share: float) -> str:
 
 
 def _rate(row: pd.Series, name: str) -> str:
-    """`0.30 (0.25 to 0.36)`, in percent."""
+    """Format `0.30 (0.25 to 0.36)`, in percent."""
     value, lo, hi = (100 * row[f"{name}{end}"] for end in ("", "_lo", "_hi"))
     if pd.isna(value):
         return "-"
@@ -324,7 +269,7 @@ def _rate(row: pd.Series, name: str) -> str:
 
 
 def _bounded(percent: float) -> str:
-    """A rate whose likelihood grows without end belongs to a class of which nothing stayed."""
+    """Format a rate; an infinite one belongs to a class of which nothing remained."""
     return "all" if math.isinf(percent) else f"{percent:.2f}"
 
 

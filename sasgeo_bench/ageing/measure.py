@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A history of dated states -> one row per class and pair of dates: shares, shifts, rates, and what tags explain."""
+"""Measure a history of dated states: shares, shifts, rates and explanations by tags, per class and pair of dates."""
 
 import datetime as dt
 from collections.abc import Sequence
@@ -88,7 +88,7 @@ DTYPES: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Stock:
-    """One class in one state, cut to the common area; `hidden` is what of the class cannot be seen from above."""
+    """One class in one state, cut to the common area; `hidden` is the part of it not visible from above."""
 
     things: Areas | Pieces
     keys: list[ObjectKey]
@@ -97,7 +97,7 @@ class _Stock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Why:
-    """Lost amount by what explains it: the world changed, the map caught up with it, or another class took over."""
+    """Lost amount by explanation: the world changed, the map caught up with it, or another class replaced it."""
 
     world: float
     catch_up: float
@@ -106,7 +106,7 @@ class _Why:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Change:
-    """One class between two states: both verdicts, and what explains them."""
+    """One class between two states: both verdicts, and their explanations."""
 
     date_from: dt.date
     date_to: dt.date
@@ -120,13 +120,13 @@ class _Change:
 
     @property
     def years(self) -> float:
-        """Time between the two states."""
+        """Return the time between the two states."""
         return (self.date_to - self.date_from).days / DAYS_PER_YEAR
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ageing:
-    """What was measured of one place: a table with the columns of `DTYPES`, of which states, over what area."""
+    """Measurements of one place: a table with the columns of `DTYPES`, its states, and its area."""
 
     place: str
     sources: tuple[str, ...]
@@ -135,7 +135,7 @@ class Ageing:
 
 
 def measure_ageing(history: History, *, place: str) -> Ageing:
-    """Measure how each class changed between the states of a history.
+    """Measure how each class changed between the states (at least two) of a history.
 
     Parameters
     ----------
@@ -147,26 +147,27 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
     Returns
     -------
     Ageing
-        The table has the columns of `DTYPES`. `span` is "interval" for neighbouring dates, "whole" for the first
-        against the last, and "pooled" for the rates that explain all intervals together: no shares of a stock there.
+        `span` is "interval" for neighbouring dates, "whole" for the first against the last, and "pooled" for the rates
+        that explain all intervals together, without shares.
 
     Notes
     -----
-    Only what is visible from above counts, as in the layers: a stream put into a culvert has vanished, and is counted
-    as retagged. `vanished_share` is of the older amount, `appeared_share` of the newer; `*_number_share` is the same by
+    Only objects visible from above count, as in the layers: a stream put into a culvert has vanished, and is counted as
+    retagged. `vanished_share` is of the older amount, `appeared_share` of the newer; `*_number_share` is the same by
     number of things, each of which counts as gone (or new) if more than half of it is. Dates less than `LEAST_DAYS`
     apart get shares but no rates.
 
     Examples
     --------
-    >>> from sasgeo_bench.osm.lifecycle import no_lifecycle
     >>> from sasgeo_bench.osm.features import DTYPES as COLUMNS, make_features
+    >>> none = np.array([], dtype=object)
     >>> def state(year, houses):
     ...     filler = {name: [0] * len(houses) for name in COLUMNS}
     ...     text = {"osm_type": ["way"] * len(houses), "class": ["building"] * len(houses)}
     ...     seen = {"osm_id": range(len(houses)), "is_visible": [True] * len(houses), "geometry": houses}
     ...     table = make_features(filler | text | seen, epsg=32632)
-    ...     return State(source="", on=dt.date(year, 1, 1), features=table, lifecycle=no_lifecycle())
+    ...     hints = Lifecycle(gone=none, rising=none, started={})
+    ...     return State(source="", on=dt.date(year, 1, 1), features=table, lifecycle=hints)
     >>> old, new = state(2010, shapely.box([0, 50], 0, [9, 59], 9)), state(2020, shapely.box([0], 0, [9], 9))
     >>> history = History(states=(old, new), area=shapely.box(-99, -99, 99, 99), epsg=32632)
     >>> table = measure_ageing(history, place="field").table
@@ -221,7 +222,7 @@ def _keys(features: gpd.GeoDataFrame, rows: Ints) -> list[ObjectKey]:
 def _changes(
     states: Sequence[State], stocks: Sequence[dict[str, _Stock]], pair: tuple[int, int], kinds: dict[str, Kind]
 ) -> dict[str, _Change]:
-    """Compare every class of two states; what takes the place of what is known only when all are compared."""
+    """Compare every class of two states; what replaced an object is known only after all classes are compared."""
     before, after = (states[index] for index in pair)
     old, new = (stocks[index] for index in pair)
     gone = {name: _verdict(old[name], new[name]) for name in kinds}
@@ -257,7 +258,7 @@ def _why_vanished(stock: _Stock, verdict: Verdict, into: Geometries, hints: Geom
 
 
 def _why_appeared(stock: _Stock, verdict: Verdict, out_of: Geometries, hints: Lifecycle, before: State) -> _Why:
-    """A start date tells most; else what was another class was there; else it came where something was being built."""
+    """Explain what appeared: by its start date first, then by a class that was there, then by construction."""
     spans = [hints.started.get(key) for key in stock.keys]
     is_new = np.array([span is not None and span.first > before.on for span in spans], dtype=bool)[verdict.thing]
     is_old = np.array([span is not None and span.last <= before.on for span in spans], dtype=bool)[verdict.thing]
@@ -276,14 +277,14 @@ def _verdict(these: _Stock, others: _Stock) -> Verdict:
 
 
 def _lost_shapes(stock: _Stock, verdict: Verdict) -> Geometries:
-    """Things, or pieces of lines as their middles, that the other state does not have."""
+    """Return things, or middles of line pieces, that the other state does not have."""
     if isinstance(stock.things, Areas):
         return stock.things.shapes[verdict.is_lost]
     return np.asarray(shapely.points(stock.things.middles[verdict.is_lost]))
 
 
 def _taken(stock: _Stock, verdict: Verdict, others: Geometries) -> Floats:
-    """Lost amount of each unit whose place belongs to another class of the kind, or to the class out of sight."""
+    """Return the lost amount of each unit that another class of the kind, or its own hidden part, replaced."""
     taken = np.zeros(len(verdict.lost))
     units = np.flatnonzero(verdict.is_lost)
     if isinstance(stock.things, Areas):
@@ -295,7 +296,7 @@ def _taken(stock: _Stock, verdict: Verdict, others: Geometries) -> Floats:
 
 
 def _is_near(stock: _Stock, verdict: Verdict, hints: Geometries) -> NDArray[np.bool_]:
-    """Which units, of those that lost anything, lie in a hinted place."""
+    """Return which of the units that lost anything lie in a hinted place."""
     near = np.zeros(len(verdict.lost), dtype=bool)
     units = np.flatnonzero(verdict.lost > 0)
     if isinstance(stock.things, Areas):
@@ -340,7 +341,7 @@ def _pooled_row(changes: Sequence[_Change], *, place: str, name: str) -> dict[st
 
 
 def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> dict[str, object]:
-    """Dates, rates, explanations and number of blocks: what rows of one interval and of all together share."""
+    """Return the part that rows of one interval and of all share: dates, rates, explanations, number of blocks."""
     years = np.array([change.years for change in changes])
     first, last = changes[0].date_from, changes[-1].date_to
     tables = _block_tables(changes)
@@ -373,7 +374,7 @@ def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> d
 
 
 def _explained(what: str, sides: Sequence[tuple[Verdict, _Why]]) -> dict[str, float]:
-    """Shares of the lost amount by explanation; together they are 1."""
+    """Return shares of the lost amount by explanation; together they are 1."""
     lost = float(sum(verdict.lost.sum() for verdict, _ in sides))
     shares = {name: _share(sum(getattr(why, name) for _, why in sides), lost) for name in _REASONS}
     shares["untold"] = max(1.0 - sum(shares.values()), 0.0) if lost > 0 else np.nan
@@ -385,7 +386,7 @@ def _named(name: str, rate: Rate) -> dict[str, object]:
 
 
 def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Lost and whole amount of the older state, then of the newer; each of shape (blocks, intervals)."""
+    """Return lost and whole amount of the older state, then of the newer; each of shape (blocks, intervals)."""
     verdicts = [(change.old, change.new) for change in changes]
     cells = [_cells(verdict.xy_m) for pair in verdicts for verdict in pair]
     blocks, number = np.unique(np.concatenate(cells), return_inverse=True)
@@ -400,13 +401,13 @@ def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, F
 
 
 def _cells(xy_m: Floats) -> Ints:
-    """One number for the block around each point."""
+    """Return one number for the block around each point."""
     cells = np.floor(xy_m / BLOCK_M).astype(np.int64).reshape(-1, 2)
     return np.asarray(cells[:, 0] * 2**32 + cells[:, 1])
 
 
 def _moved(verdict: Verdict) -> tuple[Floats, Floats]:
-    """Shift of each re-drawn thing, and what is kept of it."""
+    """Return the shift of each re-drawn thing, and the amount kept of it."""
     left = verdict.amount - verdict.lost
     kept = np.bincount(verdict.thing, weights=left, minlength=len(verdict.shift_m)).astype(np.float64)
     is_redrawn = np.nan_to_num(verdict.shift_m) > REDRAWN_M
@@ -414,7 +415,7 @@ def _moved(verdict: Verdict) -> tuple[Floats, Floats]:
 
 
 def _quantiles(values: Floats, weights: Floats, levels: tuple[float, ...]) -> list[float]:
-    """Weighted quantiles; NaN for no values."""
+    """Return weighted quantiles; NaN for no values."""
     if len(values) == 0:
         return [float("nan")] * len(levels)
     order = np.argsort(values, kind="stable")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two states of one class -> what of the one is not in the other, by geometry and never by id.
+"""Compare two states of one class: what of the one is not in the other, by geometry and never by id.
 
-An id says who drew a thing, not whether it stands: a bulk redraw replaces ids and nothing on the ground.
+An id shows who drew a thing, not whether it exists: a bulk redraw replaces ids and nothing on the ground.
 """
 
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ class Areas:
 class Pieces:
     """Line things of one class in one state, cut into pieces no longer than `STEP_M`, shape (P,).
 
-    `things` numbers the things 0..T-1, `rows` (T,) gives the row of the table each comes from; `keys` tells equal
-    segments apart, whichever way they run; `segments` are the lines that other states measure their distance to, with
-    whole areas of the class (squares), which lend support but have no length.
+    `things` numbers the things 0..T-1, `rows` (T,) gives the row of the table each comes from. `keys` identifies equal
+    segments in either direction. `segments` are the lines that other states measure their distance to, with whole areas
+    of the class (squares), which have no length here.
     """
 
     rows: Ints
@@ -55,11 +55,11 @@ class Pieces:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What of one state is missing in another, by unit: an area thing or a piece of a line, shape (U,).
+    """The part of one state that is missing in another, by unit: an area thing or a piece of a line, shape (U,).
 
-    `amount` and `lost` in m2 or m; `uncovered` is the amount that no thing of the class covers exactly, whatever the
-    pairing says; `xy_m` (U, 2) is where the unit lies; `thing` (U,) numbers its thing, and `shift_m` (T,) is how far
-    each matched thing has moved, NaN where none is known.
+    `amount` and `lost` are in m2 or m; `uncovered` is the amount that no thing of the class covers exactly, whatever
+    the pairing; `xy_m` (U, 2) is the place of the unit; `thing` (U,) numbers its thing, and `shift_m` (T,) is the shift
+    of each matched thing, NaN if unknown.
     """
 
     amount: Floats
@@ -71,26 +71,19 @@ class Verdict:
 
     @property
     def is_lost(self) -> Flags:
-        """Units of which more is lost than kept."""
+        """Return which units lost more than they kept."""
         return np.asarray(self.lost > COVER_SHARE * self.amount)
 
     @property
     def lost_things(self) -> int:
-        """Number of things of which more is lost than kept; a line's pieces are added up."""
+        """Return the number of things that lost more than they kept; a line's pieces are added up."""
         things = len(self.shift_m)
         lost, amount = (np.bincount(self.thing, weights=of, minlength=things) for of in (self.lost, self.amount))
         return int((lost > COVER_SHARE * amount).sum())
 
 
 def cut_to(shapes: Geometries, area: shapely.Geometry) -> Geometries:
-    """Cut geometries to an area; those wholly within are returned as they are.
-
-    Examples
-    --------
-    >>> row = shapely.box([0, 4], 0, [2, 6], 1)
-    >>> shapely.area(cut_to(row, shapely.box(0, 0, 5, 5))).tolist()
-    [2.0, 1.0]
-    """
+    """Cut geometries to an area; those wholly within are returned unchanged."""
     shapely.prepare(area)
     cut = shapes.copy()
     crosses = ~shapely.contains_properly(area, shapes)
@@ -99,13 +92,7 @@ def cut_to(shapes: Geometries, area: shapely.Geometry) -> Geometries:
 
 
 def polygons_of(shapes: Geometries) -> Geometries:
-    """Valid polygons or multipolygons; what has no area becomes empty.
-
-    Examples
-    --------
-    >>> shapely.area(polygons_of(np.array([shapely.Point(0, 0), shapely.box(0, 0, 1, 1)]))).tolist()
-    [0.0, 1.0]
-    """
+    """Return valid polygons or multipolygons; a geometry without area becomes empty."""
     valid = shapes.copy()
     broken = ~shapely.is_valid(shapes)
     valid[broken] = shapely.make_valid(shapes[broken])
@@ -116,20 +103,14 @@ def polygons_of(shapes: Geometries) -> Geometries:
 
 
 def make_areas(shapes: Geometries) -> Areas:
-    """Area things of a table's rows; rows without an area are left out.
-
-    Examples
-    --------
-    >>> make_areas(np.array([shapely.Point(0, 0), shapely.box(0, 0, 1, 1)])).rows.tolist()
-    [1]
-    """
+    """Return area things of a table's rows; rows without an area are left out."""
     valid = polygons_of(shapes)
     rows = np.flatnonzero(shapely.area(valid) > _LEAST_M2)
     return Areas(rows=rows, shapes=valid[rows])
 
 
 def make_pieces(shapes: Geometries) -> Pieces:
-    """Line things of a table's rows, in pieces; areas among them lend support only.
+    """Cut line things of a table's rows into pieces; areas among them only support other lines.
 
     Examples
     --------
@@ -163,7 +144,7 @@ def make_pieces(shapes: Geometries) -> Pieces:
 
 
 def _linear_parts(shapes: Geometries) -> tuple[Geometries, Ints]:
-    """The plain lines within geometries, and which geometry each comes from."""
+    """Return the plain lines within geometries, and the geometry each comes from."""
     parts, owner = shapely.get_parts(shapes, return_index=True)
     deeper, inner = shapely.get_parts(parts, return_index=True)
     is_line = np.isin(shapely.get_type_id(deeper), _LINEAR)
@@ -171,7 +152,7 @@ def _linear_parts(shapes: Geometries) -> tuple[Geometries, Ints]:
 
 
 def _segment_keys(starts: Floats, ends: Floats) -> NDArray[np.uint64]:
-    """One number for each segment, the same for both of its directions, rounded to a centimetre as OSM is."""
+    """Return one number for each segment, the same in both directions, rounded to a centimetre as OSM is."""
     first, last = (np.round(points * _CENTIMETRES).astype(np.int64).reshape(-1, 2) for points in (starts, ends))
     turned = (first[:, 0] > last[:, 0]) | ((first[:, 0] == last[:, 0]) & (first[:, 1] > last[:, 1]))
     low, high = np.where(turned[:, None], last, first), np.where(turned[:, None], first, last)
@@ -180,18 +161,10 @@ def _segment_keys(starts: Floats, ends: Floats) -> NDArray[np.uint64]:
 
 
 def compare_areas(these: Areas, others: Areas) -> Verdict:
-    """Find which areas of one state have no counterpart in another.
+    """Find which areas of one state have no counterpart in another; shifts are those of the centroids.
 
-    Parameters
-    ----------
-    these, others : Areas
-        One class in two states.
-
-    Returns
-    -------
-    Verdict
-        Areas with a counterpart of IoU above `MATCH_IOU` lose nothing; the rest, split, merged or gone, lose what no
-        area of the other state covers. Shifts are those of the centroids.
+    Areas with a counterpart of IoU above `MATCH_IOU` lose nothing; the rest, split, merged or gone, lose what no area
+    of the other state covers.
 
     Examples
     --------
@@ -219,14 +192,14 @@ def compare_areas(these: Areas, others: Areas) -> Verdict:
 
 
 def _is_among(these: Geometries, others: Geometries) -> Flags:
-    """Which geometries are there bit by bit in the other state: most are, and need no look at their neighbours."""
+    """Return which geometries occur bit by bit in the other state: most do, and need no search for neighbours."""
     known = pd.Index(shapely.to_wkb(shapely.normalize(others)))
     return np.asarray(pd.Index(shapely.to_wkb(shapely.normalize(these))).isin(known))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Overlap:
-    """For each area: the IoU and number of its best counterpart, and how much of it all counterparts cover, m2."""
+    """IoU and number of the best counterpart of each area, and how much of it all counterparts cover, m2."""
 
     best: Ints
     best_iou: Floats
@@ -235,24 +208,24 @@ class _Overlap:
 
 def _overlap(these: Geometries, others: Geometries) -> _Overlap:
     tree = shapely.STRtree(others)
-    mine, theirs = tree.query(these, predicate="intersects")
-    order = np.lexsort((theirs, mine))
-    mine, theirs = mine[order], theirs[order]
-    shared = shapely.intersection(these[mine], others[theirs])
+    left, right = tree.query(these, predicate="intersects")
+    order = np.lexsort((right, left))
+    left, right = left[order], right[order]
+    shared = shapely.intersection(these[left], others[right])
     shared_m2 = shapely.area(shared)
     real = shared_m2 > _LEAST_M2
-    mine, theirs, shared, shared_m2 = mine[real], theirs[real], shared[real], shared_m2[real]
-    iou = shared_m2 / (shapely.area(these)[mine] + shapely.area(others)[theirs] - shared_m2)
+    left, right, shared, shared_m2 = left[real], right[real], shared[real], shared_m2[real]
+    iou = shared_m2 / (shapely.area(these)[left] + shapely.area(others)[right] - shared_m2)
     best, best_iou = np.zeros(len(these), dtype=np.int64), np.zeros(len(these))
     ascending = np.argsort(iou, kind="stable")
-    best[mine[ascending]], best_iou[mine[ascending]] = theirs[ascending], iou[ascending]
-    return _Overlap(best=best, best_iou=best_iou, covered=_covered_m2(mine, shared, shared_m2, count=len(these)))
+    best[left[ascending]], best_iou[left[ascending]] = right[ascending], iou[ascending]
+    return _Overlap(best=best, best_iou=best_iou, covered=_covered_m2(left, shared, shared_m2, count=len(these)))
 
 
-def _covered_m2(mine: Ints, shared: Geometries, shared_m2: Floats, *, count: int) -> Floats:
-    """Area of each union of shared pieces: a plain sum where there is one piece, as nearly everywhere."""
-    covered = np.bincount(mine, weights=shared_m2, minlength=count).astype(np.float64)
-    pieces = np.bincount(mine, minlength=count)
+def _covered_m2(left: Ints, shared: Geometries, shared_m2: Floats, *, count: int) -> Floats:
+    """Return the area of each union of shared pieces: a plain sum if there is one piece, as nearly everywhere."""
+    covered = np.bincount(left, weights=shared_m2, minlength=count).astype(np.float64)
+    pieces = np.bincount(left, minlength=count)
     starts = np.cumsum(pieces) - pieces
     for index in np.flatnonzero(pieces > 1):
         part = slice(starts[index], starts[index] + pieces[index])
@@ -261,18 +234,9 @@ def _covered_m2(mine: Ints, shared: Geometries, shared_m2: Floats, *, count: int
 
 
 def compare_pieces(these: Pieces, others: Pieces) -> Verdict:
-    """Find which pieces of line have no line of the other state within `NEAR_M`.
+    """Find which pieces of line have no line of the other state within `NEAR_M`; a piece is lost whole or not at all.
 
-    Parameters
-    ----------
-    these, others : Pieces
-        One class in two states.
-
-    Returns
-    -------
-    Verdict
-        A piece is lost whole or not at all. The shift of a thing is the median over its kept length of the distance
-        to the other state.
+    The shift of a thing is the median, over its kept length, of the distance to the other state.
 
     Examples
     --------
@@ -294,27 +258,21 @@ def compare_pieces(these: Pieces, others: Pieces) -> Verdict:
     )
 
 
-def distance_m(points_m: Floats, targets: Geometries, *, reach_m: float = NEAR_M) -> Floats:
-    """Distance from points, shape (N, 2), to the nearest target; infinite beyond `reach_m`.
-
-    Examples
-    --------
-    >>> distance_m(np.array([[0.0, 3.0], [0.0, 9.0]]), np.array([shapely.Point(0, 0)])).tolist()
-    [3.0, inf]
-    """
+def distance_m(points_m: Floats, targets: Geometries) -> Floats:
+    """Return the distance from points, shape (N, 2), to the nearest target; infinite beyond `NEAR_M`."""
     found = np.full(len(points_m), np.inf)
     if len(targets) == 0 or len(points_m) == 0:
         return found
     tree = shapely.STRtree(targets)
-    (mine, _), distance = tree.query_nearest(
-        shapely.points(points_m), max_distance=reach_m, return_distance=True, all_matches=False
+    (left, _), distance = tree.query_nearest(
+        shapely.points(points_m), max_distance=NEAR_M, return_distance=True, all_matches=False
     )
-    found[mine] = distance
+    found[left] = distance
     return found
 
 
 def _medians(things: Ints, values: Floats, weights: Floats) -> tuple[Ints, Floats]:
-    """Numbers of the things that are there, ascending, and the weighted median of each one's values."""
+    """Return numbers of the things that occur, ascending, and the weighted median of each one's values."""
     order = np.lexsort((values, things))
     things, values, weights = things[order], values[order], weights[order]
     present, starts = np.unique(things, return_index=True)
@@ -330,13 +288,7 @@ def _medians(things: Ints, values: Floats, weights: Floats) -> tuple[Ints, Float
 
 
 def covered_share(shapes: Geometries, covers: Geometries) -> Floats:
-    """Share of each area that other areas cover together; lines and points among the covers cover nothing.
-
-    Examples
-    --------
-    >>> covered_share(shapely.box([0], 0, [10], 10), shapely.box([0, 0], 0, [5, 5], 10)).tolist()
-    [0.5]
-    """
+    """Return the share of each area that other areas cover together; lines and points cover nothing."""
     areas = covers[np.isin(shapely.get_type_id(covers), _POLYGONAL)] if len(covers) else covers
     if len(shapes) == 0 or len(areas) == 0:
         return np.zeros(len(shapes))
@@ -344,7 +296,7 @@ def covered_share(shapes: Geometries, covers: Geometries) -> Floats:
 
 
 def replaced_share(shapes: Geometries, newcomers: Geometries) -> Floats:
-    """Share of each area taken over by newcomers: those it is paired with, and those that lie mostly within it.
+    """Return the share of each area replaced by newcomers: those paired with it, and those mostly within it.
 
     A forest that grows over a house takes the ground, not the place of the house; a car park on its footprint does.
 
@@ -358,12 +310,12 @@ def replaced_share(shapes: Geometries, newcomers: Geometries) -> Floats:
     """
     if len(shapes) == 0 or len(newcomers) == 0:
         return np.zeros(len(shapes))
-    mine, theirs = shapely.STRtree(newcomers).query(shapes, predicate="intersects")
-    order = np.lexsort((theirs, mine))
-    mine, theirs = mine[order], theirs[order]
-    shared = shapely.intersection(shapes[mine], newcomers[theirs])
-    shared_m2, theirs_m2 = shapely.area(shared), shapely.area(newcomers)[theirs]
-    iou = shared_m2 / (shapely.area(shapes)[mine] + theirs_m2 - shared_m2)
-    real = (shared_m2 > _LEAST_M2) & ((iou > MATCH_IOU) | (shared_m2 > COVER_SHARE * theirs_m2))
-    covered = _covered_m2(mine[real], shared[real], shared_m2[real], count=len(shapes))
+    left, right = shapely.STRtree(newcomers).query(shapes, predicate="intersects")
+    order = np.lexsort((right, left))
+    left, right = left[order], right[order]
+    shared = shapely.intersection(shapes[left], newcomers[right])
+    shared_m2, right_m2 = shapely.area(shared), shapely.area(newcomers)[right]
+    iou = shared_m2 / (shapely.area(shapes)[left] + right_m2 - shared_m2)
+    real = (shared_m2 > _LEAST_M2) & ((iou > MATCH_IOU) | (shared_m2 > COVER_SHARE * right_m2))
+    covered = _covered_m2(left[real], shared[real], shared_m2[real], count=len(shapes))
     return np.asarray(covered / shapely.area(shapes))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ageing.svg`: yearly rates of each class with their intervals, and what ids would have said."""
+"""Draw `ageing.svg`: yearly rates of each class with their intervals, and the result of comparing ids instead."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -38,15 +38,7 @@ _STYLE: Final[dict[Any, Any]] = {
 
 
 def draw_ageing(path: Path, ageing: Ageing) -> None:
-    """Draw what was measured of one place.
-
-    Parameters
-    ----------
-    path : Path
-        The SVG to write; the same bytes for the same table.
-    ageing : Ageing
-        The table with its place and dates.
-    """
+    """Draw the measurements of one place as an SVG; the same table gives the same bytes."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     names = list(dict.fromkeys(ageing.table["class"]))
     height = _ROW_INCHES * len(names) + _FRAME_INCHES
@@ -101,12 +93,12 @@ def _tick(value: float, _: object) -> str:
 
 
 def _within(percent: float) -> float:
-    """A rate where the axis can show it; an end that is not known stays away."""
+    """Clip a rate to the axis; NaN stays NaN and is not drawn."""
     return float(np.clip(percent, *_RANGE))
 
 
 def _draw_shares(chart: Axes, table: pd.DataFrame, names: list[str]) -> None:
-    """What ids say is gone against what geometry says, by amount and by number, first map against last."""
+    """Draw what is gone by id, by geometry and by number, first map against last."""
     whole = table[table["span"] == "whole"].set_index("class").loc[names]
     columns = ("id_vanished_share", "vanished_share", "vanished_number_share")
     for at, (by_id, by_place, by_number) in enumerate(zip(*(100 * whole[name] for name in columns), strict=True)):
@@ -131,7 +123,7 @@ def _dress(chart: Axes, title: str, rows: int) -> None:
 
 
 def _words(figure: Figure, ageing: Ageing, height: float) -> None:
-    """Title above; what the marks mean and whose data they are below."""
+    """Write the title above; explain the marks and name the source of the data below."""
     table = ageing.table
     first, last = table["date_from"].min(), table["date_to"].max()
     states = f"{len(ageing.sources)} maps from {first:%Y-%m-%d} to {last:%Y-%m-%d}, {ageing.area_km2:,.1f} km2"

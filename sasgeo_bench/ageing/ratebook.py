@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured yearly rates for others to use: places -> classes -> rates, and one set of rates from all but one place."""
+"""Measured yearly rates by place and class, and one set of rates pooled over all but some places."""
 
 import math
 import re
@@ -22,7 +22,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class Estimate(Document):
-    """A yearly rate and its 95 % interval, 1/year; infinite without bound, None where no interval can be told."""
+    """A yearly rate and its 95 % interval, 1/year; infinite if unbounded, None if no interval is known."""
 
     best: NotNegative
     lo: NotNegative | None = None
@@ -30,10 +30,11 @@ class Estimate(Document):
 
 
 class ClassAgeing(Document):
-    """What was measured of one class in one place, `years` apart; None where there was nothing to measure.
+    """Measurements of one class in one place over a number of years; None if there was nothing to measure.
 
     Rates are those over all intervals; `redrawn_share` (of the older amount) and the shifts compare the first map with
-    the last. Of areas the shift is that of the centroid, so it says nothing where areas grow: green, farmland, water.
+    the last. The shift of an area is that of its centroid, so it means nothing where areas grow: green, farmland,
+    water.
     """
 
     years: Annotated[float, Field(gt=0)]
@@ -47,7 +48,7 @@ class ClassAgeing(Document):
 
 
 class PlaceAgeing(Document):
-    """What was measured in one place, and the extracts it was measured from."""
+    """Measurements of one place, and the extracts they come from."""
 
     name: str
     area_km2: NotNegative
@@ -56,13 +57,7 @@ class PlaceAgeing(Document):
 
 
 class RateBook(Document):
-    """All places that were measured; `ratebook.toml`.
-
-    Examples
-    --------
-    >>> RateBook(attribution="", licence="", place=[]).names
-    ()
-    """
+    """All measured places; `ratebook.toml`."""
 
     attribution: str
     licence: str
@@ -70,7 +65,7 @@ class RateBook(Document):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the places."""
+        """Return the names of the places."""
         return tuple(place.name for place in self.places)
 
     def __getitem__(self, name: str) -> PlaceAgeing:
@@ -78,18 +73,9 @@ class RateBook(Document):
         return {place.name: place for place in self.places}[name]
 
     def place_of(self, extract: str) -> str | None:
-        """Which place was measured from extracts like this file; None if none was.
+        """Return the place measured from extracts like this file, or None.
 
-        Files are alike when their names are the same up to the date: rates from Liechtenstein are Vaduz's own.
-
-        Examples
-        --------
-        >>> andorra = PlaceAgeing.model_validate(
-        ...     {"name": "Andorra", "area_km2": 1.0, "extracts": ["andorra-2013-05-28.osm.pbf"], "class": {}}
-        ... )
-        >>> book = RateBook(attribution="", licence="", place=[andorra])
-        >>> book.place_of("andorra-2025-01-19.osm.pbf"), book.place_of("prague-2020-01-05.osm.pbf")
-        ('Andorra', None)
+        Files are alike if their names are the same up to the date: rates from Liechtenstein are Vaduz's own.
         """
         stem = _stem(extract)
         return next((place.name for place in self.places if stem in map(_stem, place.extracts)), None)
@@ -102,9 +88,9 @@ def _stem(file: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PooledClass:
-    """Rates of one class from several places, 1/year, and how it is re-drawn; None where no place tells of that.
+    """Rates of one class from several places, 1/year, and how it is re-drawn; None if no place has a value.
 
-    `redrawn_share` is of what there was `years` before; both are medians, as are the shifts in metres.
+    `redrawn_share` is of the amount `years` before; both are medians, as are the shifts in metres.
     """
 
     vanish_per_year: float
@@ -123,68 +109,35 @@ class PooledRates:
     places: tuple[str, ...]
 
 
-def pool_rates(book: RateBook, *, besides: Collection[str] = (), least_things: int = LEAST_THINGS) -> PooledRates:
-    """One set of rates from all places but some: a place must not be aged by what was measured in it.
+def pool_rates(book: RateBook, *, exclude: Collection[str] = ()) -> PooledRates:
+    """Pool the rates of all places but those excluded: a place must not be aged by its own measurements.
 
-    Parameters
-    ----------
-    book : RateBook
-        The measured places.
-    besides : collection of str
-        Names of places to leave out; `RateBook.place_of` tells which place an extract belongs to.
-    least_things : int
-        A place with fewer things of a class, on the first map for what vanishes and on the last for what appears, has
-        no say in that rate.
-
-    Returns
-    -------
-    PooledRates
-        Medians over the places. A class is left out if no place can tell both of its rates.
-
-    Raises
-    ------
-    ConfigError
-        If a place to leave out is not in the book: a misspelt name would let its rates in.
+    `RateBook.place_of` gives the place of an extract. A place with fewer than `least_things` of a class, on the first
+    map for what vanishes and on the last for what appears, is not used for that rate; a class without both rates is
+    left out. Raise `ConfigError` if an excluded place is not in the book: a misspelt name would let its rates in.
 
     Notes
     -----
     The median, not a mean weighted by amount: places differ by far more than the interval of any one of them, so each
-    is one draw of how maps age, and one import must not set the rate of all. A mean weighted by amount would be that of
-    the largest place.
-
-    Examples
-    --------
-    >>> def place(name, rate):
-    ...     seen = {"years": 9.0, "n_from": 50, "n_to": 60, "vanish_per_year": {"best": rate}}
-    ...     found = {"building": seen | {"appear_per_year": {"best": 10 * rate}}}
-    ...     return PlaceAgeing.model_validate({"name": name, "area_km2": 1.0, "extracts": [], "class": found})
-    >>> places = [place("north", 0.001), place("south", 0.002), place("west", 0.009)]
-    >>> book = RateBook(attribution="", licence="", place=places)
-    >>> pool_rates(book).classes["building"].vanish_per_year
-    0.002
-    >>> pool_rates(book, besides=["north"]).classes["building"].appear_per_year
-    0.055
+    is one sample of how maps age, and one import must not set the rate of all.
     """
-    unknown = sorted(set(besides) - set(book.names))
+    unknown = sorted(set(exclude) - set(book.names))
     if unknown:
         message = f"there is no place {unknown[0]!r} to leave out of the ageing rates; known: {', '.join(book.names)}"
         raise ConfigError(message)
-    places = [place for place in book.places if place.name not in besides]
+    places = [place for place in book.places if place.name not in exclude]
     names = dict.fromkeys(name for place in places for name in place.classes)
-    pooled = {
-        name: _pooled([place.classes[name] for place in places if name in place.classes], least_things)
-        for name in names
-    }
+    pooled = {name: _pooled([place.classes[name] for place in places if name in place.classes]) for name in names}
     return PooledRates(
         classes={name: item for name, item in pooled.items() if item is not None},
         places=tuple(place.name for place in places),
     )
 
 
-def _pooled(found: Sequence[ClassAgeing], least_things: int) -> PooledClass | None:
-    olds = [item for item in found if item.n_from >= least_things]
+def _pooled(found: Sequence[ClassAgeing]) -> PooledClass | None:
+    olds = [item for item in found if item.n_from >= LEAST_THINGS]
     vanish = _median([item.vanish_per_year.best for item in olds if item.vanish_per_year])
-    news = [item for item in found if item.n_to >= least_things]
+    news = [item for item in found if item.n_to >= LEAST_THINGS]
     appear = _median([item.appear_per_year.best for item in news if item.appear_per_year])
     if vanish is None or appear is None or not math.isfinite(vanish + appear):
         return None

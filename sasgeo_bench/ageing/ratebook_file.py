@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ratebook.toml`: measured yearly rates of all places; one comes with the package."""
+"""Read and write `ratebook.toml`: measured yearly rates of all places; the package holds one."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -13,7 +13,6 @@ from sasgeo_bench.ageing.files import check_names, replace_file
 from sasgeo_bench.ageing.measure import Ageing
 from sasgeo_bench.ageing.ratebook import RateBook
 from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import quoted
 
@@ -30,18 +29,7 @@ _SHARES: Final = ("redrawn_share", "shift_median_m", "shift_p90_m")
 
 
 def ratebook_text(places: Sequence[Ageing]) -> str:
-    """TOML of several places.
-
-    Raises
-    ------
-    ConfigError
-        If two places have one name.
-
-    Examples
-    --------
-    >>> parse_toml(ratebook_text([]), RateBook, source="").licence
-    'ODbL-1.0'
-    """
+    """Format several places as TOML; raise `ConfigError` if two have one name."""
     check_names(places)
     parts = [_HEAD if places else f"{_HEAD}place = []\n"]
     for place in places:
@@ -71,45 +59,14 @@ def _class_text(name: str, pooled: pd.Series, whole: pd.Series) -> str:
 
 
 def write_ratebook(path: Path, places: Sequence[Ageing]) -> Path:
-    """Write `ratebook_text` into a file, replaced whole.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be written.
-    ConfigError
-        If two places have one name.
-    """
+    """Write `ratebook_text` into a file, replaced whole; raise `StoreError` if it cannot be written."""
     text = ratebook_text(places)
     return replace_file(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
 
 
-def read_ratebook(path: Path) -> RateBook:
-    """Read what `write_ratebook` wrote.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be read or a value in it is wrong; all faults on one line.
-
-    Examples
-    --------
-    >>> read_ratebook(Path("nowhere.toml"))
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.ConfigError: nowhere.toml cannot be read as a book of rates: compare-ageing --rates writes one
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        message = f"{path} cannot be read as a book of rates: compare-ageing --rates writes one"
-        raise ConfigError(message) from error
-    return parse_toml(text, RateBook, source=str(path))
-
-
 @cache
 def load_ratebook() -> RateBook:
-    """Return the rates that come with the package, those of `docs/ageing`.
+    """Return the rates of the package, those of `docs/ageing`.
 
     Examples
     --------

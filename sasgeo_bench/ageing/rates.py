@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shares lost between dates -> yearly rates with intervals: interval-censored exponential, bootstrap over blocks."""
+"""Estimate yearly rates from shares lost between dates: interval-censored exponential, bootstrap over blocks."""
 
 import hashlib
 import math
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rate:
-    """A yearly rate and its 95 % interval; NaN where nothing can be said, infinite where nothing is left."""
+    """A yearly rate and its 95 % interval; NaN if unknown, infinite if nothing is left."""
 
     per_year: float
     lo: float
@@ -27,38 +27,31 @@ class Rate:
 
 
 def seeded_rng(*purpose: object) -> np.random.Generator:
-    """A stream of chance for one purpose (place, class, dates), the same on every machine.
-
-    Examples
-    --------
-    >>> int(seeded_rng("monaco", "building").integers(100)) == int(seeded_rng("monaco", "building").integers(100))
-    True
-    """
+    """Return a random generator for one purpose (place, class, dates), the same on every machine."""
     text = "/".join(map(str, purpose))
     return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "big"))
 
 
 def loss_rate(lost: Floats, total: Floats, years: Floats) -> Floats:
-    """Yearly rate of an exponential life, from what was lost between dates.
+    """Estimate the yearly rate of an exponential life by maximum likelihood, from amounts lost between dates.
 
     Parameters
     ----------
     lost, total : ndarray of float, shape (..., K)
-        Amount lost within each of K intervals, and the amount there was at its beginning.
+        Amount lost within each of K intervals, and the amount at its beginning.
     years : ndarray of float, shape (K,)
         Lengths of the intervals.
 
     Returns
     -------
     ndarray of float, shape (...)
-        Where the likelihood of losing just that is greatest, when a loss is only known to lie between two dates. NaN
-        where there was nothing to lose, infinite where all was lost.
+        NaN if there was nothing to lose, infinite if all was lost.
 
     Notes
     -----
-    The score is sum(lost * t / expm1(rate * t)) - sum(kept * t) = 0. It falls steadily and is convex in the rate, so
-    that Newton's steps from below reach its one root without passing it. One interval has the closed form
-    -ln(1 - share) / t.
+    A loss is only known to lie between two dates. The score is sum(lost * t / expm1(rate * t)) - sum(kept * t) = 0. It
+    decreases and is convex in the rate, so that Newton's steps from below reach its one root without passing it. One
+    interval has the closed form -ln(1 - share) / t.
 
     Examples
     --------
@@ -93,10 +86,8 @@ def _root(lost: Floats, kept: Floats, some: Floats, years: Floats) -> Floats:
     return rate
 
 
-def bootstrap_rate(
-    lost: Floats, total: Floats, years: Floats, *, things: int, rng: np.random.Generator, draws: int = DRAWS
-) -> Rate:
-    """Yearly rate with a 95 % interval from resampled spatial blocks.
+def bootstrap_rate(lost: Floats, total: Floats, years: Floats, *, things: int, rng: np.random.Generator) -> Rate:
+    """Estimate a yearly rate with a 95 % interval from resampled spatial blocks.
 
     Parameters
     ----------
@@ -105,24 +96,15 @@ def bootstrap_rate(
     years : ndarray of float, shape (K,)
         Lengths of the intervals.
     things : int
-        Number of things at risk: where none was lost the bootstrap is blind, and the upper end is the rate under which
-        seeing none has a chance of 5 % (the rule of three).
+        Number of things at risk. If none was lost, the bootstrap has no variance, and the upper end is the rate at
+        which losing none has a probability of 5 % (the rule of three).
     rng : numpy.random.Generator
-        Chance of the draws.
-    draws : int
-        Number of draws.
+        Generator of the resampling.
 
     Returns
     -------
     Rate
-        The interval is NaN for fewer than two blocks: neighbours change together, so one block says nothing of others.
-
-    Examples
-    --------
-    >>> lost, total = np.array([[1.0], [3.0], [2.0]]), np.full((3, 1), 50.0)
-    >>> rate = bootstrap_rate(lost, total, np.array([1.0]), things=150, rng=np.random.default_rng(1))
-    >>> round(rate.per_year, 4), round(rate.lo, 4), round(rate.hi, 4)
-    (0.0408, 0.0202, 0.0619)
+        The interval is NaN for fewer than two blocks: neighbours change together, so one block is one sample.
     """
     best = float(loss_rate(lost.sum(axis=0), total.sum(axis=0), years))
     if math.isnan(best):
@@ -132,7 +114,7 @@ def bootstrap_rate(
     blocks = len(total)
     if blocks < 2:  # noqa: PLR2004 - one block cannot differ from itself
         return Rate(per_year=best, lo=math.nan, hi=math.nan)
-    weights = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=draws).astype(np.float64)
+    weights = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=DRAWS).astype(np.float64)
     drawn = loss_rate(weights @ lost, weights @ total, years)
     drawn = drawn[~np.isnan(drawn)]  # a draw of empty blocks alone had nothing to lose
     tail = (1 - LEVEL) / 2

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files and folders, whatever is in them: written whole or not at all, hashed, listed, removed."""
+"""Files and folders of any content: written whole or not at all, hashed, listed, removed."""

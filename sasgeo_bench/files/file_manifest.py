@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders that anybody may have made: their files listed, hashed, and held against those that are known as ours."""
+"""Folders of unknown origin: list and hash their files, and compare them with a list of known ones."""
 
 import os
 import stat
@@ -24,18 +24,7 @@ _OLD_SITE: Final = ("*.html", "site.css", "site.js", "files/*", *FIGURE_FILES, *
 
 
 def led_to(path: Path) -> Path:
-    """Where a symbolic link leads; any other path as it is.
-
-    Raises
-    ------
-    StoreError
-        If links lead in a circle.
-
-    Examples
-    --------
-    >>> led_to(Path("nowhere"))
-    PosixPath('nowhere')
-    """
+    """Return the target of a symbolic link, any other path unchanged; raise `StoreError` if links form a circle."""
     try:
         return path.resolve() if path.is_symlink() else path
     except (OSError, RuntimeError) as error:
@@ -44,7 +33,7 @@ def led_to(path: Path) -> Path:
 
 
 def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
-    """Everything below a folder that is no folder itself, by its path in there; links are not followed."""
+    """Yield everything below a folder except folders, by relative path; links are not followed."""
     for parent, folders, files in os.walk(folder):
         if Path(parent) == folder:
             folders[:] = [name for name in folders if name not in without]
@@ -55,24 +44,9 @@ def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
 
 
 def list_files(folder: Path, *, without: Collection[str] = ()) -> list[str]:
-    """Paths of all files in a folder, sorted.
+    """Return the paths of all files in a folder, sorted, without the folders named in `without`.
 
-    Parameters
-    ----------
-    folder : Path
-        Of files alone.
-    without : collection of str
-        Folders in it that are passed over.
-
-    Raises
-    ------
-    StoreError
-        If one is a link, which could lead to any file of this machine, or a pipe or a device.
-
-    Examples
-    --------
-    >>> list_files(Path("nowhere"))
-    []
+    Raise `StoreError` if one is a link, which could lead to any file of this machine, or a pipe or a device.
     """
     found = []
     for name, path in _walk(folder, without):
@@ -84,55 +58,29 @@ def list_files(folder: Path, *, without: Collection[str] = ()) -> list[str]:
 
 
 def hashes_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of some files of a folder, by their paths."""
+    """Return the SHA-256 of some files of a folder, by path."""
     return {name: sha256_of(folder / name) for name in names}
 
 
-def differing(folder: Path, said: Mapping[str, str], *, without: Collection[str] = ()) -> str | None:
-    """The first file of a folder that is missing, is more than was said, or has another hash; None where all is well.
-
-    Raises
-    ------
-    StoreError
-        As `list_files` does.
-
-    Examples
-    --------
-    >>> differing(Path("nowhere"), {"a.txt": "ff"})
-    'a.txt is missing'
-    """
+def differing(folder: Path, recorded: Mapping[str, str], *, without: Collection[str] = ()) -> str | None:
+    """Describe the first missing, unlisted or changed file of a folder, or return None."""
     there = list_files(folder, without=without)
-    missing = sorted(set(said) - set(there))
+    missing = sorted(set(recorded) - set(there))
     if missing:
         return f"{missing[0]} is missing"
-    more = sorted(set(there) - set(said))
+    more = sorted(set(there) - set(recorded))
     if more:
         return f"{more[0]} is not in its list"
-    return next((f"{name} differs" for name in there if sha256_of(folder / name) != said[name]), None)
+    return next((f"{name} differs" for name in there if sha256_of(folder / name) != recorded[name]), None)
 
 
 def check_known(
     folder: Path, known: Collection[str], what: str, *, patterns: Sequence[str] = (), without: Collection[str] = ()
 ) -> None:
-    """Refuse to put something in place of a folder that holds files of somebody else.
+    """Refuse to replace a folder that holds somebody else's files; raise `StoreError` naming the first few.
 
-    Parameters
-    ----------
-    folder : Path
-        To be replaced.
-    known : collection of str
-        Paths in it of files that are ours.
-    what : str
-        What they are part of, as in "a site".
-    patterns : sequence of str
-        Further ones, as for a shell.
-    without : collection of str
-        Folders in it that are passed over.
-
-    Raises
-    ------
-    StoreError
-        Naming the first few.
+    `known` holds the paths of our own files, and `patterns` further ones as in a shell; folders in `without` are
+    skipped. `what` names what the files belong to, as in "a site".
     """
     other = sorted(
         name
@@ -148,17 +96,7 @@ def check_known(
 
 
 def check_site(folder: Path) -> None:
-    """Refuse to replace a site into which somebody has put files of their own; one that is not there is no site.
-
-    Raises
-    ------
-    StoreError
-        Naming them.
-
-    Examples
-    --------
-    >>> check_site(Path("nowhere"))
-    """
+    """Refuse to replace a site that holds somebody else's files; raise `StoreError` naming them."""
     try:
         known = read_json(folder / SITE_SAYS, mend="publish again")["files"]
     except (StoreError, KeyError, TypeError):
@@ -170,13 +108,7 @@ def check_site(folder: Path) -> None:
 
 
 def check_room(folder: Path) -> None:
-    """Refuse a folder that cannot be made or replaced: what would be written there is an hour's work.
-
-    Raises
-    ------
-    StoreError
-        If a file stands in its way, or there is no right to write.
-    """
+    """Raise `StoreError` if a folder cannot be made or replaced: the work to fill it may take an hour."""
     there = next(path for path in (folder.parent, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         message = f"{folder} cannot be written, for {there} is a file: name another folder"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders that are written whole or not at all, by one run at a time."""
+"""Write folders whole or not at all, by one run at a time."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -14,13 +14,7 @@ from sasgeo_bench.files.removal import remove_tree
 
 @contextmanager
 def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
-    """Hold the lock of a region, or of something else that is written; a second run says so and waits.
-
-    Raises
-    ------
-    StoreError
-        If there is no right or no room for a lock.
-    """
+    """Hold the lock of a folder; a second run says so and waits. Raise `StoreError` if the lock cannot be made."""
     lock = FileLock(folder.parent / f".{folder.name}.lock")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -40,9 +34,9 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
 
 @contextmanager
 def fresh_folder(target: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `target` that takes its place when the block ends well, and goes when it does not.
+    """Yield an empty folder next to `target` that replaces it if the block succeeds, and is removed otherwise.
 
-    Call it under `locked`: leftovers of a build that was killed are cleared first.
+    Call it under `locked`: leftovers of a build that was killed are removed first.
     """
     scratch = target.parent / f".{target.name}.partial"
     replaced = target.parent / f".{target.name}.replaced"
@@ -64,7 +58,7 @@ def fresh_folder(target: Path) -> Iterator[Path]:
 
 
 def _clear(path: Path) -> None:
-    """Remove a folder, or a file or link where a folder was expected; what a link leads to stays."""
+    """Remove a folder, or a file or link in its place; the target of a link stays."""
     if path.is_symlink() or path.is_file():
         path.unlink()
     else:

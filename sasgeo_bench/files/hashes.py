@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file holds, by its hash."""
+"""Size and hash of files."""
 
 import hashlib
 from pathlib import Path
@@ -20,20 +20,11 @@ class FileRecord(Document):
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal, read in pieces.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = (Path(folder) / "empty").write_bytes(b"")
-    ...     sha256_of(Path(folder) / "empty")[:8]
-    'e3b0c442'
-    """
+    """Return the SHA-256 of a file, hexadecimal, read in pieces."""
     with path.open("rb") as source:
         return hashlib.file_digest(source, "sha256").hexdigest()
 
 
 def file_record(path: Path) -> FileRecord:
-    """Size and hash of a file."""
+    """Return size and hash of a file."""
     return FileRecord(sha256=sha256_of(path), bytes=path.stat().st_size)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parquet files, written with checksums and read within bounds; every table of ours goes through here.
+"""Read and write Parquet files with checksums and within bounds; every table of ours goes through here.
 
 Each page carries a CRC, which any reader can verify. Pages do not cover the footer, which holds names and types of the
-columns, so a file also carries the CRC-32 of its own footer. A file of somebody else may have neither; then nothing but
-its structure is checked.
+columns, so a file also carries the CRC-32 of its own footer. A file of somebody else may have neither; then only its
+structure is checked.
 """
 
 import json
@@ -37,7 +37,7 @@ _MOST_QUOTED: Final = 200  # characters of what a library says
 def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetWriter]:  # noqa: ANN401
     """Open a writer of a table with checksums; `options` are those of `pyarrow.parquet.ParquetWriter`.
 
-    The table is whole when the block ends.
+    The table is complete when the block ends.
     """
     about = {key: value for key, value in (schema.metadata or {}).items() if key != _SEAL}
     with pq.ParquetWriter(path, schema.with_metadata(about), **{**CHECKED, **options}) as writer:
@@ -62,15 +62,15 @@ def write_table(table: pa.Table, path: Path, *, row_group_size: int | None = Non
         writer.write_table(table, row_group_size)
 
 
-def write_frame(frame: pd.DataFrame, path: Path, *, attrs: Mapping[str, Any], **said: str) -> None:
-    """Write a data frame with checksums; `attrs` come back as its `attrs`, `said` stands in the file's metadata."""
+def write_frame(frame: pd.DataFrame, path: Path, *, attrs: Mapping[str, Any], **metadata: str) -> None:
+    """Write a data frame with checksums, its `attrs`, and further metadata of the file."""
     table = pa.Table.from_pandas(frame, preserve_index=False)
-    about = {**(table.schema.metadata or {}), **said, _ATTRS: json.dumps(attrs)}
+    about = {**(table.schema.metadata or {}), **metadata, _ATTRS: json.dumps(attrs)}
     write_table(table.replace_schema_metadata(about), path)
 
 
 def read_frame(path: Path, *, mend: str) -> pd.DataFrame:
-    """Read what `write_frame` wrote, with its `attrs`; raises as `open_table` does."""
+    """Read the output of `write_frame`, with its `attrs`; raise as `open_table` does."""
     table = read_table(path, mend=mend, most_rows=MOST_VALUES)
     try:
         frame: pd.DataFrame = table.to_pandas()
@@ -90,16 +90,16 @@ def open_table(
     is_whole: bool = True,
     **options: Any,  # noqa: ANN401
 ) -> Iterator[pq.ParquetFile]:
-    """Open a table that may be anybody's: its footer is checked and its size is bounded before anything is read.
+    """Open a table of unknown origin: check its footer and bound its size before anything is read.
 
     Parameters
     ----------
     path : Path
         The file.
     mend : str
-        What to do if it cannot be read, as in "score it again".
+        Advice if it cannot be read, as in "score it again".
     most_rows : int
-        Rows that it may hold.
+        Largest number of rows.
     is_whole : bool
         Whether it is read whole; otherwise each row group is bounded by itself.
     **options
@@ -114,14 +114,6 @@ def open_table(
     ------
     StoreError
         If it is missing, damaged, no table, or too large; also if reading fails while it is open.
-
-    Examples
-    --------
-    >>> with open_table(Path("nowhere.parquet"), mend="score it again"):
-    ...     pass
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: nowhere.parquet cannot be read (No such file or directory): score it again
     """
     try:
         _check_footer(path)
@@ -140,28 +132,19 @@ def open_table(
 
 
 def read_table(path: Path, *, mend: str, columns: Sequence[str] | None = None, most_rows: int = MOST_ROWS) -> pa.Table:
-    """Read a table, or some of its columns; raises as `open_table` does."""
+    """Read a table, or some of its columns; raise as `open_table` does."""
     with open_table(path, mend=mend, most_rows=most_rows) as source:
         return source.read(columns=None if columns is None else list(columns))
 
 
 def read_schema(path: Path, *, mend: str) -> pa.Schema:
-    """Read names, types and metadata of a table's columns; raises as `open_table` does."""
+    """Read names, types and metadata of a table's columns; raise as `open_table` does."""
     with open_table(path, mend=mend, most_rows=MOST_VALUES, is_whole=False) as source:
         return source.schema_arrow
 
 
 def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True) -> str | None:
-    """What is too large about a table, by its footer; None where all is well.
-
-    Examples
-    --------
-    >>> import io
-    >>> file = io.BytesIO()
-    >>> pq.write_table(pa.table({"a": pa.nulls(30)}), file)
-    >>> size_fault(pq.ParquetFile(file).metadata, most_rows=20)
-    '30 rows, 20 at most'
-    """
+    """Describe what is too large about a table, by its footer, or return None."""
     groups = [about.row_group(at) for at in range(about.num_row_groups)]
     chunks = [[group.column(at) for at in range(about.num_columns)] for group in groups]
     rows = max(about.num_rows, sum(group.num_rows for group in groups))
@@ -177,7 +160,7 @@ def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True)
 
 
 def _seal(path: Path) -> None:
-    """Put the CRC of the footer, computed with zeros in its place, where the writer left zeros."""
+    """Write the CRC of the footer, computed with zeros in its place, where the writer left zeros."""
     with path.open("r+b") as file:
         footer = _read_footer(file)
         at = footer.index(_MARK) + len(_MARK)
@@ -186,7 +169,7 @@ def _seal(path: Path) -> None:
 
 
 def _check_footer(path: Path) -> None:
-    """Refuse a file whose footer is not what its CRC says; one without a CRC passes."""
+    """Refuse a file whose footer contradicts its CRC; one without a CRC passes."""
     with path.open("rb") as file:
         footer = _read_footer(file)
     at = footer.find(_MARK) + len(_MARK)
@@ -196,7 +179,7 @@ def _check_footer(path: Path) -> None:
 
 
 def _read_footer(file: BinaryIO) -> bytes:
-    """Footer and tail of a file; the whole of one that is shorter than it says."""
+    """Read footer and tail of a file; all of a file shorter than it claims."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - _TAIL_BYTES, 0))
     length = int.from_bytes(file.read(4), "little") + _TAIL_BYTES

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders removed whatever is in them."""
+"""Remove folders of any content."""
 
 import os
 from contextlib import suppress
@@ -8,19 +8,10 @@ from typing import NamedTuple
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder with all that is in it, whatever a plugin has made there; nothing is raised, no link is followed.
+    """Remove a folder with all its content, whatever a plugin has made there; raise nothing, follow no link.
 
-    It goes down and up again folder by folder, with one of them open at a time: neither depth nor long names nor rights
-    that were taken away stop it. What the system refuses to remove stays.
-
-    Parameters
-    ----------
-    folder : Path
-        To remove; it need not be there.
-
-    Examples
-    --------
-    >>> remove_tree(Path("nowhere"))
+    It goes down and up again folder by folder, with one of them open at a time: depth, long names and missing rights do
+    not stop it. What the system refuses to remove stays; the folder need not exist.
     """
     with suppress(OSError):
         here = _opened(str(folder), None)
@@ -46,7 +37,7 @@ def remove_tree(folder: Path) -> None:
 
 
 class _Above(NamedTuple):
-    """A folder that is being emptied: what was gone into, what else is left there, and which folder it is."""
+    """A folder while it is emptied: the entry being emptied, the other entries left, and the identity of the folder."""
 
     name: str
     left: list[str]
@@ -58,24 +49,24 @@ def _instead(old: int, new: int) -> int:
     return new
 
 
-def _unlinked(name: str, beside: int) -> int | None:
-    """Remove a file or link; a folder is opened instead, if it can be."""
+def _unlinked(name: str, parent: int) -> int | None:
+    """Remove a file or link; open a folder instead, if possible."""
     with suppress(OSError):
-        os.unlink(name, dir_fd=beside)
+        os.unlink(name, dir_fd=parent)
         return None
     with suppress(OSError):
-        return _opened(name, beside)
+        return _opened(name, parent)
     return None
 
 
-def _opened(name: str, beside: int | None) -> int:
-    """A folder to work in, all rights given to its owner; no link is followed."""
+def _opened(name: str, parent: int | None) -> int:
+    """Open a folder with all rights given to its owner; follow no link."""
     flags = os.O_DIRECTORY | os.O_NOFOLLOW
     if hasattr(os, "O_PATH"):  # opens without the right to read, so that this folder and no other gets its rights
-        known = os.open(name, flags | os.O_PATH, dir_fd=beside)
+        known = os.open(name, flags | os.O_PATH, dir_fd=parent)
         try:
             with suppress(OSError):
                 Path(f"/proc/self/fd/{known}").chmod(0o700)
         finally:
             os.close(known)
-    return os.open(name, flags | os.O_RDONLY, dir_fd=beside)
+    return os.open(name, flags | os.O_RDONLY, dir_fd=parent)

@@ -18,12 +18,7 @@ _MAX_UTM_DEG: Final = (-80.0, 84.0)
 
 
 def utm_epsg(lon_deg: float, lat_deg: float) -> int:
-    """EPSG code of the plain six-degree UTM zone (WGS 84) around a point.
-
-    Raises
-    ------
-    GridError
-        If the point lies where UTM does not reach, or is no longitude and latitude.
+    """Return the EPSG code of the plain six-degree UTM zone (WGS 84) around a point; raise `GridError` beyond UTM.
 
     Examples
     --------
@@ -36,6 +31,12 @@ def utm_epsg(lon_deg: float, lat_deg: float) -> int:
         raise GridError(message)
     zone = min(int((lon_deg + 180) // 6) + 1, 60)
     return (32600 if lat_deg >= 0 else 32700) + zone
+
+
+def _check_cell_size(cell_size_m: float) -> None:
+    if not (math.isfinite(cell_size_m) and cell_size_m > 0):
+        message = f"cell_size_m must be positive and finite, got {cell_size_m!r}"
+        raise GridError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,10 +61,8 @@ class Grid:
     cols: int
 
     def __post_init__(self) -> None:
-        """Refuse what is no lattice."""
-        if not (math.isfinite(self.cell_size_m) and self.cell_size_m > 0):
-            message = f"cell_size_m must be positive and finite, got {self.cell_size_m!r}"
-            raise GridError(message)
+        """Check that the values define a lattice."""
+        _check_cell_size(self.cell_size_m)
         if not (math.isfinite(self.west_m) and math.isfinite(self.north_m)):
             message = f"west_m and north_m must be finite, got {self.west_m!r}, {self.north_m!r}"
             raise GridError(message)
@@ -75,16 +74,14 @@ class Grid:
     def from_bounds(
         cls, west_m: float, south_m: float, east_m: float, north_m: float, *, cell_size_m: float, epsg: int
     ) -> Self:
-        """Smallest grid that covers a box and whose edges are whole multiples of the cell size.
+        """Return the smallest grid that covers a box and whose edges are whole multiples of the cell size.
 
         Examples
         --------
         >>> Grid.from_bounds(3.0, 3.0, 9.0, 9.0, cell_size_m=2.0, epsg=32632).bounds_m
         (2.0, 2.0, 10.0, 10.0)
         """
-        if not (math.isfinite(cell_size_m) and cell_size_m > 0):
-            message = f"cell_size_m must be positive and finite, got {cell_size_m!r}"
-            raise GridError(message)
+        _check_cell_size(cell_size_m)
         if not (west_m < east_m and south_m < north_m):
             message = (
                 f"bounds must grow from west to east and south to north, got {(west_m, south_m, east_m, north_m)!r}"
@@ -105,7 +102,7 @@ class Grid:
     def around(
         cls, easting_m: float, northing_m: float, *, size_m: tuple[float, float], cell_size_m: float, epsg: int
     ) -> Self:
-        """Grid of a width and height around a point; its edges snap to whole multiples of the cell size.
+        """Return a grid of a width and height around a point; its edges snap to whole multiples of the cell size.
 
         Examples
         --------
@@ -119,38 +116,38 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Return rows and columns."""
         return (self.rows, self.cols)
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
-        """West, south, east, north, metres."""
+        """Return west, south, east, north, metres."""
         south_m = self.north_m - self.rows * self.cell_size_m
         return (self.west_m, south_m, self.west_m + self.cols * self.cell_size_m, self.north_m)
 
     @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
-        """Six coefficients in the order of `affine.Affine`: (u, v) -> (easting, northing)."""
+        """Return six coefficients in the order of `affine.Affine`: (u, v) -> (easting, northing)."""
         return (self.cell_size_m, 0.0, self.west_m, 0.0, -self.cell_size_m, self.north_m)
 
     def to_uv(self, en_m: Points) -> Points:
-        """Easting/northing, shape (N, 2), metres -> (u, v), shape (N, 2), cells."""
+        """Convert easting/northing, shape (N, 2), metres, to (u, v), shape (N, 2), cells."""
         return (en_m - (self.west_m, self.north_m)) / (self.cell_size_m, -self.cell_size_m)
 
     def to_en_m(self, uv: Points) -> Points:
-        """Inverse of `to_uv`."""
+        """Convert (u, v), shape (N, 2), cells, to easting/northing, metres."""
         return uv * (self.cell_size_m, -self.cell_size_m) + (self.west_m, self.north_m)
 
     def to_cells(self, en_m: Points) -> NDArray[np.int64]:
-        """Easting/northing, shape (N, 2), metres -> (row, col) of the cell around each point, shape (N, 2)."""
+        """Convert easting/northing, shape (N, 2), metres, to (row, col) of the cell around each point, shape (N, 2)."""
         return np.floor(self.to_uv(en_m)).astype(np.int64)[:, ::-1]
 
     def to_centres_m(self, cells: NDArray[np.int64]) -> Points:
-        """(row, col), shape (N, 2) -> easting/northing of the cells' centres, shape (N, 2), metres."""
+        """Convert (row, col), shape (N, 2), to easting/northing of the cells' centres, shape (N, 2), metres."""
         return self.to_en_m(cells[:, ::-1].astype(np.float64) + 0.5)
 
     def window(self, row: int, col: int, rows: int, cols: int) -> Self:
-        """Part of the grid that begins at a cell; it may reach beyond."""
+        """Return the part of the grid that begins at a cell; it may reach beyond."""
         return type(self)(
             epsg=self.epsg,
             west_m=self.west_m + col * self.cell_size_m,
@@ -161,7 +158,7 @@ class Grid:
         )
 
     def windows(self, size_cells: int) -> Iterator[tuple[int, int, Self]]:
-        """Tile the grid: row, column and window, row by row; the last ones are smaller.
+        """Tile the grid: yield row, column and window, row by row; the last ones are smaller.
 
         Examples
         --------
@@ -175,13 +172,7 @@ class Grid:
                 yield row, col, self.window(row, col, rows, cols)
 
     def coarsen(self, factor: int) -> Self:
-        """Return the grid whose cells are `factor` times as large, from the same corner; it covers at least as much.
-
-        Examples
-        --------
-        >>> Grid(epsg=32632, west_m=0.0, north_m=0.0, cell_size_m=1.0, rows=5, cols=4).coarsen(2).shape
-        (3, 2)
-        """
+        """Return the grid whose cells are `factor` times as large, from the same corner; it covers at least as much."""
         return type(self)(
             epsg=self.epsg,
             west_m=self.west_m,

@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any, Final
 
-from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import Matcher, MatcherCard
 from sasgeo_bench.matching.rejector import Rejector, RejectorCard
@@ -53,7 +53,9 @@ def _installed(group: str) -> list[EntryPoint]:
     try:
         installed = entry_points(group=group)
     except Exception as error:
-        message = f"an installed package has entry points that cannot be read ({told(error)}): reinstall or remove it"
+        message = (
+            f"an installed package has entry points that cannot be read ({message_of(error)}): reinstall or remove it"
+        )
         raise MatchError(message) from error
     return sorted(installed, key=lambda point: (_home(point) not in _OURS, _home(point), point.value))
 
@@ -186,7 +188,7 @@ def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequenc
         card = getattr(plugin, "card", None)
         missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
     except (Exception, SystemExit) as error:
-        message = f"{spec}: its card and verbs cannot be read ({told(error)})"
+        message = f"{spec}: its card and verbs cannot be read ({message_of(error)})"
         raise MatchError(message) from error
     if not isinstance(card, card_type):
         expected = f"{card_type.__module__}.{card_type.__name__}"
@@ -207,7 +209,7 @@ def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatev
     try:
         return target()
     except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
-        message = f"{spec}: cannot be made ({told(error)})"
+        message = f"{spec}: cannot be made ({message_of(error)})"
         raise MatchError(message) from error
 
 
@@ -216,7 +218,7 @@ def _from_module(spec: str) -> Callable[[], Any]:
     try:
         return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
     except (Exception, SystemExit) as error:
-        message = f"{one_line(spec)}: cannot be imported ({told(error)})"
+        message = f"{one_line(spec)}: cannot be imported ({message_of(error)})"
         raise MatchError(message) from error
 
 
@@ -286,5 +288,5 @@ def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
     try:
         return point.load()  # type: ignore[no-any-return]
     except (Exception, SystemExit) as error:
-        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({told(error)})"
+        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({message_of(error)})"
         raise MatchError(message) from error

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that knows OSM files: finding, cutting, reading and classifying them."""
+"""Find, cut, read and classify OSM files."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an extract holds the map: extracts end at borders, polygons and boxes, and beyond that nothing is absent."""
+"""The area that an extract maps: extracts end at borders, polygons and boxes, and beyond that nothing is absent."""
 
 from typing import Final
 
@@ -20,22 +20,11 @@ _M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the s
 
 
 def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
-    """Outline of where mapped coordinates lie, in longitude and latitude.
+    """Estimate the area that holds mapped vertices; longitude and latitude of shape (N, 2), degrees.
 
-    Parameters
-    ----------
-    lonlat : ndarray of float, shape (N, 2)
-        Longitude and latitude of vertices, degrees.
-
-    Returns
-    -------
-    shapely.Geometry
-        Polygon or multipolygon, degrees; empty for no vertices.
-
-    Notes
-    -----
-    Cells of 100 m that hold a vertex are closed over 600 m, holes filled, thin tails (ways kept whole across the edge)
-    and small leftovers cut off. It is an estimate: a region file's `coverage_lonlat` overrules it.
+    Mark cells of 100 m that hold a vertex, close them over 600 m, fill holes, and remove thin tails (ways kept whole
+    across the edge) and small leftovers. A region file's `coverage_lonlat` overrules the estimate. Return an empty
+    polygon for no vertices.
 
     Examples
     --------
@@ -68,7 +57,7 @@ def _disc(radius_m: float) -> NDArray[np.bool_]:
 
 
 def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Close by distance transforms, whose cost does not grow with the radius, then fill holes."""
+    """Close cells by distance transforms, whose cost does not grow with the radius, then fill holes."""
     reach = CLOSE_M / CELL_M / 2
     near = ndimage.distance_transform_edt(~cells) <= reach
     return np.asarray(ndimage.binary_fill_holes(ndimage.distance_transform_edt(near) > reach))
@@ -93,27 +82,11 @@ def choose_coverage(
     stated: shapely.Geometry | None,
     header_box: tuple[float, float, float, float] | None,
 ) -> tuple[shapely.Geometry, CoverageSource]:
-    """Choose the mapped area of an extract and say where it comes from.
+    """Choose the mapped area of an extract, in degrees, and name its source.
 
-    Parameters
-    ----------
-    lonlat : ndarray of float, shape (N, 2)
-        Longitude and latitude of the extract's vertices, degrees.
-    stated : shapely.Geometry or None
-        The region file's polygon, degrees; it overrules all else.
-    header_box : tuple of float or None
-        West, south, east, north of the file's header, degrees.
-
-    Returns
-    -------
-    shapely.Geometry, {"region file", "header box", "estimated"}
-        The area in degrees, and its source. The header's box is taken where the data fill it (an extract cut by a box);
-        of an extract cut along a border it is only the frame, and the estimate within it is taken.
-
-    Examples
-    --------
-    >>> choose_coverage(np.zeros((0, 2)), stated=shapely.box(9, 47, 10, 48), header_box=None)[1]
-    'region file'
+    The region file's polygon (`stated`) comes first. The box of the file's header (west, south, east, north) is taken
+    if the data fill it: the extract was cut by a box. Otherwise the extract was cut along a border, and the estimate
+    within the box is taken.
     """
     if stated is not None:
         return stated, "region file"

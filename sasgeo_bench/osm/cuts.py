@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways that an extract cut: they name nodes that it does not hold, and the ground they lead over is unknown."""
+"""Ways that lost nodes where the extract was cut: the ground they lead over is unknown."""
 
 from itertools import pairwise
 from typing import Any, Final
@@ -16,10 +16,9 @@ Geometries = NDArray[np.object_]
 
 
 def find_gaps(way: Any) -> list[shapely.Geometry]:  # noqa: ANN401 - an osmium way, or what looks like one
-    """List where a way lacks nodes, by the nodes beside them, in longitude and latitude.
+    """List the gaps of a way, in longitude and latitude; none if it has all of its nodes, or no node.
 
-    Of a closed way a line over each gap, of an open one a point for each node beside a gap. Nothing for a way that has
-    all of its nodes, or none.
+    Return a line over each gap of a closed way, and a point for each node next to a gap of an open way.
     """
     places = [(node.lon, node.lat) if node.location.valid() else None for node in way.nodes]
     known = [index for index, place in enumerate(places) if place is not None]
@@ -38,20 +37,11 @@ def find_gaps(way: Any) -> list[shapely.Geometry]:  # noqa: ANN401 - an osmium w
 
 
 def ground_within_reach(gaps: Geometries, mapped: shapely.Geometry) -> shapely.Geometry:
-    """Ground that the missing parts of cut ways may lie on.
+    """Return the ground on which the missing parts of cut ways may lie, within the mapped area.
 
-    Parameters
-    ----------
-    gaps : ndarray of shapely.Geometry
-        From `find_gaps`, in a projected CRS, metres.
-    mapped : shapely.Geometry
-        The mapped area in the same CRS: what is missing lies beyond its edge.
-
-    Returns
-    -------
-    shapely.Geometry
-        As far around each node beside a gap as the edge is away, at most `LONGEST_M`; of a closed way also what lies
-        between its gap and the edge. Within the mapped area.
+    It reaches as far around each node next to a gap as the edge is away, at most `LONGEST_M`; for a closed way it
+    includes what lies between its gap and the edge. `gaps` come from `find_gaps`; both arguments share a projected CRS,
+    metres.
 
     Examples
     --------
@@ -72,7 +62,7 @@ def ground_within_reach(gaps: Geometries, mapped: shapely.Geometry) -> shapely.G
 
 
 def _up_to_edge(gap: shapely.Geometry, parts: Geometries) -> shapely.Geometry:
-    """What a line over a gap parts from the rest of the mapped area, going round the edge the shorter way."""
+    """Return the area between a line over a gap and the edge of the mapped area, by the shorter way round."""
     edge = shapely.get_exterior_ring(parts[np.argmin(shapely.distance(parts, gap))])
     ring = shapely.LineString(edge.coords)
     first, last = sorted(shapely.line_locate_point(ring, shapely.points(gap.coords)).tolist())

@@ -28,29 +28,9 @@ DTYPES: Final = {
 
 
 def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
-    """Build a feature table with the right column order and types.
+    """Build a checked feature table from one array for each column of `DTYPES` and `geometry`, metres in CRS `epsg`.
 
-    Parameters
-    ----------
-    columns : dict
-        One array of shape (N,) for each column of `DTYPES`, and `geometry`.
-    epsg : int
-        The projected CRS of the geometry, metres.
-
-    Returns
-    -------
-    geopandas.GeoDataFrame
-        The table, checked.
-
-    Raises
-    ------
-    ShapeError
-        If a column is missing or more than is known.
-
-    Examples
-    --------
-    >>> len(make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632))
-    0
+    Raise `ShapeError` if a column is missing.
     """
     missing = [name for name in (*DTYPES, "geometry") if name not in columns]
     if missing:
@@ -63,19 +43,7 @@ def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
 
 
 def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Return the table unchanged if it is a feature table.
-
-    Raises
-    ------
-    ShapeError
-        If columns are missing, types differ, or the CRS is not a projected one in metres.
-
-    Examples
-    --------
-    >>> table = make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632)
-    >>> check_features(table) is table
-    True
-    """
+    """Return a feature table unchanged; raise `ShapeError` if columns, types or CRS (projected, metres) are wrong."""
     wanted = [*DTYPES, "geometry"]
     if list(features.columns) != wanted:
         message = (
@@ -93,14 +61,9 @@ def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 def fingerprint(features: gpd.GeoDataFrame) -> str:
-    """Hash what a table holds, whatever the order of its rows: types, ids, versions, classes and centroids.
+    """Hash types, ids, versions, classes and centroids of a table, whatever the order of its rows.
 
-    Coordinates are rounded to a millimetre, so another version of PROJ does not change the fingerprint.
-
-    Examples
-    --------
-    >>> fingerprint(make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632))[:8]
-    'e3b0c442'
+    Coordinates are rounded to a millimetre, so that another version of PROJ gives the same fingerprint.
     """
     centres = shapely.get_coordinates(shapely.centroid(features.geometry.array)).round(3) + 0.0
     columns = [features[name].to_numpy().tolist() for name in ("osm_type", "osm_id", "version", "class")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several dated extracts of one place, or one full history cut at several dates, read over the area all of them map."""
+"""Several dated extracts of one place, or one full history cut at several dates, read over their common area."""
 
 import datetime as dt
 import re
@@ -23,7 +23,7 @@ from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.osm.coverage import CLOSE_M
 from sasgeo_bench.osm.features import SEA
 from sasgeo_bench.osm.lifecycle import Lifecycle, read_lifecycle
-from sasgeo_bench.osm.mapped import project
+from sasgeo_bench.osm.mapped import box_text, project
 from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import Box
 from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, read_header
@@ -33,12 +33,12 @@ CELL_M: Final = 10.0  # of the grid that frames the reading; nothing is burnt in
 _EDGE_DEG: Final = 0.01  # a box's straight sides in degrees bend when projected: a corner at least so often
 _LEAST_STATES: Final = 2
 _NAMED_DATE: Final = re.compile(r"(?<!\d)(\d{4}-\d{2}-\d{2})(?!\d)")
-_SILENT: Final[Callable[[str], None]] = lambda _: None  # noqa: E731 - a default, told apart by nothing else
+_SILENT: Final[Callable[[str], None]] = lambda _: None  # noqa: E731 - a default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatedExtract:
-    """A file and the day it speaks of; of a full history the day it is cut at."""
+    """An extract and its date; for a full history, the date to cut it at."""
 
     path: Path
     on: dt.date
@@ -46,7 +46,7 @@ class DatedExtract:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """What one extract says of the common area: features with whole geometries, and hints at their lives."""
+    """One dated state of the common area: features with whole geometries, and hints from lifecycle tags."""
 
     source: str
     on: dt.date
@@ -56,7 +56,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class History:
-    """States of one place in the order of their dates, and the area that all of them map, in the CRS `epsg`."""
+    """States of one place, oldest first, and the area that all of them map, in the CRS `epsg`."""
 
     states: tuple[State, ...]
     area: shapely.Geometry
@@ -64,30 +64,14 @@ class History:
 
 
 def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple[DatedExtract, ...]:
-    """Give every extract its date and put them in order.
+    """Date every extract, and sort them by date.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Extracts; full histories (`.osh.*`) among them are cut at every date of `at`.
-    at : sequence of date
-        Where no file is a full history: the date of each, in the order of `paths`. Else the dates of the histories.
+    Full histories (`.osh.*`) are cut at every date of `at`. Without a full history, `at` dates the files in their
+    order; if it is empty, a file is dated by its header, else by the last YYYY-MM-DD in its name, else by its newest
+    element.
 
-    Returns
-    -------
-    tuple of DatedExtract
-        At least two, of different days, oldest first.
-
-    Raises
-    ------
-    ConfigError
-        If the dates do not fit the files, two states are of one day, or there are fewer than two.
-    ExtractError
-        If a file is missing, damaged, or says nowhere what day it is of.
-
-    Notes
-    -----
-    A file dates itself by its header, else by the last YYYY-MM-DD in its name, else by its newest element.
+    Raise `ConfigError` if the dates do not fit the files, two states have one date, or there are fewer than two states,
+    and `ExtractError` if a file is missing, damaged or has no date.
 
     Examples
     --------
@@ -149,7 +133,7 @@ def read_history(
     margin_m: float = MARGIN_M,
     tell: Callable[[str], None] = _SILENT,
 ) -> History:
-    """Read dated extracts over the area that all of them map.
+    """Read dated extracts over the area that all of them map, in a UTM zone; `tell` takes a line about each.
 
     Parameters
     ----------
@@ -158,16 +142,10 @@ def read_history(
     bounds : tuple of float, optional
         West, south, east, north, degrees: no more than this.
     margin_m : float
-        Cut off along the edges of coverages that are estimated: two extracts of a country are seldom cut along one
-        line, and what lies between their lines would vanish or appear in a day. States of one file have one edge, so
-        nothing is cut off there.
+        Margin to cut off along estimated edges. Two extracts of a country are seldom cut along one line, and what lies
+        between their lines would vanish or appear in a day. States of one file share one edge, so nothing is cut off.
     tell : callable, optional
-        Takes a line about each extract.
-
-    Returns
-    -------
-    History
-        The states, and the intersection of their coverages in a UTM zone.
+        Receives one line for each extract.
 
     Raises
     ------
@@ -175,13 +153,6 @@ def read_history(
         If the extracts and the bounds have no area in common.
     ExtractError
         If a file is missing, damaged or of an unknown format.
-
-    Examples
-    --------
-    >>> read_history([DatedExtract(path=Path("nowhere.osm.pbf"), on=dt.date(2020, 1, 1))])
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
     boxes = {path: _frame(path) for path in dict.fromkeys(item.path for item in dated)}
     frame = _common_frame(boxes, bounds)
@@ -211,7 +182,7 @@ def read_history(
 
 
 def _inner(reading: Reading, grid: Grid, *, margin_m: float) -> shapely.Geometry:
-    """The coverage less a margin along its own edges, if they are estimated; the grid's are no edges of a map."""
+    """Return the coverage less a margin along its own estimated edges; the grid's edges do not count."""
     if reading.coverage_source != "estimated" or margin_m <= 0:
         return reading.coverage
     beyond = shapely.difference(shapely.box(*grid.bounds_m), reading.coverage)
@@ -226,7 +197,7 @@ def _line(item: DatedExtract, reading: Reading) -> str:
 
 @contextmanager
 def _one_state(item: DatedExtract) -> Iterator[Path]:
-    """A file with one state of the world: the extract itself, or a full history cut once for both passes."""
+    """Yield a file with one state: the extract itself, or a full history cut once for both passes."""
     if not is_history(item.path):
         yield item.path
         return
@@ -238,7 +209,7 @@ def _one_state(item: DatedExtract) -> Iterator[Path]:
 
 
 def _frame(path: Path) -> Box:
-    """The box of a file's header, else of its nodes, degrees; what is mapped lies within."""
+    """Return the box of a file's header, else of its nodes, degrees."""
     box = read_header(path).box_lonlat
     if box is not None:
         return box
@@ -259,14 +230,10 @@ def _common_frame(boxes: dict[Path, Box], bounds: Box | None) -> Box:
         if not (frame[0] < frame[2] and frame[1] < frame[3]):
             what = "the bounds" if bounds is not None and len(boxes) == 1 else "the other extracts or the bounds"
             message = (
-                f"{path.name} covers {_written(box)} (west, south, east, north) and has nothing in common with {what}"
+                f"{path.name} covers {box_text(box)} (west, south, east, north) and has nothing in common with {what}"
             )
             raise CoverageError(message)
     return frame
-
-
-def _written(box: Box) -> str:
-    return "[" + ", ".join(f"{value:.4f}" for value in box) + "]"
 
 
 def _projected_box(frame: Box, epsg: int) -> shapely.Geometry:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an extract says of the life of things: what is being built, what is gone, when something was begun."""
+"""Lifecycle tags of an extract: what is being built, what is gone, and when something was begun."""
 
 import datetime as dt
 import re
@@ -48,9 +48,10 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lifecycle:
-    """Hints of one state, in the CRS of its features: places, and the days objects say they were begun.
+    """Hints of one state, in the CRS of its features.
 
-    `gone` are the places of what is tagged as demolished, razed, removed or abandoned; `rising` those of construction.
+    `gone` are places tagged as demolished, razed, removed or abandoned, `rising` those of construction, and `started`
+    the days on which objects were begun.
     """
 
     gone: NDArray[np.object_]
@@ -58,37 +59,11 @@ class Lifecycle:
     started: dict[ObjectKey, Span]
 
 
-def no_lifecycle() -> Lifecycle:
-    """Hints of an extract that gives none.
-
-    Examples
-    --------
-    >>> no_lifecycle().started
-    {}
-    """
-    nothing = np.array([], dtype=object)
-    return Lifecycle(gone=nothing, rising=nothing, started={})
-
-
 def read_lifecycle(path: Path, *, epsg: int) -> Lifecycle:
-    """Read the hints of one sorted state of the world (`open_snapshot`).
+    """Read the hints of ways and areas in one sorted state (`open_snapshot`), projected to `epsg`, metres.
 
-    Parameters
-    ----------
-    path : Path
-        A sorted OSM file.
-    epsg : int
-        The projected CRS of the places, metres.
-
-    Returns
-    -------
-    Lifecycle
-        Ways and areas with a lifecycle tag; nodes have no extent and are left out.
-
-    Raises
-    ------
-    RuntimeError
-        What osmium throws on a damaged file; `open_snapshot` turns it into an `ExtractError`.
+    Nodes have no extent and are left out. osmium raises `RuntimeError` on a damaged file, which `open_snapshot` turns
+    into an `ExtractError`.
     """
     gone: list[bytes] = []
     rising: list[bytes] = []
@@ -109,7 +84,7 @@ def read_lifecycle(path: Path, *, epsg: int) -> Lifecycle:
 
 
 def _tagged(path: Path, wanted: osmium.BaseFilter) -> Iterator[tuple[Any, bool, int]]:
-    """Open ways and areas that pass a filter, which runs in C++; a closed way comes as its area alone."""
+    """Yield open ways and areas that pass a filter, which runs in C++; a closed way comes as its area alone."""
     processor = osmium.FileProcessor(str(path)).with_locations().with_areas(wanted)
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
     for item in elements(processor.with_filter(kinds).with_filter(wanted)):
@@ -134,17 +109,9 @@ def _places(wkb: list[bytes], epsg: int) -> NDArray[np.object_]:
 
 
 def parse_start(text: str | None) -> Span | None:
-    """Days that a `start_date` may mean; None where it cannot be understood.
+    """Parse a `start_date` tag into the days that it may mean; None if it cannot be understood.
 
-    Parameters
-    ----------
-    text : str or None
-        The tag: "2015", "2015-06", "2015-06-12", "1990s", "C19", "before 1950", "~2015" (two years either way).
-
-    Returns
-    -------
-    Span or None
-        First and last day.
+    It reads "2015", "2015-06", "2015-06-12", "1990s", "C19", "before 1950", and "~2015" (two years either way).
 
     Examples
     --------
@@ -196,6 +163,6 @@ def _years(first: int, last: int) -> Span | None:
 
 
 def _moved(day: dt.date, years: int) -> dt.date:
-    """The same day some years on; the 28th stands for a 29th of February that is not there."""
+    """Return the same day some years later; the 28th replaces a 29th of February that does not exist."""
     year = min(max(day.year + years, dt.MINYEAR), dt.MAXYEAR)
     return dt.date(year, day.month, min(day.day, 28)) if years else day

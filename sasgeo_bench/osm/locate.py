@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding a dated extract: by file name and SHA-256 in the folders named, then by download."""
+"""Find a dated extract by file name and SHA-256 in the given folders, else download it."""
 
 import datetime as dt
-import hashlib
 import os
 import sys
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.files.hashes import sha256_of
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 _SILENT_S: Final = 30.0  # between two parts of a download
@@ -31,7 +31,7 @@ Morphology = Literal["grid", "old_town", "suburb", "industrial", "riverside", "a
 
 
 class TownEntry(Document):
-    """An embedded town instead of a file: made by `write_town`, never downloaded."""
+    """An embedded town in place of a file: made by `write_town`, never downloaded."""
 
     morphology: Morphology
     seed: Annotated[int, Field(ge=0)]
@@ -41,13 +41,8 @@ class TownEntry(Document):
 class Extract(Document):
     """One `[[extract]]` of a region file.
 
-    `date` is the day the extract speaks of; of a full history, the day it is cut at. Several hashes are several
-    accepted forms of one file, such as with and without user names.
-
-    Examples
-    --------
-    >>> Extract(file="town.osm.pbf", date=dt.date(2020, 1, 1), town=TownEntry(morphology="grid", seed=1)).urls
-    ()
+    `date` is the date of the extract; for a full history, the date to cut it at. Several hashes are several accepted
+    forms of one file, such as with and without user names.
     """
 
     file: Line
@@ -73,55 +68,21 @@ class Extract(Document):
 
 
 def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
-    """Folders searched for extracts, in order: those given, SASGEO_EXTRACTS, the user's cache.
-
-    Examples
-    --------
-    >>> extract_folders([Path("mine")])[0].name
-    'mine'
-    """
+    """Return the folders to search for extracts, in order: those given, SASGEO_EXTRACTS, the user's cache."""
     named = [Path(folder) for folder in os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep) if folder]
     return (*given, *named, cache_folder())
 
 
 def cache_folder() -> Path:
-    """Where downloaded extracts are kept.
-
-    Examples
-    --------
-    >>> cache_folder().name
-    'sasgeo-bench'
-    """
+    """Return the folder of downloaded extracts."""
     return Path(pooch.os_cache("sasgeo-bench"))
 
 
 def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
-    """Find the file of an extract, or download it into the user's cache.
+    """Find the file of an extract by name and SHA-256, or download it into the user's cache; `folders` come first.
 
-    Parameters
-    ----------
-    extract : Extract
-        Name, accepted hashes and addresses.
-    folders : sequence of Path
-        Searched first.
-
-    Returns
-    -------
-    Path
-        A file whose SHA-256 is one of those accepted.
-
-    Raises
-    ------
-    ExtractError
-        If no folder holds the file and it cannot be downloaded; the line names the file, its SHA-256 and its place.
-
-    Examples
-    --------
-    >>> wanted = Extract(file="nowhere.osm.pbf", date=dt.date(2020, 1, 1), sha256=("0" * 64,))
-    >>> find_extract(wanted)  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.ExtractError: nowhere.osm.pbf (SHA-256 0000...) was not found: put it into ...
+    Raise `ExtractError` if no folder holds it and it cannot be downloaded; the message names the file, its SHA-256 and
+    where to put it.
     """
     if not extract.sha256:
         message = f"{extract.file} is an embedded town: it is made by the build, there is no file to find"
@@ -130,7 +91,7 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     for folder in extract_folders(folders):
         path = folder / extract.file
         if path.is_file():
-            found = _sha256(path)
+            found = sha256_of(path)
             if found in extract.sha256:
                 return path
             wrong.append(f"{path} has SHA-256 {found}, which is none of those accepted")
@@ -153,20 +114,8 @@ def _not_found(extract: Extract, folders: Sequence[Path], reasons: Sequence[str]
     )
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as source:
-        return hashlib.file_digest(source, "sha256").hexdigest()
-
-
-def _check_hash(path: Path, extract: Extract, source: str) -> None:
-    found = _sha256(path)
-    if found not in extract.sha256:
-        message = f"{source} has SHA-256 {found}, which is none of those accepted"
-        raise ExtractError(message)
-
-
 def _download(extract: Extract, url: str) -> Path:
-    """Download into the cache; the file gets its name only when its hash is one of those accepted."""
+    """Download into the cache; the file gets its name only if its hash is accepted."""
     if not answers(url):
         message = f"{url} cannot be reached"
         raise ExtractError(message)
@@ -176,10 +125,13 @@ def _download(extract: Extract, url: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".download-") as scratch:
-            # pooch checks one hash, and several may be accepted here: so it is told none, and we check.
+            # pooch checks one hash, and several may be accepted here: so it gets none, and we check.
             got = Path(pooch.retrieve(url, known_hash=None, fname=extract.file, path=scratch, downloader=load))
-            _check_hash(got, extract, url)
-            return got.replace(folder / extract.file)
+            found = sha256_of(got)
+            if found in extract.sha256:
+                return got.replace(folder / extract.file)
+            message = f"{url} has SHA-256 {found}, which is none of those accepted"
+            raise ExtractError(message)  # noqa: TRY301 - an OSError too, and passed on as it is
     except ExtractError:
         raise
     except OSError as error:  # requests' errors are OSErrors, too
@@ -188,7 +140,7 @@ def _download(extract: Extract, url: str) -> Path:
 
 
 def _why(error: OSError) -> str:
-    """Reason of a failed download, in our words: those of the libraries name their own insides."""
+    """Describe why a download failed, without the internals that the libraries name."""
     response = getattr(error, "response", None)
     if response is not None:
         return f"the server answered with status {response.status_code}"
@@ -196,13 +148,7 @@ def _why(error: OSError) -> str:
 
 
 def answers(url: str) -> bool:
-    """Whether the server of an address answers at all, within `ANSWER_S`; asked once for each server.
-
-    Examples
-    --------
-    >>> answers("http://127.0.0.1:1/town.osm.pbf")
-    False
-    """
+    """Return whether the server of an address answers within `ANSWER_S`; each server is asked once."""
     parts = urlsplit(url)
     return parts.scheme in {"http", "https"} and _server_answers(f"{parts.scheme}://{parts.netloc}")
 
@@ -210,14 +156,15 @@ def answers(url: str) -> bool:
 @cache
 def _server_answers(server: str) -> bool:
     found = Event()
-
-    def ask() -> None:
-        with suppress(OSError, ValueError):
-            pooch.HTTPDownloader(timeout=ANSWER_S)(server, None, None, check_only=True)
-            found.set()
-
     # In a thread: the look-up of a name takes as long as the system likes, whatever limit is set on the connection.
-    thread = Thread(target=ask, daemon=True)
+    thread = Thread(target=_ask, args=(server, found), daemon=True)
     thread.start()
     thread.join(ANSWER_S)
     return found.is_set()
+
+
+def _ask(server: str, found: Event) -> None:
+    """Set the event if the server answers."""
+    with suppress(OSError, ValueError):
+        pooch.HTTPDownloader(timeout=ANSWER_S)(server, None, None, check_only=True)
+        found.set()

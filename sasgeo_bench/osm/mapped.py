@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an extract holds the map of a grid, which part of it is sea, and what of it is unknown and why."""
+"""The mapped ground of a grid: which part of it is sea, and what is unknown and why."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.cuts import ground_within_reach
 from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.osm.scan import Box
 from sasgeo_bench.osm.sea import find_shore
 
 CUT: Final = "within reach of ways cut at the edge of the extract"
@@ -23,16 +24,15 @@ _AROUND_DEG: Final = 0.5  # coast further off decides nothing here, and a projec
 _COARSE_M: Final = 20.0  # of outlines of islands, where only what is about a kilometre away counts
 _AREA: Final = 2  # dimensions of a polygon
 
-Box = tuple[float, float, float, float]
 Geometries = NDArray[np.object_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mapped:
-    """What is known of the ground of a grid, in its CRS.
+    """The known ground of a grid, in its CRS.
 
-    `coverage` is the mapped area less what is unknown within it, `unknown_m2` the size of that by reason, and `sea` the
-    polygons of the mapped area that are water for their side of the coast.
+    `coverage` is the mapped area less the unknown ground in it, `unknown_m2` the size of that ground by reason, and
+    `sea` the polygons of the mapped area on the water side of the coast.
     """
 
     coverage: shapely.Geometry
@@ -50,7 +50,7 @@ def map_ground(
     gaps: Geometries,
     frame: shapely.Geometry,
 ) -> Mapped:
-    """Find what of a grid an extract maps, what of that is sea, and what is unknown.
+    """Find the mapped ground of a grid, the sea in it, and what is unknown.
 
     Parameters
     ----------
@@ -58,25 +58,17 @@ def map_ground(
         The area wanted.
     area, source : shapely.Geometry, str
         From `choose_coverage`: the mapped area in longitude and latitude.
-    coast, gaps : ndarray of shapely.Geometry
-        All coastlines of the extract, and where its ways lack nodes (`find_gaps`), in longitude and latitude.
+    coast : ndarray of shapely.Geometry
+        Every coastline of the extract, in longitude and latitude; water lies on its right.
+    gaps : ndarray of shapely.Geometry
+        From `find_gaps`.
     frame : shapely.Geometry
-        The box that the whole extract lies in, in longitude and latitude.
+        Box that holds the extract's vertices, in longitude and latitude.
 
     Returns
     -------
     Mapped
-        In the CRS of the grid. An estimated outline grows to whole islands and `OFFSHORE_M` of the sea around them.
-
-    Examples
-    --------
-    >>> grid = Grid(epsg=32632, west_m=5e5, north_m=100.0, cell_size_m=1.0, rows=100, cols=100)
-    >>> quay = shapely.LineString([(8.9, 0.0003), (9.1, 0.0003)])  # 33 m north of the southern edge, eastwards
-    >>> none = np.array([], dtype=object)
-    >>> box = shapely.box(8.9, -0.1, 9.1, 0.1)
-    >>> found = map_ground(grid, box, "header box", coast=np.array([quay]), gaps=none, frame=box)
-    >>> round(shapely.area(found.sea).sum()), round(found.coverage.area)
-    (3316, 10000)
+        Where the area is estimated, whole islands and the sea around them count as mapped too.
     """
     west, south, east, north = lonlat_box(grid)
     near = shapely.box(west - _AROUND_DEG, south - _AROUND_DEG, east + _AROUND_DEG, north + _AROUND_DEG)
@@ -102,7 +94,7 @@ def map_ground(
 
 
 def _less(ground: shapely.Geometry, unknown: dict[str, shapely.Geometry]) -> shapely.Geometry:
-    """The ground without what is unknown of it, polygons alone."""
+    """Return the polygons of the ground less its unknown parts."""
     if all(part.is_empty for part in unknown.values()):
         return ground
     parts = shapely.get_parts(shapely.difference(ground, shapely.union_all(list(unknown.values()))))
@@ -110,7 +102,7 @@ def _less(ground: shapely.Geometry, unknown: dict[str, shapely.Geometry]) -> sha
 
 
 def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
-    """Islands that lie in a frame whole, with the sea around them; nothing where any coastline in it is not whole."""
+    """Return islands that lie whole within a frame and the sea around them; empty if a coastline is not whole."""
     shore = find_shore(coast, frame)
     is_whole = shapely.length(shapely.intersection(shore.land, shapely.boundary(frame))) == 0
     if shore.unknown or not is_whole.any():
@@ -121,13 +113,7 @@ def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
 
 
 def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
-    """Longitude and latitude -> easting and northing of a CRS, rounded to a millimetre; one geometry or an array.
-
-    Examples
-    --------
-    >>> project(shapely.Point(9.0, 0.0), 32632)
-    <POINT (500000 0)>
-    """
+    """Project longitude and latitude to easting and northing, rounded to a millimetre; one geometry or an array."""
     to_grid = pyproj.Transformer.from_crs(_WGS84, epsg, always_xy=True)
 
     def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,15 +124,13 @@ def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
 
 
 def lonlat_box(grid: Grid) -> Box:
-    """West, south, east, north of a grid, degrees: the box around its bent edges.
-
-    Examples
-    --------
-    >>> west, *_ = lonlat_box(Grid(epsg=32632, west_m=5e5, north_m=5.2e6, cell_size_m=1.0, rows=9, cols=9))
-    >>> round(west, 6)
-    9.0
-    """
+    """Return west, south, east, north of a grid, degrees: the box around its bent edges."""
     to_lonlat = pyproj.Transformer.from_crs(grid.epsg, _WGS84, always_xy=True)
     west, south, east, north = grid.bounds_m
     bounds = to_lonlat.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS)
     return (float(bounds[0]), float(bounds[1]), float(bounds[2]), float(bounds[3]))
+
+
+def box_text(box: Box | NDArray[np.float64]) -> str:
+    """Format a box for an error, to four decimals."""
+    return "[" + ", ".join(f"{value:.4f}" for value in box) + "]"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an OSM file to a feature table: read, classify, project, cut to the grid."""
+"""Read an OSM file into a feature table: read, classify, project, cut to the grid."""
 
 import datetime as dt
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.coverage import choose_coverage
 from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
 from sasgeo_bench.osm.locate import CoverageSource
-from sasgeo_bench.osm.mapped import Mapped, lonlat_box, map_ground, project
+from sasgeo_bench.osm.mapped import Mapped, box_text, lonlat_box, map_ground, project
 from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
@@ -28,12 +28,12 @@ _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium says 1970-01-01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """What one extract says about one grid.
+    """The content of one extract for one grid.
 
-    `coverage` lies in the grid's CRS and is cut to the grid; `unknown_m2` is what was taken out of it, by reason (one
-    place may have two), and `cuts` counts what an extract cut out of a larger one lacks. `drops`, `hidden` and `notes`
-    count objects around the grid by reason; `osm_timestamp` is the newest moment the extract speaks of, None where it
-    carries no times.
+    `coverage` lies in the grid's CRS and is cut to the grid. `unknown_m2` is the ground removed from it, by reason (one
+    place may have two). `cuts` counts what an extract lost where it was cut out of a larger one. `drops`, `hidden` and
+    `notes` count objects around the grid by reason. `osm_timestamp` is the newest time in the extract, None if it has
+    none.
     """
 
     features: gpd.GeoDataFrame
@@ -54,7 +54,6 @@ def read_extract(
     *,
     at: dt.date | None = None,
     stated_coverage: shapely.Geometry | None = None,
-    taxonomy: Taxonomy | None = None,
 ) -> Reading:
     """Read the features of one extract that touch a grid.
 
@@ -63,36 +62,26 @@ def read_extract(
     path : Path
         An OSM file: .osm.pbf, .osm, .osm.gz, .osm.bz2, or a full history (.osh.pbf) with `at`.
     grid : Grid
-        The area wanted; its CRS is that of the features, metres.
+        The area wanted; features get its CRS.
     at : date, optional
         For a full history: the state at the end of this day.
     stated_coverage : shapely.Geometry, optional
-        Mapped area in longitude and latitude, where the user knows it.
-    taxonomy : Taxonomy, optional
-        The classes; those of the package unless given.
+        Mapped area in longitude and latitude, if the user knows it.
 
     Returns
     -------
     Reading
-        Features with whole geometries, ordered by class and id, whatever the order in the file.
+        Features with whole geometries, sorted by class and id, whatever the order in the file.
 
     Raises
     ------
     ExtractError
-        If the file is missing, damaged or of an unknown format, or an id, date or coordinate in it is no number: what
-        comes after that cannot be read. A node beyond the globe is only taken out of its ways, and counted in `drops`.
+        If the file is missing, damaged or of an unknown format, or an id, date or coordinate is not a number. A node
+        beyond the globe is removed from its ways and counted in `drops`.
     CoverageError
         If the grid lies outside the extract, or no element of any class lies in it.
-
-    Examples
-    --------
-    >>> grid = Grid(epsg=32632, west_m=5e5, north_m=5.2e6, cell_size_m=1.0, rows=9, cols=9)
-    >>> read_extract(Path("nowhere.osm.pbf"), grid)
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
-    taxonomy = taxonomy or load_taxonomy()
+    taxonomy = load_taxonomy()
     grid_lonlat = lonlat_box(grid)
     with open_snapshot(path, at=at) as snapshot:
         scan = scan_file(snapshot.path, taxonomy, box=grid_lonlat)
@@ -114,7 +103,7 @@ def read_extract(
     features = _with_sea(features, mapped.sea, taxonomy)
     if len(features) == 0:
         message = (
-            f"{path.name} holds no element of any class within {_written(grid_lonlat)}: move or enlarge the bounds"
+            f"{path.name} holds no element of any class within {box_text(grid_lonlat)}: move or enlarge the bounds"
         )
         raise CoverageError(message)
     newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
@@ -133,7 +122,7 @@ def read_extract(
 
 
 def _cuts(scan: Scan) -> dict[str, int]:
-    """Ways of a class in the whole extract that lack nodes; nothing where none does."""
+    """Count the ways of a class in the whole extract that lack nodes; empty if none does."""
     partial = sum(bool(marks) for marks in scan.gaps.values())
     found = {"ways that lack some nodes": partial, "ways that lack all nodes": len(scan.gaps) - partial}
     return {what: count for what, count in found.items() if count}
@@ -144,15 +133,11 @@ def _check_covered(path: Path, wanted: Box, coverage: shapely.Geometry, mapped: 
         message = f"{path.name} holds no element of any class: is it an extract of map data?"
         raise CoverageError(message)
     if mapped.coverage.is_empty and not mapped.unknown_m2:
-        covered = _written(shapely.bounds(coverage))
+        covered = box_text(shapely.bounds(coverage))
         message = (
-            f"bounds {_written(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
+            f"bounds {box_text(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
         )
         raise CoverageError(message)
-
-
-def _written(box: Box | NDArray[np.float64]) -> str:
-    return "[" + ", ".join(f"{value:.4f}" for value in box) + "]"
 
 
 def _meets(bounds: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
@@ -165,7 +150,7 @@ def _meets(bounds: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
 def _table(
     scan: Scan, picked: NDArray[np.int64], geometry: NDArray[np.object_], grid: Grid, taxonomy: Taxonomy
 ) -> gpd.GeoDataFrame:
-    """One row for each picked object and class that touches the grid, in the order of class, type and id."""
+    """Build one row for each picked object and class that touches the grid, sorted by class, type and id."""
     geometry = project(geometry, grid.epsg)
     touches = shapely.intersects(geometry, shapely.box(*grid.bounds_m))
     rows, geometry = [scan.rows[index] for index in picked[touches]], geometry[touches]
@@ -194,7 +179,7 @@ def _table(
 
 
 def _with_sea(features: gpd.GeoDataFrame, sea: NDArray[np.object_], taxonomy: Taxonomy) -> gpd.GeoDataFrame:
-    """The table with a row of class water for each polygon of sea, numbered from the largest; they have no date."""
+    """Add a row of class water for each polygon of sea, numbered from the largest; they have no date."""
     if len(sea) == 0:
         return features
     columns: dict[str, object] = {name: np.zeros(len(sea)) for name in DTYPES} | {
@@ -212,13 +197,13 @@ def _with_sea(features: gpd.GeoDataFrame, sea: NDArray[np.object_], taxonomy: Ta
 
 
 def _times(rows: Sequence[ScanRow]) -> NDArray[np.datetime64]:
-    """Timestamps as UTC milliseconds; NaT where the file carries none."""
+    """Return timestamps as UTC milliseconds; NaT if the file has none."""
     known = [row.timestamp.replace(tzinfo=None) if row.timestamp > _EPOCH else None for row in rows]
     return np.array(known, dtype="datetime64[ms]")
 
 
 def _width_m(label: Label, traits: Traits) -> float:
-    """Drawn width of a line: a tagged width, else that of the class, else that of the road or railway it lies on."""
+    """Return the drawn width of a line: as tagged, else of its class, else of the road or railway that it lies on."""
     if traits.is_area and not label.is_outline:
         return float("nan")
     if traits.width_m is not None and label.keeps_width:
@@ -229,7 +214,7 @@ def _width_m(label: Label, traits: Traits) -> float:
 
 
 def _shapes(geometry: NDArray[np.object_], labels: list[Label]) -> NDArray[np.object_]:
-    """Outlines become lines; a multipolygon or multiline of one part becomes that part."""
+    """Turn outlines into lines, and multi-geometries of one part into that part."""
     is_outline = np.array([label.is_outline for label in labels], dtype=bool)
     shaped = geometry.copy()
     shaped[is_outline] = shapely.boundary(geometry[is_outline])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One pass over an OSM file: ways and areas with a key of the taxonomy, and what the rules make of their tags."""
+"""One pass over an OSM file: ways and areas with a key of the taxonomy, and their classes by the rules."""
 
 import datetime as dt
 import gc
@@ -37,14 +37,13 @@ _POINTS: Final = tuple(struct.Struct(f"<{2 * count}d") for count in range(40))
 
 Get = Callable[[str], str | None]
 Box = tuple[float, float, float, float]
-WORLD: Final[Box] = (-180.0, -90.0, 180.0, 90.0)
 _NOWHERE: Final = 2**31 - 1  # what osmium has for the place of a node that is missing
 _FACTORY: Final = osmium.geom.WKBFactory()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traits:
-    """What the tags of one object say; `width_m` is a tagged width, None where only the class default is known."""
+    """Properties from an object's tags; `width_m` is a tagged width, None if only the class default is known."""
 
     labels: tuple[Label, ...]
     is_area: bool
@@ -65,7 +64,7 @@ class Tally:
 
 
 class ScanRow(NamedTuple):
-    """One object and geometry: WKB (lon/lat), its index into `Scan.traits`, and what OSM says of it."""
+    """One object and geometry: WKB (lon/lat), its index into `Scan.traits`, and its OSM identity."""
 
     wkb: bytes
     kind: int
@@ -77,10 +76,10 @@ class ScanRow(NamedTuple):
 
 @dataclass(slots=True)
 class Scan:
-    """What one pass found: a row for each object, the distinct traits they share, and what was not used.
+    """Result of one pass: a row for each object, the distinct traits they share, and what was not used.
 
-    `far` holds the geometry of what lies beyond the box asked for, or has no class: it still tells what is mapped.
-    `coast` holds every coastline of the file, `gaps` where a way of a class lacks nodes, by its id.
+    `far` holds geometry outside the requested box or without a class: it still shows what is mapped. `coast` holds
+    every coastline of the file, `gaps` the gaps of ways of a class, by way id.
     """
 
     rows: list[ScanRow] = field(default_factory=list)
@@ -92,7 +91,7 @@ class Scan:
 
 
 class Classifier:
-    """Tags of one object -> what the rules make of it; rules run once for each distinct set of values."""
+    """Apply the rules to the tags of one object; rules run once for each distinct set of values."""
 
     def __init__(self, taxonomy: Taxonomy, scan: Scan) -> None:
         self._taxonomy = taxonomy
@@ -103,12 +102,12 @@ class Classifier:
         self._kinds: dict[tuple[object, ...], int] = {}
 
     def as_line(self, get: Get) -> Classification:
-        """What the rules make of the keys that line rules read."""
+        """Classify by the keys that line rules read."""
         values = tuple(map(get, self._line_keys))
         return self._lines.get(values) or self._classify(self._line_keys, values, self._lines)
 
     def as_area(self, get: Get) -> Classification:
-        """What the rules make of the keys that area rules read."""
+        """Classify by the keys that area rules read."""
         values = tuple(map(get, self._area_keys))
         return self._areas.get(values) or self._classify(self._area_keys, values, self._areas)
 
@@ -119,7 +118,7 @@ class Classifier:
         return known.setdefault(values, classify(tags, self._taxonomy))
 
     def area_labels(self, get: Get, *, is_relation: bool) -> tuple[Label, ...]:
-        """Labels of an object that is an area: of area rules; of line rules filled where it says so, else outlines."""
+        """Return the labels of an area by area rules and by line rules, filled if the rule says so, else outlines."""
         labels = self.as_area(get).area
         if not labels and get("area") == "yes":
             return self.as_line(get).line
@@ -135,7 +134,7 @@ class Classifier:
         return (*kept, *(label for label in along if label.is_outline or not labels))
 
     def kind(self, get: Get, labels: tuple[Label, ...], *, is_area: bool) -> int:
-        """Index of the object's traits in `Scan.traits`; counts what is hidden from above."""
+        """Return the index of the object's traits in `Scan.traits`; count objects hidden from above."""
         keys = _AREA_MODIFIERS if is_area else _LINE_MODIFIERS
         modifiers = tuple(map(get, keys))
         signature = (labels, is_area, modifiers)
@@ -165,7 +164,7 @@ def _traits(tags: dict[str, str], labels: tuple[Label, ...], *, is_area: bool) -
 
 
 def _hidden_by(tags: dict[str, str], *, level: int, is_tunnel: bool) -> str | None:
-    """Why an object is not visible from above, or None."""
+    """Return the reason why an object is not visible from above, or None."""
     if is_tunnel:
         return f"tunnel={tags['tunnel']}"
     if level < 0:
@@ -174,7 +173,7 @@ def _hidden_by(tags: dict[str, str], *, level: int, is_tunnel: bool) -> str | No
 
 
 def _integer(text: str | None) -> int:
-    """The OSM layer; what is no whole number within -20..20 counts as 0, as renderers do."""
+    """Parse the OSM layer; a value that is no whole number within -20..20 counts as 0, as in renderers."""
     try:
         value = int(text or 0)
     except ValueError:
@@ -183,7 +182,7 @@ def _integer(text: str | None) -> int:
 
 
 def tagged_width_m(width: str | None, lanes: str | None) -> float | None:
-    """Width in metres from the tags `width` ("6", "6.5 m", "6,5") and `lanes`, or None if neither says it.
+    """Return the width in metres from the tags `width` ("6", "6.5 m", "6,5") and `lanes`, or None.
 
     Examples
     --------
@@ -202,9 +201,9 @@ def tagged_width_m(width: str | None, lanes: str | None) -> float | None:
 
 
 def reaches(wkb: bytes, box: Box) -> bool:
-    """Whether a geometry may reach into a box: exact for short lines and polygons of one ring, True for all others.
+    """Return whether a geometry may reach into a box: exact for short lines and polygons of one ring, else True.
 
-    Most objects of an extract lie far from the region and are short: told apart here, their tags need not be read.
+    Most objects of an extract are short and lie far from the region; their tags need not be read.
 
     Examples
     --------
@@ -222,27 +221,13 @@ def reaches(wkb: bytes, box: Box) -> bool:
     return max(longitudes) >= west and min(longitudes) <= east and max(latitudes) >= south and min(latitudes) <= north
 
 
-def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box = WORLD) -> Scan:
+def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box) -> Scan:
     """Read every way and area that carries a key of the taxonomy and may reach into a box.
 
-    Parameters
-    ----------
-    path : Path
-        A sorted OSM file with one state of the world (`open_snapshot`).
-    taxonomy : Taxonomy
-        The classes.
-    box : tuple of float
-        West, south, east, north, degrees. What certainly lies outside is neither classified nor counted.
-
-    Returns
-    -------
-    Scan
-        A row for each object and geometry that belongs to a class; `tally` counts all others by reason.
-
-    Raises
-    ------
-    RuntimeError
-        What osmium throws on a damaged file; `open_snapshot` turns it into an `ExtractError`.
+    `path` is a sorted OSM file with one state of the world (`open_snapshot`); `box` is west, south, east, north,
+    degrees. Objects certainly outside it are neither classified nor counted; `Scan.tally` counts all others that are
+    not used, by reason. osmium raises `RuntimeError` on a damaged file, which `open_snapshot` turns into an
+    `ExtractError`.
     """
     scan = Scan()
     classifier = Classifier(taxonomy, scan)
@@ -269,7 +254,7 @@ def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box = WORLD) -> Scan:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keep the cyclic collector from searching a growing list of rows again and again: a tenth of the time."""
+    """Stop the cyclic garbage collector while a list of rows grows: this saves a tenth of the time."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -280,7 +265,7 @@ def _no_collection() -> Iterator[None]:
 
 
 def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
-    """Ways with a key of lines and all areas, in one pass; the filters and the assembly of areas run in C++."""
+    """Yield ways with a key of lines and all areas, in one pass; filters and assembly of areas run in C++."""
     with_key = osmium.filter.KeyFilter(*taxonomy.keys)
     processor = osmium.FileProcessor(str(path)).with_locations().with_areas(with_key)
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
@@ -291,7 +276,7 @@ def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Relation:
-    """An area relation before it is assembled: its tags' meaning and its member ways by role."""
+    """An area relation before it is assembled: its labels and its member ways by role."""
 
     labels: tuple[Label, ...]
     tags: dict[str, str]
@@ -304,14 +289,14 @@ class _Relation:
 
 @dataclass(slots=True)
 class _Expected:
-    """Closed ways and relations that carry an area class; what osmium assembles is taken out again."""
+    """Closed ways and relations that carry an area class; what osmium assembles is removed again."""
 
     ways: set[int] = field(default_factory=set)
     relations: dict[int, _Relation] = field(default_factory=dict)
 
 
 def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally) -> _Expected:
-    """List what should become an area: the main pass sees only what did."""
+    """List the objects that should become areas: the main pass sees only those that did."""
     line_keys = taxonomy.keys_of("line")
     area_keys = tuple(key for key in taxonomy.keys_of("area") if key not in line_keys)
     wanted, typed = osmium.filter.KeyFilter(*area_keys), osmium.filter.KeyFilter("type")
@@ -333,7 +318,7 @@ def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally
 
 
 def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int], box: Box) -> None:  # noqa: ANN401
-    """Take a way as a line where a line rule holds; remember it where an area of it must follow."""
+    """Take a way as a line if a line rule holds; remember it if an area of it must follow."""
     get, wkb = way.tags.get, line_wkb(way, scan.tally)
     if (wkb is None or wkb[1] == _SEVERAL_LINES) and classifier.as_line(get).line:
         scan.gaps[way.id] = find_gaps(way)
@@ -363,7 +348,7 @@ def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int], bo
 
 
 def _scan_area(area: Any, scan: Scan, classifier: Classifier, box: Box) -> bool:  # noqa: ANN401
-    """Take an assembled area; False where osmium hands one over that has no ring."""
+    """Take an assembled area; return False if osmium gives one without a ring."""
     try:
         wkb = bytes.fromhex(_FACTORY.create_multipolygon(area))
     except RuntimeError:  # osmium's geometry_error: the rings were too broken to assemble
@@ -385,7 +370,7 @@ def _scan_area(area: Any, scan: Scan, classifier: Classifier, box: Box) -> bool:
 
 
 def line_wkb(way: Any, tally: Tally) -> bytes | None:  # noqa: ANN401
-    """WKB of a way; where nodes are missing at a clip edge, of the pieces that are left; None where nothing is."""
+    """Return the WKB of a way; of the remaining pieces if nodes are missing, None if nothing remains."""
     try:
         return bytes.fromhex(_FACTORY.create_linestring(way))
     except osmium.InvalidLocationError:
@@ -401,7 +386,7 @@ def line_wkb(way: Any, tally: Tally) -> bytes | None:  # noqa: ANN401
 
 
 def _pieces(way: Any, tally: Tally) -> list[list[tuple[float, float]]]:  # noqa: ANN401
-    """Runs of at least two nodes that are there, as longitude and latitude; counts those with an impossible place."""
+    """Return runs of at least two present nodes, as longitude and latitude; count nodes at impossible places."""
     impossible = sum(not node.location.valid() and node.location.x != _NOWHERE for node in way.nodes)
     if impossible:
         tally.drops["node beyond 180 degrees east or 90 degrees north, taken out of a way"] += impossible
@@ -411,7 +396,7 @@ def _pieces(way: Any, tally: Tally) -> list[list[tuple[float, float]]]:  # noqa:
 
 
 def _area_relation(item: Any, classifier: Classifier) -> _Relation | None:  # noqa: ANN401
-    """A relation that should become an area: a multipolygon of a class, or type=building, which osmium leaves alone."""
+    """Return a relation that should become an area: a multipolygon, or type=building, which osmium ignores."""
     kind = item.tags.get("type")
     if kind not in ("multipolygon", "building"):
         return None
@@ -436,7 +421,7 @@ def _area_relation(item: Any, classifier: Classifier) -> _Relation | None:  # no
 def _scan_lost(
     path: Path, closed: set[int], relations: dict[int, _Relation], scan: Scan, classifier: Classifier
 ) -> None:
-    """Mend what osmium could not assemble: rings that lack nodes or cross themselves, relations cut at an edge."""
+    """Repair what osmium could not assemble: rings that lack nodes or cross themselves, relations cut at an edge."""
     members = {ref for relation in relations.values() for ref in (*relation.outer, *relation.inner)}
     lines: dict[int, shapely.Geometry] = {}
     ways = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.EntityFilter(osmium.osm.WAY))
@@ -481,7 +466,7 @@ def _add_mended(
 
 
 def _ring_area(line: shapely.Geometry) -> shapely.Geometry:
-    """The area within a closed way; missing nodes are bridged, a ring that crosses itself is split."""
+    """Return the area within a closed way; missing nodes are bridged, a ring that crosses itself is split."""
     coordinates = shapely.get_coordinates(line)
     if len(np.unique(coordinates, axis=0)) < MIN_RING_POINTS:
         return shapely.Polygon()
@@ -489,7 +474,7 @@ def _ring_area(line: shapely.Geometry) -> shapely.Geometry:
 
 
 def _relation_area(relation: _Relation, lines: dict[int, shapely.Geometry]) -> shapely.Geometry:
-    """Closed outer rings less closed inner rings, of the member ways that are there."""
+    """Return closed outer rings less closed inner rings, from the member ways that are present."""
     outer, inner = (
         shapely.union_all(shapely.get_parts(shapely.polygonize([lines[ref] for ref in refs if ref in lines])))
         for refs in (relation.outer, relation.inner)
@@ -498,6 +483,6 @@ def _relation_area(relation: _Relation, lines: dict[int, shapely.Geometry]) -> s
 
 
 def _polygons_of(geometry: shapely.Geometry) -> shapely.Geometry:
-    """The polygons within a geometry, as one multipolygon."""
+    """Return the polygons within a geometry, as one multipolygon."""
     parts = shapely.get_parts(shapely.get_parts(geometry))
     return shapely.MultiPolygon([part for part in parts if part.geom_type == "Polygon"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sea and land on the two sides of a coastline: the map knows the line alone, water lies to the right of it."""
+"""Sea and land on the two sides of a coastline: OSM maps only the line, and water lies to its right."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 OPEN: Final = "near a gap in the coastline"
 CONTRARY: Final = "between coastlines that contradict each other"
 _STEP_M: Final = 25.0  # the sides of a coastline are looked at once in each straight piece of at most this length
-_BESIDE_M: Final = 0.01  # so far to the side, which is also how finely OSM places a node
+_OFFSET_M: Final = 0.01  # so far to the side, which is also how finely OSM places a node
 _SLIP_SHARE: Final = 0.01  # of a face's coast: so little that says otherwise is a loop where a line was drawn badly
 
 Floats = NDArray[np.float64]
@@ -31,22 +31,11 @@ class Shore:
 
 
 def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.Geometry) -> Shore:
-    """Decide which ground is sea and which is land.
+    """Divide mapped ground into sea and land; `coast` has water on its right, both are in a projected CRS, metres.
 
-    Parameters
-    ----------
-    coast : sequence of shapely.Geometry
-        Lines with water to their right, in a projected CRS, metres; their order does not matter.
-    mapped : shapely.Geometry
-        Where the coastline is known, in the same CRS.
-
-    Returns
-    -------
-    Shore
-        The coast and the edge of the mapped area part it into faces. A face with the right side of coasts alone is sea,
-        with the left side alone land, with both unknown; one without any coast is none of them. A coast that ends
-        within the mapped area goes on to the nearest beginning of another, or to the edge: ground no further from such
-        a link than it is long is unknown.
+    The coast and the edge of the mapped area divide it into faces. A face that meets only right sides of coasts is sea,
+    only left sides land, both unknown, none neither. A coast that ends within the mapped area continues to the nearest
+    beginning of another, or to the edge; ground no further from such a link than its length is unknown.
 
     Examples
     --------
@@ -78,7 +67,7 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
 
 
 def _plain_lines(coast: Sequence[shapely.Geometry] | Geometries) -> Geometries:
-    """Single lines, joined where one ends and another begins."""
+    """Return single lines, joined where one ends and another begins."""
     parts = shapely.get_parts(np.array(coast, dtype=object))
     return np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(parts), directed=True)))
 
@@ -89,7 +78,7 @@ def _less(faces: Geometries, doubt: shapely.Geometry) -> Geometries:
 
 
 def _links(lines: Geometries, mapped: shapely.Geometry, edge: shapely.Geometry) -> list[shapely.Geometry]:
-    """Straight lines from loose ends to the loose beginnings or the edge, the shortest in sum."""
+    """Return straight lines from loose ends to loose beginnings or the edge, of the smallest total length."""
     begins, ends = (shapely.get_coordinates(shapely.get_point(lines, index)) for index in (0, -1))
     places, count = np.unique(np.concatenate((begins, ends)), axis=0, return_counts=True)
     single = {tuple(place) for place in places[count == 1].tolist()}
@@ -120,9 +109,9 @@ def _links(lines: Geometries, mapped: shapely.Geometry, edge: shapely.Geometry) 
 
 
 def _beyond(link: shapely.Geometry) -> shapely.Geometry:
-    """A line to the edge, a little longer: it must part the ground, and no point lies on the edge to the last bit."""
+    """Lengthen a line to the edge a little: it must divide the ground, and rounding may stop it short."""
     start, end = shapely.get_coordinates(link)
-    return shapely.LineString([start, end + (end - start) * (_BESIDE_M / max(link.length, _BESIDE_M))])
+    return shapely.LineString([start, end + (end - start) * (_OFFSET_M / max(link.length, _OFFSET_M))])
 
 
 def _is_within(place: Sequence[float], mapped: shapely.Geometry) -> bool:
@@ -130,21 +119,24 @@ def _is_within(place: Sequence[float], mapped: shapely.Geometry) -> bool:
 
 
 def _coast_m(lines: Geometries, faces: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats]:
-    """Metres of coast that each face has on the right and on the left of the line."""
+    """Return the metres of coast that each face has on the right and on the left of the line."""
     start, end = _segments(lines, edge)
     ahead = end - start
     length_m = np.hypot(*ahead.T)
-    to_right = np.column_stack((ahead[:, 1], -ahead[:, 0])) / length_m[:, None] * _BESIDE_M
+    to_right = np.column_stack((ahead[:, 1], -ahead[:, 0])) / length_m[:, None] * _OFFSET_M
 
-    def seen(aside: Floats) -> Floats:
-        face, looked = shapely.STRtree(shapely.points(start + ahead / 2 + aside)).query(faces, predicate="contains")
-        return np.bincount(face, weights=length_m[looked], minlength=len(faces)).astype(np.float64)
+    middle = start + ahead / 2
+    return _length_in(faces, middle + to_right, length_m), _length_in(faces, middle - to_right, length_m)
 
-    return seen(to_right), seen(-to_right)
+
+def _length_in(faces: Geometries, points: Floats, length_m: Floats) -> Floats:
+    """Return the summed length of the points that each face contains."""
+    face, point = shapely.STRtree(shapely.points(points)).query(faces, predicate="contains")
+    return np.bincount(face, weights=length_m[point], minlength=len(faces)).astype(np.float64)
 
 
 def _segments(lines: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats]:
-    """Beginnings and ends, shape (N, 2), of short straight pieces, none of which crosses the edge."""
+    """Return beginnings and ends, shape (N, 2), of short straight pieces, none of which crosses the edge."""
     points, line = shapely.get_coordinates(shapely.segmentize(lines, _STEP_M), return_index=True)
     joined = (line[1:] == line[:-1]) & (points[1:] != points[:-1]).any(axis=1)
     start, end = points[:-1][joined], points[1:][joined]
@@ -152,7 +144,7 @@ def _segments(lines: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats
     shapely.prepare(edge)
     crosses = shapely.intersects(edge, straight)
     crosses[crosses] = shapely.crosses(edge, straight[crosses])
-    split = shapely.difference(straight[crosses], shapely.buffer(edge, _BESIDE_M))
+    split = shapely.difference(straight[crosses], shapely.buffer(edge, _OFFSET_M))
     parts, owner = shapely.get_parts(split, return_index=True)
     is_left = ~shapely.is_empty(parts)
     first, last = (shapely.get_coordinates(shapely.get_point(parts[is_left], index)) for index in (0, -1))

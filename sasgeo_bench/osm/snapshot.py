@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An OSM file as the reader needs it: readable, sorted, and one state of the world."""
+"""Prepare an OSM file for reading: readable, sorted, and with one state of the world."""
 
 import datetime as dt
 from collections.abc import Iterable, Iterator
@@ -40,27 +40,14 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """What the header of a file says; each may be None. The box is west, south, east, north, degrees."""
+    """Box (west, south, east, north, degrees) and date of a file's header; each may be None."""
 
     box_lonlat: tuple[float, float, float, float] | None
     replicated_at: dt.datetime | None
 
 
 def read_header(path: Path) -> Header:
-    """Read the header of an extract and no more.
-
-    Raises
-    ------
-    ExtractError
-        If the file is missing, empty, damaged or of an unknown format.
-
-    Examples
-    --------
-    >>> read_header(Path("nowhere.osm.pbf"))
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
-    """
+    """Read the header of an extract and no more; raise `ExtractError` as `open_snapshot` does."""
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
@@ -70,24 +57,10 @@ def read_header(path: Path) -> Header:
 
 @contextmanager
 def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot]:
-    """Make one extract readable: sort what is out of order, cut a history at a date.
+    """Yield one extract ready to read: sort it if it is out of order, cut a full history at the end of a day (UTC).
 
-    Parameters
-    ----------
-    path : Path
-        A file with one of `SUFFIXES`.
-    at : date, optional
-        For a history file: the state at the end of this day (UTC). Needed there, refused elsewhere.
-
-    Yields
-    ------
-    Snapshot
-        Its path may lie in a temporary folder that goes when the context ends.
-
-    Raises
-    ------
-    ExtractError
-        If the file is missing, empty, damaged, of an unknown format, or a history without a date.
+    The yielded path may lie in a temporary folder that is removed when the context ends. Raise `ExtractError` if the
+    file is missing, empty, damaged, of a format not in `SUFFIXES`, or a history without a date.
 
     Examples
     --------
@@ -120,13 +93,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
 
 
 def is_history(path: Path) -> bool:
-    """Whether a file holds all versions of its objects, by its name.
-
-    Examples
-    --------
-    >>> is_history(Path("andorra-2017-02-19.osh.pbf")), is_history(Path("andorra-2020-05-01.osm.pbf"))
-    (True, False)
-    """
+    """Return whether a file name is that of a full history, with all versions of its objects."""
     return path.name.endswith(_HISTORY_SUFFIXES)
 
 
@@ -143,7 +110,7 @@ def _check_file(path: Path) -> None:
 
 
 def _as_its_content(path: Path, scratch: Path) -> Path:
-    """Return the path, or a link to it whose name says what the file holds: osmium goes by the name alone."""
+    """Return the path, or a link to it with the suffix of its content: osmium goes by the name alone."""
     kind = "osh" if is_history(path) else "osm"
     with path.open("rb") as source:
         start = source.read(16)
@@ -166,22 +133,9 @@ def _as_its_content(path: Path, scratch: Path) -> Path:
 
 
 def elements(source: Iterable[Any]) -> Iterator[Any]:
-    """Elements that osmium reads; whatever it refuses in the file is a `RuntimeError`.
+    """Yield the elements that osmium reads; raise `RuntimeError` on whatever it refuses in the file.
 
-    Parameters
-    ----------
-    source : iterable
-        An `osmium.FileProcessor`, with or without filters.
-
-    Raises
-    ------
-    RuntimeError
-        On a damaged file, an id, date or coordinate that is none; `open_snapshot` turns it into an `ExtractError`.
-
-    Examples
-    --------
-    >>> list(elements([1, 2]))
-    [1, 2]
+    `open_snapshot` turns that error into an `ExtractError`.
     """
     with _one_type():
         yield from source
@@ -189,7 +143,7 @@ def elements(source: Iterable[Any]) -> Iterator[Any]:
 
 @contextmanager
 def _one_type() -> Iterator[None]:
-    """Turn the unrelated types of what osmium's C++ side throws into `RuntimeError`, its most common one."""
+    """Turn the unrelated exceptions of osmium's C++ side into `RuntimeError`, its most common one."""
     try:
         yield
     except (osmium.InvalidLocationError, ValueError, IndexError, OverflowError) as error:
@@ -198,7 +152,7 @@ def _one_type() -> Iterator[None]:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn osmium's own errors on a damaged file into one line that names the file."""
+    """Turn osmium's errors on a damaged file into one line that names the file."""
     try:
         yield
     except (RuntimeError, UnicodeDecodeError) as error:  # text is decoded only where it is looked at
@@ -231,7 +185,7 @@ def _header_time(header: osmium.io.Header) -> dt.datetime | None:
 
 
 def _in_order(path: Path) -> bool:
-    """Whether elements come as osmium wants them: nodes, ways, relations, each by id (negative ids first, by size)."""
+    """Return whether elements come in osmium's order: nodes, ways, relations, each by id (negative first, by size)."""
     last = (-1, 0, 0)
     for item in elements(osmium.FileProcessor(str(path))):
         identifier = item.id
@@ -251,7 +205,7 @@ def _sort(path: Path, target: Path) -> None:
 
 
 def _cut_history(path: Path, target: Path, *, at: dt.date) -> None:
-    """Write the state at the end of a day: of each object its last version by then, unless that one is deleted."""
+    """Write the state at the end of a day: the last version of each object by then, unless that one is deleted."""
     until = dt.datetime.combine(at, dt.time.max, tzinfo=dt.UTC)
     kept = _versions_at(path, until=until)
     with osmium.SimpleWriter(str(target), overwrite=True) as writer:
@@ -263,7 +217,7 @@ def _cut_history(path: Path, target: Path, *, at: dt.date) -> None:
 
 
 def _versions_at(path: Path, *, until: dt.datetime) -> NDArray[np.int64]:
-    """Positions in the file, ascending, of the versions alive at a moment. Needs no order of versions."""
+    """Return positions in the file, ascending, of the versions alive at a time; versions may come in any order."""
     latest: dict[tuple[str, int], tuple[int, int, bool]] = {}
     for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
         if item.timestamp <= until:

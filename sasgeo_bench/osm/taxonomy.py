@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The semantic classes and the OSM tag rules that make them; the data is in `taxonomy.toml`."""
+"""The semantic classes and the OSM tag rules that define them; the data is in `taxonomy.toml`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ ANY = "*"
 
 
 class Persistence(Document):
-    """Hand-set prior and yearly rates of one class (SASGeo paper, Eq. 5); dimensionless and 1/year."""
+    """Hand-set prior (dimensionless) and yearly rates (1/year) of one class (SASGeo paper, Eq. 5)."""
 
     prior: Share
     vanish_per_year: Annotated[float, Field(ge=0)]
@@ -28,7 +28,7 @@ class Persistence(Document):
 
 
 class Rule(Document):
-    """One OSM key and the exact values of it that make a class.
+    """One OSM key and the exact values of it that define a class.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class Rule(Document):
         return self
 
     def takes(self, value: str) -> bool:
-        """Whether a tag value makes the class."""
+        """Return whether a tag value belongs to the class."""
         return value in self.widths or value in self.values or (ANY in self.values and value not in self.besides)
 
 
@@ -67,7 +67,7 @@ class Outline(Document):
 
 
 class SemanticClass(Document):
-    """One semantic class: identity, tag rules, look and persistence."""
+    """One semantic class: identity, tag rules, colour and persistence."""
 
     id: Annotated[int, Field(ge=0)]
     name: Name
@@ -80,14 +80,7 @@ class SemanticClass(Document):
 
 
 class Taxonomy(Document):
-    """All classes in the order of their ids; the band order of every layer stack.
-
-    Examples
-    --------
-    >>> taxonomy = load_taxonomy()
-    >>> taxonomy.names[:2], taxonomy["building"].id
-    (('road_major', 'road_minor'), 4)
-    """
+    """All classes in the order of their ids, which is the band order of every layer stack."""
 
     classes: list[SemanticClass] = Field(alias="class")
 
@@ -104,7 +97,7 @@ class Taxonomy(Document):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Class names in id order."""
+        """Return class names in id order."""
         return tuple(item.name for item in self.classes)
 
     def __getitem__(self, name: str) -> SemanticClass:
@@ -113,27 +106,21 @@ class Taxonomy(Document):
 
     @cached_property
     def keys(self) -> tuple[str, ...]:
-        """OSM keys that any rule reads, in order of first use."""
+        """Return OSM keys that any rule reads, in order of first use."""
         return tuple(dict.fromkeys(rule.key for item in self.classes for rule in item.rules))
 
     def keys_of(self, geometry: Kind) -> tuple[str, ...]:
-        """OSM keys that line rules (or area rules) read, in order of first use.
-
-        Examples
-        --------
-        >>> load_taxonomy().keys_of("area")[0]
-        'building'
-        """
+        """Return OSM keys that line rules (or area rules) read, in order of first use."""
         rules = (rule for item in self.classes for rule in item.rules)
         return tuple(dict.fromkeys(rule.key for rule in rules if rule.geometry == geometry))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """One class that an object belongs to; `width_m` is None for areas and where the host's width counts.
+    """One class of an object; `width_m` is None for areas and where the width of the carrying way counts.
 
     `is_outline`: the edge of an area is drawn, not the area; `is_filled`: a multipolygon of a line rule is an area;
-    `keeps_width`: a tagged width goes before `width_m`.
+    `keeps_width`: a tagged width overrides `width_m`.
     """
 
     class_name: str
@@ -145,7 +132,7 @@ class Label:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Classification:
-    """What the rules make of one object: labels as a line and as an area, and the tags no rule knows."""
+    """Labels of one object as a line and as an area, and the tags without a rule."""
 
     line: tuple[Label, ...]
     area: tuple[Label, ...]
@@ -153,20 +140,10 @@ class Classification:
 
 
 def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
-    """Apply every rule to the tags of one object.
+    """Apply every rule to the tags of one object; only keys of the taxonomy matter.
 
-    Parameters
-    ----------
-    tags : mapping of str to str
-        The object's tags; only keys of the taxonomy matter.
-    taxonomy : Taxonomy
-        The classes.
-
-    Returns
-    -------
-    Classification
-        Labels in class order. A line rule labels areas too (filled or by their outline); whether the object is a line
-        or an area is for the reader to say. `unknown` names "key=value" of taxonomy keys without rule.
+    Labels come in class order. A line rule labels areas too (filled or by their outline); the reader decides whether
+    the object is a line or an area. `unknown` lists "key=value" of taxonomy keys without a rule.
 
     Examples
     --------
@@ -202,18 +179,12 @@ def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
 
 
 def _unique(labels: list[Label]) -> tuple[Label, ...]:
-    """One label a class; the first rule wins."""
+    """Keep one label per class: that of the first rule."""
     return tuple({label.class_name: label for label in reversed(labels)}.values())[::-1]
 
 
 @cache
 def load_taxonomy() -> Taxonomy:
-    """Return the taxonomy that ships with the package.
-
-    Examples
-    --------
-    >>> len(load_taxonomy().names)
-    13
-    """
+    """Return the taxonomy of the package."""
     text = resources.files("sasgeo_bench.osm").joinpath("taxonomy.toml").read_text(encoding="utf-8")
     return parse_toml(text, Taxonomy, source="taxonomy.toml")

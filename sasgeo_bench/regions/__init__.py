@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features -> layers, network, graph: a Region, built and on disk."""
+"""Turn features into layers, network and graph: a Region, built and on disk."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One region file -> one region directory: the order of the steps, and what makes a build unnecessary."""
+"""Build a region directory from a region file: the order of the steps, and when a build is unnecessary."""
 
 import datetime as dt
 import hashlib
@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -51,7 +52,7 @@ PREVIEW_CELLS: Final = 2048
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildPlan:
-    """What a build would read and write. `source` is None for an embedded town, which is made on the way."""
+    """Inputs and outputs of a build. `source` is None for an embedded town, which is made during the build."""
 
     spec: RegionFile
     extract: Extract
@@ -62,7 +63,7 @@ class BuildPlan:
     is_current: bool
 
     def to_text(self) -> str:
-        """Several lines for a person: inputs, grid, outputs and their size before compression."""
+        """Describe inputs, grid, outputs and their size before compression, in several lines."""
         classes = len(load_taxonomy().names)
         grid = self.grid
         west, south, east, north = lonlat_box(grid)
@@ -85,30 +86,11 @@ class BuildPlan:
 def plan_build(
     spec: RegionFile, *, out: Path, date: dt.date | None = None, extract_folders: Sequence[Path] = ()
 ) -> BuildPlan:
-    """Find the inputs of a build and whether its result is there already; writes nothing.
+    """Find the inputs of a build, and whether its result is up to date; write nothing.
 
-    Parameters
-    ----------
-    spec : RegionFile
-        The region file.
-    out : Path
-        Root of what is built; the region goes to `out/regions/<id>`, of an older date to `out/regions/<id>@<date>`.
-    date : date, optional
-        Date of one of the region's extracts; the newest unless given.
-    extract_folders : sequence of Path
-        Searched for extracts before SASGEO_EXTRACTS and the user's cache.
-
-    Returns
-    -------
-    BuildPlan
-        What `build_region` takes.
-
-    Raises
-    ------
-    ConfigError
-        If the region has no extract of that date.
-    ExtractError
-        If the extract is not to be found.
+    The region goes to `out/regions/<id>`, that of an older date to `out/regions/<id>@<date>`; without `date` the newest
+    extract is taken. `extract_folders` are searched before SASGEO_EXTRACTS and the user's cache. Raise `ConfigError` if
+    the region has no extract of that date, `ExtractError` if the extract is not found.
     """
     extract = spec.pick(date)
     source = None if extract.town else find_extract(extract, folders=extract_folders)
@@ -127,7 +109,7 @@ def plan_build(
 
 
 def _inputs_sha256(spec: RegionFile, extract: Extract, source_sha256: str) -> str:
-    """Hash all that a region depends on: its file, the extract's bytes, the taxonomy, and our versions."""
+    """Hash all inputs of a region: its file, the extract's bytes, the taxonomy, and our versions."""
     inputs = {
         "region": spec.model_dump(mode="json", exclude={"extract"}),
         "extract": extract.model_dump(mode="json", exclude={"urls", "sha256"}),
@@ -139,7 +121,7 @@ def _inputs_sha256(spec: RegionFile, extract: Extract, source_sha256: str) -> st
 
 
 def package_version() -> str:
-    """Version of the installed package."""
+    """Return the version of the installed package."""
     return metadata.version("sasgeo-bench")
 
 
@@ -156,44 +138,18 @@ def _is_current(folder: Path, inputs_sha256: str) -> bool:
 
 
 def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> Manifest:
-    """Build the region of a plan, or leave it as it is where it is up to date.
+    """Build the region of a plan unless it is up to date; `tell` receives a line for each step.
 
-    Parameters
-    ----------
-    plan : BuildPlan
-        What `plan_build` found.
-    tell : callable
-        Gets one line for every step.
-    with_preview : bool
-        Whether to draw `preview.png` too.
-
-    Returns
-    -------
-    Manifest
-        Of the region on disk.
-
-    Raises
-    ------
-    ExtractError, CoverageError
-        If the extract is damaged, or does not hold the bounds.
-    StoreError
-        If the folder cannot be written. Whatever goes wrong, a region that was there before is left as it was.
+    A failed build leaves an earlier region as it was. Raise `ExtractError` or `CoverageError` if the extract is damaged
+    or does not cover the bounds, `StoreError` if the folder cannot be written.
     """
     name = plan.folder.name
-    try:
-        with locked(plan.folder, tell=tell):
-            if _is_current(plan.folder, plan.inputs_sha256):  # the build we may have waited for made it
-                tell(f"{name}: up to date, nothing to do")
-                return region_files.read_manifest(plan.folder)
-            with fresh_folder(plan.folder) as scratch:
-                manifest = _build_into(scratch, plan, tell, with_preview=with_preview)
-    except SasgeoError:
-        raise
-    except OSError as error:
-        message = (
-            f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights there"
-        )
-        raise StoreError(message) from error
+    manifest = _write_unless_current(
+        plan, tell, lambda scratch: _build_into(scratch, plan, tell, with_preview=with_preview)
+    )
+    if manifest is None:
+        tell(f"{name}: up to date, nothing to do")
+        return region_files.read_manifest(plan.folder)
     tell(f"{name}: mapped {manifest.coverage.to_text()}")
     tell(f"{name}: built {plan.folder}")
     return manifest
@@ -229,10 +185,10 @@ def _write_into(
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
     taxonomy = load_taxonomy()
-    # GDAL packs blocks without holding the interpreter, so the layers are written beside the graph.
-    with ThreadPoolExecutor(max_workers=1) as beside:
-        paint = _painter(reading, plan.grid, taxonomy)
-        layers = beside.submit(write_layers, scratch / region_files.LAYERS, plan.grid, taxonomy.names, paint)
+    # GDAL packs blocks without holding the interpreter, so the layers are written while the graph is made.
+    with ThreadPoolExecutor(max_workers=1) as executor:
+        paint = partial(_painter, reading, plan.grid, taxonomy)
+        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, taxonomy.names, paint)
         graph = build_graph(reading.features, bounds_m=plan.grid.bounds_m)
         region_files.write_tables(scratch, reading.features, graph)
         manifest = make_manifest(plan, extract, reading, graph)
@@ -247,30 +203,10 @@ def _write_into(
 
 
 def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, suffix: str, note: str) -> Path:
-    """Write a region whose features were edited beside the one it comes from, as `<id>+<suffix>`.
+    """Write a region with edited features next to its base, as `<id>+<suffix>`, and return its folder.
 
-    Parameters
-    ----------
-    plan : BuildPlan
-        Of the region that was edited.
-    base : Region
-        That region.
-    features : geopandas.GeoDataFrame
-        The edited feature table; coverage and provenance stay those of the base.
-    suffix : str
-        What the copy is for.
-    note : str
-        What was done, for the manifest.
-
-    Returns
-    -------
-    Path
-        Its folder.
-
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written.
+    Coverage and provenance stay those of the base; `note` says in the manifest what was edited. Raise `StoreError` if
+    the folder cannot be written.
     """
     name = f"{plan.folder.name}+{suffix}"
     inputs = hashlib.sha256(f"{base.manifest.inputs_sha256}/{note}/{fingerprint(features)}".encode()).hexdigest()
@@ -289,33 +225,17 @@ def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, s
         unknown_m2=record.coverage.unknown_m2,
         cuts=record.coverage.cuts,
     )
-    _write_unless_current(edited, record.extract, reading, tell=lambda _: None)
+    _write_unless_current(
+        edited, lambda _: None, lambda scratch: _write_into(scratch, edited, record.extract, reading, with_preview=True)
+    )
     return edited.folder
 
 
 def build_made(spec: RegionFile, reading: Reading, *, out: Path, tell: Tell) -> Path:
-    """Write a region whose features come from no extract, because they were generated.
+    """Write a region of generated features to `out/regions/<id>`, and return its folder.
 
-    Parameters
-    ----------
-    spec : RegionFile
-        Where it lies, its id and title; the file its one extract names is read by nobody.
-    reading : Reading
-        What was generated, in the place of what is read from an extract.
-    out : Path
-        Root of what is built; the region goes to `out/regions/<id>`.
-    tell : callable
-        Gets a line where another run has to be waited for.
-
-    Returns
-    -------
-    Path
-        Its folder.
-
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written.
+    `spec` gives place, id and title; the file of its one extract is not read. `reading` replaces what would be read
+    from an extract. Raise `StoreError` if the folder cannot be written.
     """
     extract = spec.pick(None)
     content = _content_sha256(reading.features)
@@ -329,23 +249,24 @@ def build_made(spec: RegionFile, reading: Reading, *, out: Path, tell: Tell) -> 
         is_current=False,
     )
     record = ExtractRecord(file=extract.file, sha256=content, bytes=0, date=extract.date, osm_timestamp=None)
-    _write_unless_current(plan, record, reading, tell=tell)
+    _write_unless_current(plan, tell, lambda scratch: _write_into(scratch, plan, record, reading, with_preview=True))
     return plan.folder
 
 
 def _content_sha256(features: gpd.GeoDataFrame) -> str:
-    """Hash every shape and what it is; a fingerprint has centroids alone."""
+    """Hash every shape and its attributes; a fingerprint has only centroids."""
     shapes = b"".join(shapely.to_wkb(features.geometry.to_numpy()))
     return hashlib.sha256(fingerprint(features).encode() + shapes).hexdigest()
 
 
-def _write_unless_current(plan: BuildPlan, extract: ExtractRecord, reading: Reading, *, tell: Tell) -> None:
-    """Write a region that is read from no file, unless it is there already."""
+def _write_unless_current(plan: BuildPlan, tell: Tell, write: Callable[[Path], Manifest]) -> Manifest | None:
+    """Let `write` fill the folder of a region; return None if it is up to date, perhaps by a build we waited for."""
     try:
         with locked(plan.folder, tell=tell):
-            if not _is_current(plan.folder, plan.inputs_sha256):
-                with fresh_folder(plan.folder) as scratch:
-                    _write_into(scratch, plan, extract, reading, with_preview=True)
+            if _is_current(plan.folder, plan.inputs_sha256):
+                return None
+            with fresh_folder(plan.folder) as scratch:
+                return write(scratch)
     except SasgeoError:
         raise
     except OSError as error:
@@ -355,7 +276,7 @@ def _write_unless_current(plan: BuildPlan, extract: ExtractRecord, reading: Read
 
 @contextmanager
 def _source(plan: BuildPlan) -> Iterator[Path]:
-    """Yield the extract; an embedded town is written to a temporary folder first."""
+    """Yield the extract; an embedded town is first written to a temporary folder."""
     if plan.source is not None:
         yield plan.source
         return
@@ -376,20 +297,19 @@ def _source(plan: BuildPlan) -> Iterator[Path]:
         yield path
 
 
-def _painter(reading: Reading, grid: Grid, taxonomy: Taxonomy) -> Callable[[int], PaintWindow]:
-    """Overview factor -> what burns a window; overviews draw lines at least one of their cells wide."""
+def _painter(reading: Reading, grid: Grid, taxonomy: Taxonomy, factor: int) -> PaintWindow:
+    """Return what burns a window of one overview, or of the map itself (factor 1).
 
-    def of_level(factor: int) -> PaintWindow:
-        """What burns a window of one overview, or of the map itself (1)."""
-        least_width_m = 0.0 if factor == 1 else grid.cell_size_m * factor
-        paint = make_paint(reading.features, taxonomy.names, reading.coverage, least_width_m=least_width_m)
-        return lambda window: burn_layers(paint, window)
-
-    return of_level
+    Overviews draw lines at least one of their cells wide.
+    """
+    least_width_m = 0.0 if factor == 1 else grid.cell_size_m * factor
+    return partial(
+        burn_layers, make_paint(reading.features, taxonomy.names, reading.coverage, least_width_m=least_width_m)
+    )
 
 
 def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, graph: MapGraph) -> Manifest:
-    """All that `region.json` says but the hashes of the files."""
+    """Make the content of `region.json`, without the hashes of the files."""
     taxonomy, grid, spec = load_taxonomy(), plan.grid, plan.spec
     west, south, east, north = grid.bounds_m
     counts = reading.features["class"].value_counts()

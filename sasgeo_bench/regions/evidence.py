@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Three-state rasters: present, absent or unknown per class, as a view saw them; packing, and warping to the map."""
+"""Three-state rasters: present, absent or unknown per class, as a view observed them; packing, and views of a map."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, inverse
+from sasgeo_bench.geometry.pose import Pose
 
 ABSENT: Final = 0
 PRESENT: Final = 1
@@ -29,29 +29,23 @@ _CELLS: Final = np.arange(256, dtype=np.uint8)[:, None] >> _SHIFTS & 3  # shape 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What one view says about each class and cell.
+    """The state of each class and cell, as observed in one view.
 
     Parameters
     ----------
     classes : tuple of str
         Class names in band order.
     cells : ndarray of uint8, shape (C, rows, cols)
-        ABSENT, PRESENT or UNKNOWN; row 0 is the top of the view. Kept read-only.
+        ABSENT, PRESENT or UNKNOWN; row 0 is the top of the view. Made read-only.
     cell_size_m : float
-        Metres on the ground a side of a cell, for scale 1.
+        Side of a cell on the ground, for scale 1.
     confidence : ndarray of uint8, shape (C, rows, cols), optional
-        0..255 for how sure perception is of each cell.
+        Confidence of perception in each cell, 0..255.
 
     Raises
     ------
     ShapeError
         If shapes, types or values do not fit.
-
-    Examples
-    --------
-    >>> seen = Evidence(classes=("water",), cells=np.full((1, 2, 2), UNKNOWN, dtype=np.uint8), cell_size_m=1.0)
-    >>> seen.unknown_share
-    1.0
     """
 
     classes: tuple[str, ...]
@@ -60,7 +54,7 @@ class Evidence:
     confidence: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no three-state raster; lock the arrays."""
+        """Check shapes, types and values; lock the arrays."""
         if self.cells.dtype != np.uint8 or self.cells.ndim != 3 or len(self.cells) != len(self.classes):  # noqa: PLR2004
             message = (
                 f"evidence for {len(self.classes)} classes is uint8 of shape (C, rows, cols), "
@@ -83,34 +77,34 @@ class Evidence:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Return rows and columns."""
         return (self.cells.shape[1], self.cells.shape[2])
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height on the ground for scale 1, metres."""
+        """Return width and height on the ground for scale 1, metres."""
         return (self.cells.shape[2] * self.cell_size_m, self.cells.shape[1] * self.cell_size_m)
 
     @cached_property
     def unknown_share(self) -> float:
-        """Share of unknown cells over all classes."""
+        """Return the fraction of unknown cells over all classes."""
         return float((self.cells == UNKNOWN).mean())
 
     def replace(self, cells: NDArray[np.uint8], confidence: NDArray[np.uint8] | None = None) -> Self:
-        """Return the same view with other cells (and confidence, none unless given)."""
+        """Return the same view with other cells (and confidence, none by default)."""
         return type(self)(classes=self.classes, cells=cells, cell_size_m=self.cell_size_m, confidence=confidence)
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
-        """Cells of one class, shape (rows, cols)."""
+        """Return the cells of one class, shape (rows, cols)."""
         return np.asarray(self.cells[self.classes.index(class_name)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LayerBits:
-    """All classes of a map in one integer a cell: many views are cut from it at the price of one layer.
+    """All classes of a map in one integer per cell: many views are cut from it for the price of one layer.
 
     `bits` is uint32 of shape (rows, cols), bit i set where class i is present, the highest where nothing is known;
-    `count` is the number of classes. Made by `of`.
+    `count` is the number of classes.
     """
 
     bits: NDArray[np.uint32]
@@ -118,7 +112,7 @@ class LayerBits:
 
     @classmethod
     def of(cls, layers: NDArray[np.uint8]) -> Self:
-        """Gather layers, uint8 of shape (C, rows, cols); a cell that one class does not know, none does.
+        """Combine layers, uint8 of shape (C, rows, cols); a cell unknown in one class is unknown in all.
 
         Examples
         --------
@@ -137,17 +131,7 @@ class LayerBits:
 
 
 def pack(cells: NDArray[np.uint8]) -> bytes:
-    """Pack three-state cells to two bits each, in C order, four to a byte, the first cell in the lowest bits.
-
-    Parameters
-    ----------
-    cells : ndarray of uint8
-        ABSENT, PRESENT or UNKNOWN, any shape.
-
-    Returns
-    -------
-    bytes
-        ceil(cells / 4) bytes; unused bits are 0.
+    """Pack three-state cells of any shape to two bits each, in C order, the first of four cells in the lowest bits.
 
     Examples
     --------
@@ -163,18 +147,7 @@ def pack(cells: NDArray[np.uint8]) -> bytes:
 
 
 def unpack(packed: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Inverse of `pack` for cells of a known shape.
-
-    Raises
-    ------
-    ShapeError
-        If the bytes are too few or too many, or hold a state that is none.
-
-    Examples
-    --------
-    >>> unpack(bytes.fromhex("4902"), (5,)).tolist()
-    [1, 2, 0, 1, 2]
-    """
+    """Unpack bytes of `pack` into cells of a known shape; raise `ShapeError` if their number or a state is wrong."""
     count = int(np.prod(shape))
     if len(packed) != -(-count // CELLS_PER_BYTE):
         message = (
@@ -197,20 +170,18 @@ def observe(
     size_cells: int,
     cell_size_m: float,
 ) -> NDArray[np.uint8]:
-    """Show the map as a perfect view from a pose would: each view cell takes the map cell under its centre.
+    """Return the map as a perfect view from a pose: each view cell takes the map cell under its centre.
 
     Parameters
     ----------
-    layers : LayerBits
-        A region's layers.
-    grid : Grid
-        Their lattice.
+    layers, grid : LayerBits, Grid
+        A region's layers and their lattice.
     pose : Pose
         Centre, heading and residual scale of the view.
     size_cells : int
         Rows and columns of the view.
     cell_size_m : float
-        Metres a side of a view cell for scale 1.
+        Side of a view cell on the ground, for scale 1.
 
     Returns
     -------
@@ -242,42 +213,8 @@ def observe(
     return seen
 
 
-def to_map(evidence: Evidence, pose: Pose, grid: Grid) -> NDArray[np.uint8]:
-    """Lay a view onto the map: each map cell takes the view cell its centre falls into.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        The view.
-    pose : Pose
-        Where it is thought to be.
-    grid : Grid
-        The map's lattice, or a window of it.
-
-    Returns
-    -------
-    ndarray of uint8, shape (C, rows, cols)
-        ABSENT, PRESENT or UNKNOWN; UNKNOWN wherever the view does not reach.
-
-    Examples
-    --------
-    >>> seen = Evidence(classes=("water",), cells=np.ones((1, 2, 2), dtype=np.uint8), cell_size_m=1.0)
-    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=3.0, cell_size_m=1.0, rows=3, cols=3)
-    >>> to_map(seen, Pose(easting_m=1.0, northing_m=2.0, yaw_deg=0.0), grid)[0]
-    array([[1, 1, 2],
-           [1, 1, 2],
-           [2, 2, 2]], dtype=uint8)
-    """
-    rows, cols = np.indices(grid.shape)
-    centres = grid.to_centres_m(np.column_stack((rows.ravel(), cols.ravel())))
-    offsets = inverse(pose).to_map(centres)
-    at_row, at_col = _view_grid(evidence.shape, evidence.cell_size_m).to_cells(offsets).T
-    laid = np.stack([_sample(layer, at_row, at_col, np.uint8(UNKNOWN)) for layer in evidence.cells])
-    return laid.reshape(-1, *grid.shape)
-
-
 def cell_offsets_m(shape: tuple[int, int], cell_size_m: float) -> NDArray[np.float64]:
-    """(right, up) of every cell centre of a view from its middle, row by row, shape (rows * cols, 2), metres.
+    """Return (right, up) of every cell centre of a view from its middle, row by row, shape (rows * cols, 2), metres.
 
     Examples
     --------
@@ -290,7 +227,7 @@ def cell_offsets_m(shape: tuple[int, int], cell_size_m: float) -> NDArray[np.flo
 
 
 def footprint(pose: Pose, *, size_m: tuple[float, float]) -> shapely.Polygon:
-    """Outline on the map of a view of a width and height, counter-clockwise.
+    """Return the outline of a view of a width and height on the map, counter-clockwise.
 
     Examples
     --------
@@ -303,14 +240,14 @@ def footprint(pose: Pose, *, size_m: tuple[float, float]) -> shapely.Polygon:
 
 
 def _view_grid(shape: tuple[int, int], cell_size_m: float) -> Grid:
-    """The view as a lattice of its own whose origin is the middle of the view."""
+    """Return the view as a lattice of its own whose origin is the middle of the view."""
     rows, cols = shape
     west_m, north_m = -cols * cell_size_m / 2, rows * cell_size_m / 2
     return Grid(epsg=0, west_m=west_m, north_m=north_m, cell_size_m=cell_size_m, rows=rows, cols=cols)
 
 
 def _sample(source: NDArray[Value], rows: NDArray[np.int64], cols: NDArray[np.int64], beyond: Value) -> NDArray[Value]:
-    """Values of a raster at cells of any shape; `beyond` outside of it."""
+    """Return values of a raster at cells of any shape; `beyond` outside of it."""
     height, width = source.shape
     at = rows * width + cols
     if rows.min() >= 0 and rows.max() < height and cols.min() >= 0 and cols.max() < width:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features -> MapGraph: junctions, crossings, buildings, clusters, areas, river bends, and what relates them."""
+"""Derive a MapGraph from features: junctions, crossings, buildings, clusters, areas, bends, and relations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,86 +66,30 @@ FULL_TURN_DEG, HALF_TURN_DEG = 360.0, 180.0
 SEVERAL: Final = -1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphRules:
-    """The distances and angles that decide what is a node and what is near.
-
-    Parameters
-    ----------
-    cluster_gap_m : float
-        Buildings at most this far apart belong together: a street and two front gardens part two blocks (20 m and
-        more), the gap between neighbours does not.
-    cluster_members : int
-        Smallest cluster; two houses are a pair, seen as well as instances.
-    building_adjacency_m : float
-        Longest adjacency of two building centres: across one street, not across a block.
-    bend_step_m : float
-        Spacing of a resampled waterway; about the breadth of a stream with its banks.
-    bend_smoothing_m : float
-        Length of the moving average that hides the digitizing noise of a waterway.
-    bend_window_m : float
-        Length of waterway within which a bend must turn; also the least distance of two bends.
-    bend_turn_deg : float
-        Least turn within the window; half a right angle stands out in a view of 100 m and more.
-    """
-
-    cluster_gap_m: float = 15.0
-    cluster_members: int = 3
-    building_adjacency_m: float = 60.0
-    bend_step_m: float = 10.0
-    bend_smoothing_m: float = 60.0
-    bend_window_m: float = 120.0
-    bend_turn_deg: float = 45.0
-
+CLUSTER_GAP_M: Final = 15.0  # more than between neighbours, less than a street with two front gardens (20 m and more)
+CLUSTER_MEMBERS: Final = 3  # two houses are a pair, and are nodes anyway
+BUILDING_ADJACENCY_M: Final = 60.0  # between centres: across one street, not across a block
+# Waterways: spacing of samples (about the width of a stream with its banks), length of the moving average that hides
+# the digitizing noise, length within which a bend must turn (also the least distance between two bends), least turn.
+BEND_STEP_M, BEND_SMOOTHING_M, BEND_WINDOW_M, BEND_TURN_DEG = 10.0, 60.0, 120.0, 45.0
 
 Bounds = tuple[float, float, float, float]
-DEFAULT_RULES: Final = GraphRules()
 
 
-def build_graph(
-    features: gpd.GeoDataFrame,
-    *,
-    bounds_m: Bounds | None = None,
-    rules: GraphRules = DEFAULT_RULES,
-) -> MapGraph:
-    """Derive the graph of a map.
+def build_graph(features: gpd.GeoDataFrame, *, bounds_m: Bounds | None = None) -> MapGraph:
+    """Derive the graph of a feature table.
 
-    Parameters
-    ----------
-    features : geopandas.GeoDataFrame
-        A feature table. What is not visible from above makes no node, but roads connect through it.
-    bounds_m : tuple of float, optional
-        West, south, east, north, metres: nothing outside becomes a node, and a road that ends on the border is cut
-        there, not dead.
-    rules : GraphRules
-        Thresholds.
-
-    Returns
-    -------
-    MapGraph
-        Nodes and edges; both empty with the right columns if there is nothing.
-
-    Raises
-    ------
-    ShapeError
-        If `features` is no feature table.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.osm.features import DTYPES, make_features
-    >>> empty = build_graph(make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632))
-    >>> len(empty.nodes), list(empty.edges.columns)[:3]
-    (0, ['source', 'target', 'relation'])
+    Features that are not visible from above make no node, but roads connect through them. Nothing outside `bounds_m`
+    (west, south, east, north) becomes a node, and a road that ends on the border is cut there, not a dead end. Raise
+    `ShapeError` if `features` is no feature table.
     """
     check_features(features)
     names = features["class"]
     draft = _Draft()
     ways = _sorted(features[names.isin(list(LAYERS)).to_numpy()])
-    _draw_ways(draft, ways, bounds_m=bounds_m, rules=rules)
+    _draw_ways(draft, ways, bounds_m)
     is_seen = features["is_visible"].to_numpy()
-    _draw_buildings(
-        draft, _sorted(features[is_seen & (names == "building").to_numpy()]), bounds_m=bounds_m, rules=rules
-    )
+    _draw_buildings(draft, _sorted(features[is_seen & (names == "building").to_numpy()]), bounds_m)
     # Where the middle of the sea lies tells where the extract was cut, and nothing of the place.
     is_area = is_seen & names.isin(AREA_CLASSES).to_numpy() & (features["osm_type"] != SEA).to_numpy()
     _draw_areas(draft, _sorted(features[is_area]))
@@ -153,7 +97,7 @@ def build_graph(
 
 
 def _sorted(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Put rows into the order of their identity, so that nothing below depends on the order they came in."""
+    """Sort rows by class, type and id, so that nothing below depends on the order they came in."""
     order = np.lexsort(
         [pd.Categorical(features[name]).codes for name in ("class", "osm_type")] + [features["osm_id"].to_numpy()]
     )
@@ -161,7 +105,7 @@ def _sorted(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 class _Draft:
-    """Nodes and edges as they are found; edges name nodes by the order in which they were added."""
+    """Nodes and edges while they are found; edges refer to nodes by the order in which they were added."""
 
     def __init__(self) -> None:
         self._nodes: list[dict[str, NDArray[np.generic]]] = []
@@ -169,7 +113,7 @@ class _Draft:
         self._count = 0
 
     def add_nodes(self, kind: str, en_m: Floats, **columns: object) -> Ints:
-        """Add nodes at places of shape (N, 2); a column left out holds its "not applicable" value."""
+        """Add nodes at places of shape (N, 2); a missing column gets its "not applicable" value."""
         count = len(en_m)
         values = {
             "degree": 0, "class": "", "osm_id": SEVERAL, "area_m2": np.nan, "count": 1, "level_difference": 0,
@@ -182,14 +126,14 @@ class _Draft:
         return np.arange(self._count - count, self._count)
 
     def add_edges(self, relation: str, source: Ints, target: Ints, length_m: Floats | None = None) -> None:
-        """Add edges between nodes added before; one that lacks a node (-1) or joins a node to itself is no edge."""
+        """Add edges between existing nodes; skip one that lacks a node (-1) or joins a node to itself."""
         real = (source >= 0) & (target >= 0) & (source != target)
         length_m = np.full(len(source), np.nan) if length_m is None else length_m
         code = np.full(int(real.sum()), RELATIONS.index(relation))
         self._edges.append((code, source[real], target[real], length_m[real]))
 
     def finish(self, crs: object, bounds_m: Bounds | None) -> MapGraph:
-        """Drop what lies outside, number the rest by kind and place, and measure the edges."""
+        """Drop nodes outside the bounds, number the rest by kind and place, and measure the edges."""
         table = {name: np.concatenate([batch[name] for batch in self._nodes]) for name in self._nodes[0]}
         en_m = np.column_stack([table["east"], table["north"]])
         order = np.lexsort([table["osm_id"], en_m[:, 1], en_m[:, 0], table["kind"]])
@@ -202,7 +146,7 @@ class _Draft:
         return MapGraph(nodes=nodes, edges=self._finish_edges(new_id, en_m[order]))
 
     def _finish_edges(self, new_id: Ints, en_m: Floats) -> pd.DataFrame:
-        """Return the edges between nodes that were kept, in order of relation and ends."""
+        """Return the edges between nodes that were kept, sorted by relation and ends."""
         code, source, target, length_m = (np.concatenate(part) for part in zip(*self._edges, strict=True))
         source, target = new_id[source], new_id[target]
         is_mutual = np.isin(code, [RELATIONS.index("adjacency"), RELATIONS.index("connectivity")])
@@ -225,7 +169,7 @@ class _Draft:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Ways:
-    """The network of a map with what its ways say, in one order."""
+    """The network of a map and the attributes of its ways, in one order."""
 
     network: Network
     names: NDArray[np.object_]  # class of each way
@@ -234,8 +178,8 @@ class _Ways:
     height: Ints  # OSM layer; a bridge without one lies above the ground
 
 
-def _draw_ways(draft: _Draft, ways: gpd.GeoDataFrame, *, bounds_m: Bounds | None, rules: GraphRules) -> None:
-    """Add junctions, crossings and river bends, and what connects them."""
+def _draw_ways(draft: _Draft, ways: gpd.GeoDataFrame, bounds_m: Bounds | None) -> None:
+    """Add junctions, crossings and river bends, and their connections."""
     names = ways["class"].to_numpy(dtype=object)
     level = ways["level"].to_numpy(dtype=np.int64)
     table = _Ways(
@@ -255,13 +199,13 @@ def _draw_ways(draft: _Draft, ways: gpd.GeoDataFrame, *, bounds_m: Bounds | None
     draft.add_edges("connectivity", junction[roads.tips[:, 0]], junction[roads.tips[:, 1]], roads.length_m)
     stops = _Stops(chains=lines, layers=[], nodes=[], chain=[], at_m=[])
     _add_crossings(draft, table, roads, junction, stops)
-    _add_bends(draft, table, stops, rules)
+    _add_bends(draft, table, stops)
     stops.connect(draft)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Stops:
-    """Nodes along railways and waterways, gathered until they can be put in order."""
+    """Nodes along railways and waterways, collected until they can be sorted."""
 
     chains: dict[int, Chains]
     layers: list[Ints]
@@ -270,17 +214,17 @@ class _Stops:
     at_m: list[Floats]
 
     def add(self, layer: int, nodes: Ints, chain: Ints, at_m: Floats) -> None:
-        """Note that nodes lie so far along chains of a layer."""
+        """Record nodes by their distance along chains of a layer."""
         self.layers.append(np.full(len(nodes), layer))
         self.nodes.append(nodes)
         self.chain.append(chain)
         self.at_m.append(at_m)
 
     def add_on_segments(self, layer: int, nodes: Ints, segments: Ints, shares: Floats) -> None:
-        """Note nodes that lie a share of the way along segments of a layer; others are passed over."""
+        """Record nodes by their share of the way along segments of a layer; skip segments of other layers."""
         chains = self.chains[layer]
-        mine = chains.of_segment[segments] >= 0
-        nodes, segments, shares = nodes[mine], segments[mine], shares[mine]
+        chosen = chains.of_segment[segments] >= 0
+        nodes, segments, shares = nodes[chosen], segments[chosen], shares[chosen]
         begin_m, end_m = chains.segment_at_m[segments].T
         self.add(layer, nodes, chains.of_segment[segments], begin_m + shares * (end_m - begin_m))
 
@@ -296,14 +240,14 @@ class _Stops:
 
 
 def _is_on_square(network: Network, ways: gpd.GeoDataFrame) -> Bools:
-    """Whether vertices lie on the outline of a square (a road mapped as an area), where a way does not end."""
+    """Return which vertices lie on the outline of a square (a road mapped as an area), where a way does not end."""
     shapes = np.asarray(ways.geometry.array)
     vertex = network.lookup(shapely.get_coordinates(shapes[shapely.get_dimensions(shapes) == AREA_DIMENSION]))
     return np.isin(np.arange(len(network.vertices)), vertex)
 
 
 def _add_junctions(draft: _Draft, ways: _Ways, is_dead: Bools) -> Ints:
-    """Add intersections and dead ends; returns the node at each vertex, -1 where there is none."""
+    """Add intersections and dead ends; return the node at each vertex, -1 where there is none."""
     network = ways.network
     degree, seen = network.degree(ROAD), network.degree(ROAD, visible_only=True)
     carrier = _carriers(ways, ROAD)
@@ -319,7 +263,7 @@ def _add_junctions(draft: _Draft, ways: _Ways, is_dead: Bools) -> Ints:
 
 
 def _carriers(ways: _Ways, layer: int) -> Ints:
-    """Way of highest class and OSM id (-1 for several) at each vertex, shape (V, 2); (-1, -1) off the layer."""
+    """Return way of highest class and OSM id (-1 for several) at each vertex, shape (V, 2); (-1, -1) off the layer."""
     network = ways.network
     chosen = np.flatnonzero(network.layer == layer)
     vertex, way = network.ends[chosen].ravel(), np.repeat(network.way[chosen], 2)
@@ -336,7 +280,7 @@ def _carriers(ways: _Ways, layer: int) -> Ints:
 
 
 def _add_crossings(draft: _Draft, ways: _Ways, roads: Chains, junction: Ints, stops: _Stops) -> None:
-    """Add the places where ways cross, at grade or not; the way above names the node, else the higher class."""
+    """Add the places where ways cross, at grade or not; the upper way names the node, else the higher class."""
     network = ways.network
     parts = (find_crossings(network), find_meetings(network, RAIL), find_meetings(network, WATER))
     segments, shares = (np.concatenate([getattr(part, name) for part in parts]) for name in ("segments", "shares"))
@@ -354,41 +298,41 @@ def _add_crossings(draft: _Draft, ways: _Ways, roads: Chains, junction: Ints, st
         kind[(layer == pair).all(axis=1)] = name
     kind[is_level] = "level_crossing"
     for name in ("crossing", *CROSSING_KIND.values(), "level_crossing"):
-        mine = np.flatnonzero(kind == name)
+        chosen = np.flatnonzero(kind == name)
         nodes = draft.add_nodes(
             name,
-            en_m[mine],
-            degree=ends[vertex[mine]] if name == "level_crossing" else 0,
-            level_difference=difference[mine],
-            osm_id=np.where(difference > 0, ways.osm_id[above], SEVERAL)[mine],
-            **{"class": ways.names[above[mine]]},
+            en_m[chosen],
+            degree=ends[vertex[chosen]] if name == "level_crossing" else 0,
+            level_difference=difference[chosen],
+            osm_id=np.where(difference > 0, ways.osm_id[above], SEVERAL)[chosen],
+            **{"class": ways.names[above[chosen]]},
         )
-        at = np.where(vertex[mine] >= 0, junction[vertex[mine]], -1)
+        at = np.where(vertex[chosen] >= 0, junction[vertex[chosen]], -1)
         draft.add_edges("crossing", nodes, at)
-        for segment, share in zip(segments[mine].T, shares[mine].T, strict=True):
+        for segment, share in zip(segments[chosen].T, shares[chosen].T, strict=True):
             _link_to_ends(draft, roads, junction, nodes[at < 0], segment[at < 0])
             stops.add_on_segments(RAIL, nodes, segment, share)
             stops.add_on_segments(WATER, nodes, segment, share)
 
 
 def _link_to_ends(draft: _Draft, roads: Chains, junction: Ints, nodes: Ints, segments: Ints) -> None:
-    """Link crossings to the junctions at both ends of their roads; segments of other layers are passed over."""
-    mine = roads.of_segment[segments] >= 0
-    for end in roads.tips[roads.of_segment[segments[mine]]].T:
-        draft.add_edges("crossing", nodes[mine], junction[end])
+    """Link crossings to the junctions at both ends of their roads; skip segments of other layers."""
+    chosen = roads.of_segment[segments] >= 0
+    for end in roads.tips[roads.of_segment[segments[chosen]]].T:
+        draft.add_edges("crossing", nodes[chosen], junction[end])
 
 
-def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops, rules: GraphRules) -> None:
-    """Add the bends of waterways, save where they run under ground."""
+def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops) -> None:
+    """Add the bends of waterways, except under ground."""
     chains, network = stops.chains[WATER], ways.network
     bends = find_bends(
         chains.en_m,
         chains.at_m,
         chains.first,
-        step_m=rules.bend_step_m,
-        smoothing_m=rules.bend_smoothing_m,
-        window_m=rules.bend_window_m,
-        turn_deg=rules.bend_turn_deg,
+        step_m=BEND_STEP_M,
+        smoothing_m=BEND_SMOOTHING_M,
+        window_m=BEND_WINDOW_M,
+        turn_deg=BEND_TURN_DEG,
     )
     segment = chains.segment_at(bends.line, bends.at_m)
     seen = np.flatnonzero(network.is_visible[segment])
@@ -403,7 +347,7 @@ def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops, rules: GraphRules) -> 
     stops.add(WATER, nodes, bends.line[seen], bends.at_m[seen])
 
 
-def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, *, bounds_m: Bounds | None, rules: GraphRules) -> None:
+def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, bounds_m: Bounds | None) -> None:
     """Add buildings and their clusters."""
     shapes = np.asarray(buildings.geometry.array)
     en_m = centroids(shapes)
@@ -413,12 +357,12 @@ def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, *, bounds_m: Bou
     bearing = _wrapped(bearing_deg(*long_sides(shapes).T), HALF_TURN_DEG)
     about = {"class": "building"}
     nodes = draft.add_nodes("building", en_m, osm_id=osm_id, area_m2=area_m2, bearing_deg=bearing, **about)
-    pairs = delaunay_pairs(en_m, rules.building_adjacency_m)
+    pairs = delaunay_pairs(en_m, BUILDING_ADJACENCY_M)
     draft.add_edges("adjacency", *nodes[pairs].T)
 
-    group = groups_within(shapes, rules.cluster_gap_m)
+    group = groups_within(shapes, CLUSTER_GAP_M)
     size = np.bincount(group)
-    chosen = np.flatnonzero(size >= rules.cluster_members)
+    chosen = np.flatnonzero(size >= CLUSTER_MEMBERS)
     area = np.bincount(group, weights=area_m2)
     weight = area_m2 / area[group]
     centre: Floats = np.column_stack(
@@ -449,12 +393,12 @@ def _draw_areas(draft: _Draft, areas: gpd.GeoDataFrame) -> None:
 
 
 def _typed(columns: Mapping[str, object], dtypes: Mapping[str, str]) -> pd.DataFrame:
-    """Table of the columns in the order and with the types of a schema."""
+    """Return a table of the columns in the order and with the types of a schema."""
     return pd.DataFrame({name: columns[name] for name in dtypes}).astype(dict(dtypes))
 
 
 def _is_inside(en_m: Floats, bounds_m: Bounds | None, *, on_border: bool = True) -> Bools:
-    """Whether places lie in the bounds; `on_border` is the answer for the border itself."""
+    """Return which places lie in the bounds; `on_border` is the answer for the border itself."""
     if bounds_m is None:
         return np.ones(len(en_m), dtype=bool)
     west, south, east, north = bounds_m
@@ -464,6 +408,6 @@ def _is_inside(en_m: Floats, bounds_m: Bounds | None, *, on_border: bool = True)
 
 
 def _wrapped(angle_deg: Floats, turn_deg: float) -> NDArray[np.float32]:
-    """Angles in [0, turn) that stay below the turn when stored in four bytes."""
+    """Return angles in [0, turn) that stay below the turn when stored in four bytes."""
     short = np.mod(angle_deg, turn_deg).astype(np.float32)
     return np.where(short >= turn_deg, np.float32(0), short)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`layers.tif`: a cloud-optimized GeoTIFF with one band per class, written window by window."""
+"""Read and write `layers.tif`: a cloud-optimized GeoTIFF with one band per class, written window by window."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,7 +28,7 @@ PaintWindow = Callable[[Grid], NDArray[np.uint8]]
 
 
 def overview_factors(grid: Grid) -> tuple[int, ...]:
-    """Factors of the internal overviews: quartered until the raster fits two blocks.
+    """Return factors of the internal overviews: quartered until the raster fits two blocks.
 
     Examples
     --------
@@ -40,29 +40,14 @@ def overview_factors(grid: Grid) -> tuple[int, ...]:
 
 
 def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callable[[int], PaintWindow]) -> None:
-    """Write the layer stack of a region.
+    """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
-    Parameters
-    ----------
-    path : Path
-        The file to write; must not exist.
-    grid : Grid
-        The region's lattice.
-    classes : tuple of str
-        Band names.
-    paint : callable
-        Given an overview factor (1 for the map itself), returns what burns one window: Grid -> uint8 (C, rows, cols).
+    `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
+    cols).
 
-    Raises
-    ------
-    StoreError
-        If the file cannot be written.
-
-    Notes
-    -----
-    A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver gets there
-    by writing everything twice; here the empty overviews are laid out first and then every level is burnt from the
-    vectors straight into its place, so memory and time are those of one pass.
+    A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
+    everything twice to get there. Here the empty overviews are laid out first and then every level is burnt from the
+    vectors into its place, so memory and time are those of one pass.
     """
     factors = overview_factors(grid)
     options = {"GDAL_CACHEMAX": _CACHE_BYTES, "SPARSE_OK_OVERVIEW": "YES", "GDAL_TIFF_OVR_BLOCKSIZE": BLOCK_CELLS}
@@ -111,20 +96,20 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: tuple[in
 
 
 def _fill(target: rasterio.io.DatasetWriter, grid: Grid, burn: PaintWindow) -> None:
-    """Burn the next window while GDAL packs the one before, which needs no interpreter; at most two are held."""
-    with ThreadPoolExecutor(max_workers=1) as beside:
+    """Burn a window while GDAL packs the previous one, which needs no interpreter; at most two are held."""
+    with ThreadPoolExecutor(max_workers=1) as executor:
         packing: Future[None] | None = None
         for row, col, window in grid.windows(WINDOW_CELLS):
             layers = burn(window)
             if packing is not None:
                 packing.result()
-            packing = beside.submit(target.write, layers, window=Window(col, row, window.cols, window.rows))
+            packing = executor.submit(target.write, layers, window=Window(col, row, window.cols, window.rows))
         if packing is not None:
             packing.result()
 
 
 def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
-    """Read the finest level whose longer side has at most so many cells; shape (C, rows, cols)."""
+    """Read the finest level whose longer side has at most `longest_cells`; shape (C, rows, cols)."""
     with rasterio.open(path) as source:
         longest, factors = max(source.height, source.width), source.overviews(1)
     fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
@@ -137,10 +122,7 @@ def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
 def read_layers(path: Path, *, window: tuple[int, int, int, int] | None = None) -> NDArray[np.uint8]:
     """Read a layer stack, or one window of it (row, col, rows, cols); shape (C, rows, cols), read-only.
 
-    Raises
-    ------
-    StoreError
-        If the file cannot be read.
+    Raise `StoreError` if the file cannot be read.
     """
     try:
         with rasterio.open(path) as source:
@@ -154,13 +136,7 @@ def read_layers(path: Path, *, window: tuple[int, int, int, int] | None = None) 
 
 
 def cog_faults(path: Path) -> list[str]:
-    """What a validator of cloud-optimized GeoTIFFs finds wrong with a file; nothing where it is good.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be read.
-    """
+    """List the faults found by a validator of cloud-optimized GeoTIFFs; raise `StoreError` if it cannot be read."""
     from rio_cogeo.cogeo import cog_validate  # noqa: PLC0415 - an extra: only whoever writes a release needs it
 
     try:

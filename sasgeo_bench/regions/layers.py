@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features + grid -> one raster per class, by the cell-centre rule, lines as wide as they are in metres."""
+"""Burn features into one raster per class, by the cell-centre rule; lines have their width in metres."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 
-ABSENT: Final = 0
 PRESENT: Final = 1
 OUTSIDE: Final = 255  # beyond the mapped area: not absent, unknown
 
@@ -21,7 +20,7 @@ _ARC_SEGMENTS: Final = 2  # per quarter circle at line ends and bends: 3 % of th
 
 @dataclass(frozen=True, kw_only=True)
 class Paint:
-    """What is to be burnt: for each class, in band order, its polygons with the outer ring counter-clockwise."""
+    """The polygons to burn: for each class, in band order, with the outer ring counter-clockwise."""
 
     classes: tuple[str, ...]
     areas: tuple[NDArray[np.object_], ...]
@@ -29,38 +28,17 @@ class Paint:
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], ...]:
-        """West, south, east, north of every polygon, shape (N, 4) for each class."""
+        """Return west, south, east, north of every polygon, shape (N, 4) for each class."""
         return tuple(shapely.bounds(areas).reshape(-1, 4) for areas in self.areas)
 
 
 def make_paint(
     features: gpd.GeoDataFrame, classes: tuple[str, ...], coverage: shapely.Geometry, *, least_width_m: float = 0.0
 ) -> Paint:
-    """Turn visible features into polygons: lines are buffered to their width, areas taken as they are.
+    """Turn visible features into polygons for `burn_layers`: lines are buffered to their width, areas stay as they are.
 
-    Parameters
-    ----------
-    features : geopandas.GeoDataFrame
-        A feature table; what is not visible from above is left out.
-    classes : tuple of str
-        Band order.
-    coverage : shapely.Geometry
-        Mapped area in the CRS of the features.
-    least_width_m : float
-        For overviews with large cells: lines are drawn at least this wide, so that they do not break, and simplified to
-        an eighth of it.
-
-    Returns
-    -------
-    Paint
-        Polygons for `burn_layers`.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.osm.features import DTYPES, make_features
-    >>> empty = make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632)
-    >>> len(make_paint(empty, ("road_major",), shapely.box(0, 0, 9, 9)).coverage)
-    1
+    `classes` gives the band order, `coverage` the mapped area in the CRS of the features. For overviews with large
+    cells, lines are at least `least_width_m` wide, so that they do not break, and simplified to an eighth of it.
     """
     seen = features[features["is_visible"].to_numpy()]
     shape = seen.geometry.to_numpy().copy()
@@ -79,25 +57,15 @@ def make_paint(
 
 
 def _oriented(areas: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Single polygons, outer rings counter-clockwise and holes clockwise, so that crossings can be summed by sign."""
+    """Return single polygons, outer rings counter-clockwise, holes clockwise: crossings are summed by sign."""
     parts = shapely.get_parts(areas)
     return np.asarray(shapely.orient_polygons(parts[~shapely.is_empty(parts)], exterior_cw=False))
 
 
 def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
-    """Burn every class on one grid.
+    """Burn every class on a grid in the CRS of the polygons: PRESENT, ABSENT, or OUTSIDE beyond the mapped area.
 
-    Parameters
-    ----------
-    paint : Paint
-        Polygons in the CRS of the grid.
-    grid : Grid
-        The lattice; any window of the region's grid gives exactly that window of the whole.
-
-    Returns
-    -------
-    ndarray of uint8, shape (C, rows, cols)
-        PRESENT, ABSENT, or OUTSIDE beyond the mapped area.
+    The result is uint8 of shape (C, rows, cols). A window of the region's grid gives exactly that window of the whole.
 
     Examples
     --------
@@ -128,25 +96,16 @@ def _meets(bounds: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
 
 
 def burn(areas: NDArray[np.object_], grid: Grid) -> NDArray[np.bool_]:
-    """Mark the cells whose centre lies within any polygon: GDAL's rule, for all polygons at once.
+    """Mark the cells whose centre lies within any polygon: GDAL's rule, for all polygons at once; shape (rows, cols).
 
-    Parameters
-    ----------
-    areas : ndarray of shapely.Polygon, shape (N,)
-        Outer rings counter-clockwise, holes clockwise (`shapely.orient_polygons`).
-    grid : Grid
-        The lattice, in the CRS of the polygons.
-
-    Returns
-    -------
-    ndarray of bool, shape (rows, cols)
-        True where a centre lies within. A centre exactly on an edge belongs to the polygon south or east of it.
+    Outer rings are counter-clockwise, holes clockwise (`shapely.orient_polygons`). A centre exactly on an edge belongs
+    to the polygon south or east of it.
 
     Notes
     -----
     Each ring edge crosses the centre lines of some rows; downward crossings count +1, upward ones -1. Sorted along the
     raster, their running sum is the number of polygons that cover a cell, and its runs are written out in one go. The
-    same cells as `rasterio.features.rasterize`, which spends its time on converting every vertex from Python
+    cells equal those of `rasterio.features.rasterize`, which spends its time on converting every vertex from Python
     (docs/decisions/0007).
 
     Examples
@@ -169,7 +128,7 @@ def burn(areas: NDArray[np.object_], grid: Grid) -> NDArray[np.bool_]:
 def _crossings(
     areas: NDArray[np.object_], grid: Grid
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Row, first column at or right of the crossing, and sign, of every edge with every row's centre line."""
+    """Return row, first column at or right of the crossing, and sign, for every edge and every row's centre line."""
     rings = shapely.get_rings(areas)
     points, ring = shapely.get_coordinates(rings, return_index=True)
     uv = grid.to_uv(points)

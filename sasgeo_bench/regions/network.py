@@ -25,18 +25,18 @@ LINE_TYPE: Final = 1  # of shapely.get_type_id
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
-    """Segments between shared vertices; each undirected segment stands once a layer.
+    """Segments between shared vertices; each undirected segment occurs once per layer.
 
     Parameters
     ----------
     vertices : ndarray of float64, shape (V, 2)
         Easting and northing, metres.
     keys : ndarray of int64, shape (V,)
-        Ascending key of each vertex on the millimetre lattice that `origin` and `stride` define.
+        Ascending key of each vertex on the millimetre lattice of `origin` and `stride`.
     ends : ndarray of int64, shape (S, 2)
         Vertices of each segment, in the direction of its way; the segments of a way follow each other.
     way : ndarray of int64, shape (S,)
-        Row of the way in the table the network was made of.
+        Row of the way in the source table.
     layer : ndarray of int64, shape (S,)
         ROAD, RAIL or WATER.
     is_visible : ndarray of bool, shape (S,)
@@ -57,7 +57,7 @@ class Network:
     stride: int
 
     def lookup(self, en_m: Floats) -> Ints:
-        """Vertex at each place of shape (N, 2), metres; -1 where there is none."""
+        """Return the vertex at each place of shape (N, 2), metres; -1 where there is none."""
         if not len(self.keys):
             return np.full(len(en_m), -1)
         cells = np.rint((en_m - self.origin) / VERTEX_M).astype(np.int64)
@@ -74,17 +74,10 @@ class Network:
 
 
 def make_network(ways: gpd.GeoDataFrame) -> Network:
-    """Cut ways into segments and join them where they share a vertex of the same layer.
+    """Cut ways with the classes of `LAYERS` into segments that share the vertices of their layer.
 
-    Parameters
-    ----------
-    ways : geopandas.GeoDataFrame
-        Rows of a feature table with the classes of `LAYERS`; areas among them (squares) are left out.
-
-    Returns
-    -------
-    Network
-        A segment drawn by two ways of one layer counts once, and is visible if either is.
+    Areas among them (squares) are left out. A segment drawn by two ways of one layer counts once, and is visible if
+    either is.
 
     Examples
     --------
@@ -125,7 +118,7 @@ def make_network(ways: gpd.GeoDataFrame) -> Network:
 
 
 def pair_keys(pairs: Ints, count: int) -> Ints:
-    """One integer for each unordered pair of shape (N, 2) of numbers below `count`.
+    """Return one integer for each unordered pair, shape (N, 2), of numbers below `count`.
 
     Examples
     --------
@@ -137,7 +130,7 @@ def pair_keys(pairs: Ints, count: int) -> Ints:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chains:
-    """The segments of one layer, strung together.
+    """The segments of one layer, joined into chains.
 
     Parameters
     ----------
@@ -169,7 +162,7 @@ class Chains:
     part_segment: Ints
 
     def segment_at(self, chain: Ints, at_m: Floats) -> Ints:
-        """Network segment so far along each chain, metres."""
+        """Return the network segment at a distance along each chain, metres."""
         shift_m = np.cumsum(self.length_m + 1.0) - self.length_m  # one axis for all chains
         axis_m = self.at_m + np.repeat(shift_m, np.diff(self.first))
         part = np.searchsorted(axis_m, at_m + shift_m[chain], side="right") - 1
@@ -177,22 +170,11 @@ class Chains:
 
 
 def make_chains(network: Network, layer: int, *, is_break: Bools) -> Chains:
-    """String the segments of a layer into chains that end at the breaks and wherever the layer forks.
+    """Join the segments of a layer (ROAD, RAIL or WATER) into chains that end at breaks and forks.
 
-    Parameters
-    ----------
-    network : Network
-        All layers.
-    layer : int
-        ROAD, RAIL or WATER.
-    is_break : ndarray of bool, shape (V,)
-        Vertices inside a way where a chain must end too. Where this is False a way runs on past a fork inside it: a
-        river past its tributaries, a track past its switches.
-
-    Returns
-    -------
-    Chains
-        Chain ends depend on the geometry only; their order and direction follow the order of the ways.
+    `is_break`, shape (V,), marks vertices inside a way where a chain must end too. Elsewhere a way continues past a
+    fork inside it: a river past its tributaries, a track past its switches. Chain ends depend on the geometry only;
+    order and direction of chains follow the order of the ways.
 
     Examples
     --------
@@ -239,7 +221,7 @@ def make_chains(network: Network, layer: int, *, is_break: Bools) -> Chains:
 
 
 def _pieces(network: Network, chosen: Ints, is_break: Bools) -> Lines:
-    """Runs of successive segments of one way between breaks, as lines."""
+    """Return runs of successive segments of one way between breaks, as lines."""
     if not len(chosen):
         return np.empty(0, dtype=object)
     ends, way = network.ends[chosen], network.way[chosen]
@@ -260,13 +242,13 @@ class Crossings:
     Parameters
     ----------
     en_m : ndarray of float64, shape (N, 2)
-        Where, metres.
+        Place, metres.
     segments : ndarray of int64, shape (N, 2)
         The two segments; the layer of the first is not the greater one.
     shares : ndarray of float64, shape (N, 2)
-        How far along each of the two the crossing lies, in [0, 1].
+        Position of the crossing along each of the two, in [0, 1].
     vertex : ndarray of int64, shape (N,)
-        The vertex they share; -1 where they share none.
+        The shared vertex, or -1.
     """
 
     en_m: Floats
@@ -276,9 +258,10 @@ class Crossings:
 
 
 def find_crossings(network: Network) -> Crossings:
-    """Find where ways cross without a shared vertex; waterways are not crossed with each other.
+    """Find where ways cross without a shared vertex, except two waterways.
 
-    A way that ends on another without a shared vertex does not cross it; one that has a vertex on it and goes on does.
+    A way that ends on another without a shared vertex does not cross it; one that has a vertex on it and continues
+    does.
 
     Examples
     --------
@@ -300,8 +283,8 @@ def find_crossings(network: Network) -> Crossings:
     corner = network.vertices[network.ends[pairs]]
     ahead = corner[:, :, 1] - corner[:, :, 0]
     area = _cross(ahead[:, 0], ahead[:, 1])
-    is_apart = area != 0  # parallel segments may overlap, but they do not cross
-    pairs, corner, ahead, area = pairs[is_apart], corner[is_apart], ahead[is_apart], area[is_apart]
+    is_skew = area != 0  # parallel segments may overlap, but they do not cross
+    pairs, corner, ahead, area = pairs[is_skew], corner[is_skew], ahead[is_skew], area[is_skew]
     between = corner[:, 1, 0] - corner[:, 0, 0]
     shares = np.stack([_cross(between, ahead[:, 1]) / area, _cross(between, ahead[:, 0]) / area], axis=1)
     slack = VERTEX_M / np.linalg.norm(ahead, axis=2)
@@ -351,5 +334,5 @@ def find_meetings(network: Network, layer: int) -> Crossings:
 
 
 def _cross(left: Floats, right: Floats) -> Floats:
-    """Cross product of vectors of shape (N, 2)."""
+    """Return the cross product of vectors of shape (N, 2)."""
     return np.asarray(left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`preview.png`: a region as a map for people, with legend, scale, north, date and attribution."""
+"""Draw `preview.png`: a region as a map with legend, scale, north arrow, date and attribution."""
 
 from pathlib import Path
 from textwrap import wrap
@@ -40,17 +40,7 @@ _EDGE: Final = "#d81b60"
 
 
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
-    """Draw a region.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG to write.
-    manifest : Manifest
-        What the frame says.
-    overview : ndarray of uint8, shape (C, rows, cols)
-        A coarse level of the layers, bands in the order of the manifest's classes.
-    """
+    """Draw a region to a PNG; `overview` is a coarse level of the layers, uint8 of shape (C, rows, cols)."""
     rows, cols = overview.shape[1:]
     scale = _MAP_INCHES / max(rows, cols)
     width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
@@ -74,7 +64,7 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
 
 
 def _draw_edge(chart: Axes, manifest: Manifest) -> None:
-    """The outline of what is mapped, within the grid."""
+    """Draw the outline of the mapped area within the grid."""
     west, south, east, north = manifest.bounds_m
     frame = shapely.boundary(shapely.box(west, south, east, north))
     edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))
@@ -85,7 +75,7 @@ def _draw_edge(chart: Axes, manifest: Manifest) -> None:
 
 
 def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:
-    """Scale and north under the map, in its scale, so that they hide nothing of it."""
+    """Draw scale bar and north arrow under the map, at its scale, so that they hide nothing of it."""
     width = width_m / m_per_inch
     strip = figure.add_axes(
         (0.3 / total[0], (_FOOT_INCHES - _STRIP_INCHES) / total[1], width / total[0], _STRIP_INCHES / total[1])
@@ -99,12 +89,12 @@ def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m
 
 
 def _cell_m(manifest: Manifest, overview: NDArray[np.uint8]) -> float:
-    """Size of an overview cell: overviews are coarser by a whole factor."""
+    """Return the size of an overview cell: overviews are coarser by a whole factor."""
     return manifest.cell_size_m * round(manifest.cols / overview.shape[2]) if overview.shape[2] else 1.0
 
 
 def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Colours, shape (rows, cols, 3), 0..1."""
+    """Return the colours of a map, shape (rows, cols, 3), 0..1."""
     rows, cols = overview.shape[1:]
     picture = np.empty((rows, cols, 3))
     picture[:] = to_rgb(_GROUND)
@@ -121,7 +111,7 @@ def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[n
 
 
 def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
-    """A bar of a round length, about a fifth of the width, in the lower left corner of a chart in metres."""
+    """Draw a bar of a round length, about a fifth of the width, in the lower left corner of a chart in metres."""
     goal = width_m / 4
     power = 10.0 ** np.floor(np.log10(goal))
     length_m = float(max(step * power for step in (1, 2, 5) if step * power <= goal))
@@ -142,7 +132,7 @@ def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
 
 
 def north_arrow(chart: Axes, width_m: float, height_m: float, *, size_m: float | None = None) -> None:
-    """An arrow with an N in the upper right corner of a chart in metres."""
+    """Draw an arrow with an N in the upper right corner of a chart in metres."""
     size = size_m or 0.05 * max(width_m, height_m)
     x, y = width_m - 0.9 * size, height_m - 1.5 * size
     chart.add_patch(
@@ -159,7 +149,7 @@ def north_arrow(chart: Axes, width_m: float, height_m: float, *, size_m: float |
 
 
 def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> None:
-    """Title above, facts below it, attribution at the foot."""
+    """Write the title, the facts below it, and the attribution at the foot."""
     per_inch = 9.0
     title = wrap(f"{manifest.title} ({manifest.id})", int(per_inch * 0.9 * (total[0] - 0.6)))
     figure.text(0.3 / total[0], 1 - 0.16 / total[1], title[0], ha="left", va="top", fontsize=14, fontweight="bold")
@@ -173,7 +163,7 @@ def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> No
 
 
 def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, left: float, top: float) -> None:
-    """Classes that are there, with their number of objects, and what the hatching means."""
+    """Draw the classes that occur, with their number of objects, and explain the hatching."""
     titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
     entries: list[Patch | Line2D] = [
         Patch(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Region: grid + layers + graph + features + coverage + provenance; immutable."""
+"""Region: grid, layers, graph, features, coverage and provenance; immutable."""
 
 import datetime as dt
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class _Record(Document):
-    """JSON knows no tuples and no dates, so the records are read with ordinary conversion."""
+    """Base of JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
@@ -43,10 +43,10 @@ class ExtractRecord(_Record):
 
 
 class CoverageRecord(_Record):
-    """The mapped area: where it is known from, its share of the grid, and its outline as WKT in the region's CRS.
+    """The mapped area: its source, its share of the grid, and its outline as WKT in the region's CRS.
 
-    `unknown_m2` is ground that was taken out of it, by reason (one place may have two); `cuts` are counts of what an
-    extract cut out of a larger one lacks. Both are empty in regions of data version 1, which did not look.
+    `unknown_m2` is the ground removed from it, by reason (one place may have two); `cuts` counts what an extract lost
+    where it was cut out of a larger one. Both are empty in regions of data version 1, which did not record them.
     """
 
     source: CoverageSource
@@ -56,7 +56,7 @@ class CoverageRecord(_Record):
     cuts: dict[str, Count] = {}
 
     def to_text(self) -> str:
-        """One line for a person: how much is mapped, and what is not and why."""
+        """Describe in one line how much is mapped, and what is not and why."""
         cuts = ", ".join(f"{what} {count}" for what, count in self.cuts.items())
         reasons = [f"{area_m2:,.0f} m2 unknown {reason}" for reason, area_m2 in self.unknown_m2.items()]
         about = f"; cut out of a larger extract: {cuts}" if cuts else ""
@@ -64,10 +64,10 @@ class CoverageRecord(_Record):
 
 
 class Manifest(_Record):
-    """`region.json`: what a region is, where it comes from, and the hashes of its files.
+    """`region.json`: identity and provenance of a region, and the hashes of its files.
 
     `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by
-    reason: not visible from above, not used, mended.
+    reason: not visible from above, not used, repaired.
     """
 
     schema_version: int
@@ -99,7 +99,7 @@ class Manifest(_Record):
 
     @property
     def grid(self) -> Grid:
-        """The region's lattice."""
+        """Return the region's lattice."""
         return Grid(
             epsg=self.epsg,
             west_m=self.bounds_m[0],
@@ -112,19 +112,19 @@ class Manifest(_Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapGraph:
-    """What stands where on the map, and how it relates.
+    """Landmarks of a map and their relations.
 
     Parameters
     ----------
     nodes : geopandas.GeoDataFrame
-        One row a node with the columns of `graph.NODE_DTYPES` and `geometry`, by kind and coordinates, so `id` does
-        not depend on the order of the features. `degree` counts the road ends that meet (and the rail ends at a level
-        crossing), 0 elsewhere. `class` and `osm_id` name the feature that carries the node: the way above at a
-        crossing, the way of highest class at a junction; -1 where several do. `level_difference` is the upper level
-        less the lower one. `bearing_deg` is the long side of a building in [0, 180), and towards the inside of a bend.
+        One row per node with the columns of `graph.NODE_DTYPES` and `geometry`, sorted by kind and coordinates, so that
+        `id` does not depend on the order of the features. `degree` counts the road ends that meet (and the rail ends at
+        a level crossing), 0 elsewhere. `class` and `osm_id` name the feature that carries the node: the upper way at a
+        crossing, the way of highest class at a junction; -1 if several do. `level_difference` is the upper level less
+        the lower one. `bearing_deg` is the long side of a building in [0, 180), and towards the inside of a bend.
     edges : pandas.DataFrame
-        One row an edge with the columns of `graph.EDGE_DTYPES`. Connectivity (along roads, railways and waterways) and
-        adjacency have no direction and stand once, from the smaller id; a crossing points to the junctions at the ends
+        One row per edge with the columns of `graph.EDGE_DTYPES`. Connectivity (along roads, railways and waterways) and
+        adjacency have no direction and occur once, from the smaller id; a crossing points to the junctions at the ends
         of its roads, a membership from the building to its cluster. `distance_m` is straight, `length_m` along the way.
     """
 
@@ -148,14 +148,14 @@ class Region:
 
     @property
     def grid(self) -> Grid:
-        """The region's lattice."""
+        """Return the region's lattice."""
         return self.manifest.grid
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Class names in band order."""
+        """Return class names in band order."""
         return self.manifest.classes
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
-        """The raster of one class, shape (rows, cols)."""
+        """Return the raster of one class, shape (rows, cols)."""
         return np.asarray(self.layers[self.classes.index(class_name)])

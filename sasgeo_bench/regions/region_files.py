@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A region on disk: `region.json` and the files it names; written whole or not at all."""
+"""Read and write a region on disk: `region.json` and the files it names; written whole or not at all."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,7 +30,7 @@ FEATURES: Final = "features.parquet"
 NODES: Final = "nodes.parquet"
 EDGES: Final = "edges.parquet"
 PREVIEW: Final = "preview.png"
-_SAID: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICENCE}
+_ORIGIN: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICENCE}
 _MEND: Final = "build the region again"
 
 
@@ -39,13 +39,13 @@ def write_tables(folder: Path, features: gpd.GeoDataFrame, graph: MapGraph) -> N
     geographic = {**CHECKED, "schema_version": "1.1.0"}
     _attributed(features).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
     _attributed(graph.nodes).to_parquet(folder / NODES, **geographic)
-    write_frame(graph.edges, folder / EDGES, attrs=_SAID)
+    write_frame(graph.edges, folder / EDGES, attrs=_ORIGIN)
 
 
 def _attributed(table: Table) -> Table:
-    """A view of the table whose parquet file says where its data come from (`attrs` in the file's metadata)."""
+    """Return a shallow copy whose parquet file states attribution and licence (`attrs` in its metadata)."""
     shown = table.copy(deep=False)
-    shown.attrs = dict(_SAID)
+    shown.attrs = dict(_ORIGIN)
     return shown
 
 
@@ -56,12 +56,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read `region.json`.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds no region, one of another schema, or a damaged manifest.
+    """Read `region.json`; raise `StoreError` if it is missing, damaged or of another schema.
 
     Examples
     --------
@@ -93,13 +88,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def read_region(folder: Path) -> Region:
-    """Read a region whole.
-
-    Raises
-    ------
-    StoreError
-        If a file is missing or cannot be read.
-    """
+    """Read a region whole; raise `StoreError` if a file is missing, changed or unreadable."""
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
@@ -113,46 +102,27 @@ def read_region(folder: Path) -> Region:
 
 
 def read_features(folder: Path) -> gpd.GeoDataFrame:
-    """Read a region's features alone.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds no region, or the file cannot be read.
-    """
+    """Read a region's features alone; raise `StoreError` as `read_region` does."""
     manifest = read_manifest(folder)
     _check_file(folder / FEATURES, manifest.files[FEATURES])
     return check_features(_read_geometry(folder / FEATURES))
 
 
 def check_files(folder: Path) -> None:
-    """Refuse a region of which a file is missing, or not what `region.json` says.
-
-    Raises
-    ------
-    StoreError
-        Naming the first such file.
-
-    Examples
-    --------
-    >>> check_files(Path("nowhere"))
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
-    """
-    for name, said in read_manifest(folder).files.items():
-        _check_file(folder / name, said)
+    """Raise `StoreError` naming the first file of a region that is missing or differs from `region.json`."""
+    for name, record in read_manifest(folder).files.items():
+        _check_file(folder / name, record)
 
 
-def _check_file(path: Path, said: FileRecord) -> None:
-    """Refuse a file that is not what the manifest says: nothing else covers a raster, or the footer of a GeoParquet."""
-    if not path.is_file() or file_record(path) != said:
+def _check_file(path: Path, record: FileRecord) -> None:
+    """Refuse a file that differs from its record: nothing else protects a raster, or the footer of a GeoParquet."""
+    if not path.is_file() or file_record(path) != record:
         message = f"{path} is missing, or not what {MANIFEST} says: {_MEND}"
         raise StoreError(message)
 
 
 def _read_geometry(path: Path) -> gpd.GeoDataFrame:
-    """A table of geometry, after its size was looked at."""
+    """Read a table of geometry after checking its size."""
     with open_table(path, mend=_MEND, most_rows=MOST_VALUES):
         pass
     try:
@@ -166,7 +136,7 @@ def _read_geometry(path: Path) -> gpd.GeoDataFrame:
 
 
 def differing_files(folder: Path) -> list[str]:
-    """Compare every file of a region with its manifest; a line for each that is missing, changed or unknown."""
+    """Compare every file of a region with its manifest; return a line for each that is missing, changed or unknown."""
     manifest = read_manifest(folder)
     found = []
     for name, record in manifest.files.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""RegionFile: what a researcher writes down of a place in `regions/*.toml`."""
+"""RegionFile: the definition of a place in `regions/*.toml`."""
 
 import datetime as dt
 import math
@@ -26,7 +26,7 @@ Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$
 
 
 class RegionFile(NamedDocument):
-    """One region as written down: identity, place, cell size and dated extracts.
+    """Definition of one region: identity, place, cell size and dated extracts.
 
     Examples
     --------
@@ -116,14 +116,14 @@ class RegionFile(NamedDocument):
         return self
 
     def lonlat_box(self) -> tuple[float, float, float, float]:
-        """West, south, east, north as written, degrees; of a centre, that point twice."""
+        """Return west, south, east, north as written, degrees; for a centre, that point twice."""
         if self.bounds_lonlat is not None:
             return self.bounds_lonlat
         longitude_deg, latitude_deg = self.center_lonlat or (math.nan, math.nan)
         return (longitude_deg, latitude_deg, longitude_deg, latitude_deg)
 
     def _size_estimate_m(self) -> tuple[float, float]:
-        """Width and height, near enough to refuse what is far too large before anything is projected."""
+        """Estimate width and height, well enough to refuse far too large regions before anything is projected."""
         if self.size_m is not None:
             return self.size_m
         west, south, east, north = self.lonlat_box()
@@ -132,12 +132,9 @@ class RegionFile(NamedDocument):
         return (width, (north - south) * metres_per_degree)
 
     def grid(self) -> Grid:
-        """The region's lattice: edges on whole multiples of the cell size, so regions of one zone share their lines.
+        """Return the region's lattice; raise `ConfigError` if the place cannot be projected into the CRS.
 
-        Raises
-        ------
-        ConfigError
-            If the place cannot be projected into the CRS.
+        Its edges are whole multiples of the cell size, so that regions of one zone share their lines.
         """
         west, south, east, north = self.lonlat_box()
         epsg = self.epsg or utm_epsg((west + east) / 2, (south + north) / 2)
@@ -155,13 +152,7 @@ class RegionFile(NamedDocument):
             raise ConfigError(message) from error
 
     def pick(self, date: dt.date | None) -> Extract:
-        """Return the extract of a date, or the newest.
-
-        Raises
-        ------
-        ConfigError
-            If there is no extract of that date; the line lists those there are.
-        """
+        """Return the extract of a date, or the newest; raise `ConfigError`, which lists the dates, if there is none."""
         newest = max(self.extract, key=lambda item: item.date)
         if date is None:
             return newest
@@ -196,7 +187,7 @@ def _check_lonlat(box: tuple[float, float, float, float]) -> None:
 
 
 def _check_size(width_m: float, height_m: float, cell_size_m: float) -> None:
-    """Refuse before anything is allocated."""
+    """Refuse a region that is empty or too large, before anything is allocated."""
     if width_m <= 0 or height_m <= 0:
         message = f"the region is {width_m:.0f} m by {height_m:.0f} m: give it a positive size"
         raise ValueError(message)
@@ -210,39 +201,17 @@ def _check_size(width_m: float, height_m: float, cell_size_m: float) -> None:
 
 
 def read_region_file(path: Path) -> RegionFile:
-    """Read one region file.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be read or a value in it is wrong; all faults on one line.
-    """
+    """Read one region file; raise `ConfigError` with all faults on one line."""
     return read_document(path, RegionFile, "regions")
 
 
 def list_region_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
-    """Region id -> file, of the given folders and those shipped.
-
-    Raises
-    ------
-    ConfigError
-        If a folder is missing, a file is wrong, or two files have one id.
-
-    Examples
-    --------
-    >>> "vaduz" in list_region_files()
-    True
-    """
+    """Return region id -> file, from the given folders and the package; raise as `list_documents` does."""
     return list_documents("regions", RegionFile, folders)
 
 
 def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
-    """Find a region file by its id, or take the path of one.
-
-    Raises
-    ------
-    ConfigError
-        If there is none; the line suggests the nearest id.
+    """Find a region file by its id, or return the path of one; raise as `find_document` does.
 
     Examples
     --------

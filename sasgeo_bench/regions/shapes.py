@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shape and nearness of many geometries at once: bends of lines, orientation, groups and neighbours."""
+"""Shape and proximity of many geometries at once: bends of lines, orientation, groups and neighbours."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -28,9 +28,9 @@ class Bends:
     Parameters
     ----------
     en_m : ndarray of float64, shape (N, 2)
-        The place on the line, metres.
+        Place on the line, metres.
     line : ndarray of int64, shape (N,)
-        Which line.
+        Number of the line.
     at_m : ndarray of float64, shape (N,)
         Distance along it, metres.
     inward : ndarray of float64, shape (N, 2)
@@ -46,7 +46,7 @@ class Bends:
 def find_bends(
     en_m: Floats, at_m: Floats, first: Ints, *, step_m: float, smoothing_m: float, window_m: float, turn_deg: float
 ) -> Bends:
-    """Find where lines turn most.
+    """Find where lines turn most, at most once within half a window; lines shorter than the window have no bend.
 
     Parameters
     ----------
@@ -58,11 +58,6 @@ def find_bends(
         Spacing of the samples, length of the moving average, and length within which a bend turns, metres.
     turn_deg : float
         Least turn within the window.
-
-    Returns
-    -------
-    Bends
-        At most one within half a window. Lines shorter than the window have none.
 
     Examples
     --------
@@ -113,19 +108,13 @@ def find_bends(
 
 
 def centroids(shapes: Shapes) -> Floats:
-    """Centroid of each shape, shape (N, 2), metres: inside or not, it turns with the shape, and a raster blob has it.
-
-    Examples
-    --------
-    >>> centroids(np.array([shapely.box(0, 0, 4, 2)])).tolist()
-    [[2.0, 1.0]]
-    """
+    """Return the centroid of each shape, shape (N, 2), metres; it need not lie inside."""
     centre = shapely.centroid(shapes)
     return np.column_stack([shapely.get_x(centre), shapely.get_y(centre)])
 
 
 def long_sides(shapes: Shapes) -> Floats:
-    """Vector along the long side of each minimum rotated rectangle, shape (N, 2), metres; NaN where there is none.
+    """Return the vector along the long side of each minimum rotated rectangle, shape (N, 2), metres; or NaN.
 
     Examples
     --------
@@ -142,7 +131,7 @@ def long_sides(shapes: Shapes) -> Floats:
 
 
 def groups_within(shapes: Shapes, gap_m: float) -> Ints:
-    """Number of the group of each shape, shape (N,): shapes at most `gap_m` apart share one.
+    """Number the groups of shapes, shape (N,): shapes at most `gap_m` from each other share one.
 
     Examples
     --------
@@ -159,7 +148,7 @@ def groups_within(shapes: Shapes, gap_m: float) -> Ints:
 
 
 def touching_pairs(shapes: Shapes) -> Ints:
-    """Rows of shapes that touch or overlap, shape (K, 2), smaller row first.
+    """Return rows of shapes that touch or overlap, shape (K, 2), smaller row first.
 
     Examples
     --------
@@ -172,17 +161,17 @@ def touching_pairs(shapes: Shapes) -> Ints:
 
 
 def _near_pairs(shapes: Shapes, gap_m: float) -> Ints:
-    """Rows of shapes whose bounding boxes are at most the gap apart along both axes, smaller row first."""
+    """Return rows of shapes whose bounding boxes are at most the gap apart along both axes, smaller row first."""
     grown = shapely.box(*(shapely.bounds(shapes) + np.array([-gap_m, -gap_m, gap_m, gap_m])).T)
     pairs = shapely.STRtree(shapes).query(grown).T
     return np.asarray(pairs[pairs[:, 0] < pairs[:, 1]], dtype=np.int64)
 
 
 def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:
-    """Neighbours in the Delaunay triangulation of places at most `longest_m` apart, shape (K, 2), smaller row first.
+    """Return Delaunay neighbours no further apart than `longest_m`, shape (K, 2), smaller row first.
 
-    A pair that is a neighbour only by the whim of the algorithm (a diagonal of four corners on one circle, as among
-    houses on a lattice) is left out, so the pairs turn with the places.
+    An edge that depends on the choice of the algorithm (a diagonal of four corners on one circle, as among houses on a
+    lattice) is left out, so that the pairs turn with the places.
 
     Examples
     --------
@@ -205,7 +194,7 @@ def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:
 
 
 def _strict_pairs(en_m: Floats) -> Ints:
-    """Edges of the triangulation whose two opposite angles stay below a half turn together."""
+    """Return edges of the triangulation whose two opposite angles sum to less than a half turn."""
     corners = Delaunay(en_m).simplices.astype(np.int64)
     tip = corners.ravel()
     base = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2).reshape(-1, PLANE))

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import SasgeoError
 
 LOG: Final = "failures.log"  # in the folder of a run; beside that of a board
@@ -95,7 +95,11 @@ class Failures:
 
     def note(self, name: str, error: Exception) -> None:
         """Note a failure; of an error that nobody has put in words the log keeps where it was raised."""
-        line = one_line(str(error)) if isinstance(error, SasgeoError) else f"{told(error)} ({self.log.name} says where)"
+        line = (
+            one_line(str(error))
+            if isinstance(error, SasgeoError)
+            else f"{message_of(error)} ({self.log.name} says where)"
+        )
         if not isinstance(error, SasgeoError):
             write_log(self.log, name, error)
         self.errors.setdefault(name, error)

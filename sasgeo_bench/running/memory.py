@@ -13,7 +13,7 @@ from typing import Final
 
 import psutil
 
-from sasgeo_bench.bounds import told
+from sasgeo_bench.bounds import message_of
 from sasgeo_bench.running.cgroup import Group
 
 WATCH_S: Final = 0.05  # how often memory is looked at
@@ -82,7 +82,7 @@ class MemoryWatch:
             try:
                 return self._measure()
             except Exception as error:  # noqa: BLE001 - what a process shows of itself is its own making
-                fault = told(error)
+                fault = message_of(error)
                 time.sleep(_AGAIN_S)
         self.fault, self.is_over = fault, True
         return True

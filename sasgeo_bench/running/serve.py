@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import psutil
 
-from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import Learner, Match, Matcher, Training, check_learned, check_match
 from sasgeo_bench.matching.plugins import load_matcher
@@ -54,9 +54,9 @@ class Server:
                 answer = wire.packed(said | {"status": "crash", "message": "out of memory"})
             except OSError as error:
                 status = "refused" if error.errno in _REFUSED else "crash"
-                answer = wire.packed(said | {"status": status, "message": told(error)})
+                answer = wire.packed(said | {"status": status, "message": message_of(error)})
             except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
-                answer = wire.packed(said | {"status": "crash", "message": told(error)})
+                answer = wire.packed(said | {"status": "crash", "message": message_of(error)})
             wire.put(self.channel, answer)
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:

@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from functools import partial
 
-from sasgeo_bench.bounds import one_line, told
+from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.learned_file import read_learned, write_learned
@@ -70,7 +70,7 @@ def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
         raise
     except Exception as error:
         if stops_all(error):
-            message = f"no process of a matcher can be started ({told(error)}): free some space and run again"
+            message = f"no process of a matcher can be started ({message_of(error)}): free some space and run again"
             raise StoreError(message) from error
         return failed_by_us(plan, error)
 
@@ -78,7 +78,9 @@ def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
 def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
     """What a query gets about which our own code raised something; the log beside the run says where."""
     write_log(plan.run_folder / LOG, plan.card.name, error)
-    return Reply(status="crash", message=one_line(f"not its own process failed, but ours: {told(error)} (see {LOG})"))
+    return Reply(
+        status="crash", message=one_line(f"not its own process failed, but ours: {message_of(error)} (see {LOG})")
+    )
 
 
 def _failed(reply: Reply) -> Learned:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.bounds import told
+from sasgeo_bench.bounds import message_of
 from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.rejector import Rejector, RejectorCard, check_p_false, remark_of
@@ -300,7 +300,7 @@ def _fit_and_say(
             found[is_answered] = check_p_false(rejector.p_false(some), len(some))
         remark = remark_of(rejector)
     except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
-        message = f"rejector {rejector.card.name!r} failed ({told(error)}): mend it, or leave it out"
+        message = f"rejector {rejector.card.name!r} failed ({message_of(error)}): mend it, or leave it out"
         raise MatchError(message) from error
     return found, remark
 

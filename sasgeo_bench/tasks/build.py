@@ -241,7 +241,7 @@ def _ageing(spec: RegionFile) -> Ageing:
     """Ageing by the rates measured in all places but the region's own."""
     book = load_ratebook()
     place = book.place_of(spec.pick(None).file)
-    return ageing_of(pool_rates(book, besides=[place] if place else []), place=place or spec.id)
+    return ageing_of(pool_rates(book, exclude=[place] if place else []), place=place or spec.id)
 
 
 def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell) -> Region:

@@ -12,6 +12,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sasgeo_bench.ageing import rates
 from sasgeo_bench.ageing.files import read_ageing, summary_text, write_ageing
 from sasgeo_bench.ageing.measure import DTYPES as COLUMNS
 from sasgeo_bench.ageing.measure import measure_ageing
@@ -28,11 +29,12 @@ from sasgeo_bench.ageing.rates import bootstrap_rate, loss_rate, seeded_rng
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.osm.history import History, State
-from sasgeo_bench.osm.lifecycle import Lifecycle, ObjectKey, Span, no_lifecycle
+from sasgeo_bench.osm.lifecycle import Lifecycle, ObjectKey, Span
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 OLD, NEW = dt.date(2015, 1, 1), dt.date(2020, 1, 1)
 AREA = shapely.box(-1000, -1000, 3000, 3000)
+NO_HINTS = Lifecycle(gone=np.array([], dtype=object), rising=np.array([], dtype=object), started={})
 
 
 def house(x, y=0.0, width=10.0, depth=10.0):
@@ -49,7 +51,7 @@ def state(on, things, lifecycle=None, *, hidden=()):
     ids, classes, shapes = ([thing[k] for thing in things] for k in range(3))
     columns |= {"osm_type": ["way"] * len(things), "osm_id": ids, "class": classes, "geometry": shapes}
     columns["is_visible"] = [identifier not in hidden for identifier in ids]
-    return State(source="", on=on, features=make_features(columns, epsg=32632), lifecycle=lifecycle or no_lifecycle())
+    return State(source="", on=on, features=make_features(columns, epsg=32632), lifecycle=lifecycle or NO_HINTS)
 
 
 def measured(*states, area=AREA):
@@ -296,14 +298,15 @@ def test_one_block_has_no_interval():
     assert np.isnan(alone.hi)
 
 
-def test_the_block_interval_covers_a_known_rate_about_as_often_as_it_says():
+def test_the_block_interval_covers_a_known_rate_about_as_often_as_it_says(monkeypatch):
+    monkeypatch.setattr(rates, "DRAWS", 400)
     rate, years, rng = 0.03, np.array([1.5, 4.0]), seeded_rng("coverage")
     hits, trials = 0, 200
     for _ in range(trials):
         # Blocks of unequal size, whose things fall in clumps of five.
         clumps = rng.integers(2, 30, size=(80, 2))
         lost = 5.0 * rng.binomial(clumps, -np.expm1(-rate * years))
-        found = bootstrap_rate(lost, 5.0 * clumps, years, things=int(5 * clumps.sum()), rng=rng, draws=400)
+        found = bootstrap_rate(lost, 5.0 * clumps, years, things=int(5 * clumps.sum()), rng=rng)
         hits += found.lo <= rate <= found.hi
     assert 0.89 <= hits / trials <= 0.99
 

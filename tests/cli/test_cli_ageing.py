@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench import cli
-from sasgeo_bench.ageing.ratebook_file import read_ratebook
+from sasgeo_bench.ageing.ratebook import RateBook
+from sasgeo_bench.config import parse_toml
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 
 
@@ -61,7 +62,7 @@ def test_places_are_put_beside_each_other(program, towns, tmp_path):
     code, out, err = program("compare-ageing", "north", "--control", "south", "--rates", "r.toml", "--out", "one.md")
     assert code == 0, err
     assert out.split() == ["one.md", "r.toml"]
-    assert read_ratebook(tmp_path / "r.toml").names == ("north",)
+    assert parse_toml((tmp_path / "r.toml").read_text(), RateBook, source="r.toml").names == ("north",)
     assert "| class | south |" in (tmp_path / "one.md").read_text()
 
 

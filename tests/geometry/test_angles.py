@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.geometry.angles import bearing_deg, normalize_deg, rotation, to_math_deg, wrap_deg
+from sasgeo_bench.geometry.angles import bearing_deg, normalize_deg, rotation, wrap_deg
 
 angles = st.floats(-1e4, 1e4)
 
@@ -32,11 +32,6 @@ def test_a_landmark_due_east_seen_with_yaw_90_is_at_the_top():
 def test_a_landmark_due_north_seen_with_yaw_90_is_at_the_left():
     right, up = rotation(90.0).T @ np.array([0.0, 100.0])
     assert (round(right, 9), round(up, 9)) == (-100.0, 0.0)
-
-
-@given(st.floats(0, 359.9))
-def test_to_math_is_its_own_inverse(yaw):
-    assert abs(wrap_deg(to_math_deg(to_math_deg(yaw)) - yaw)) < 1e-9
 
 
 def test_a_tiny_negative_angle_does_not_become_360():

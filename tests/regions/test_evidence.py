@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -21,7 +20,6 @@ from sasgeo_bench.regions.evidence import (
     footprint,
     observe,
     pack,
-    to_map,
     unpack,
 )
 from sasgeo_bench.regions.layers import OUTSIDE
@@ -92,28 +90,6 @@ def test_what_a_view_shows_lies_on_the_map_where_the_pose_puts_it(u, v, yaw_deg,
     assert (seen[:, row, col] == layers[:, map_row, map_col]).all()
 
 
-@given(st.floats(40, 60), st.floats(40, 60), st.floats(0, 359.9))
-def test_a_view_laid_back_on_the_map_agrees_with_it_and_is_silent_elsewhere(u, v, yaw_deg):
-    # Blocks of 8 cells: apart from their edges, the cell that a centre falls into does not matter.
-    layers = np.kron(np.random.default_rng(3).integers(0, 2, (1, 13, 13)), np.ones((1, 8, 8))).astype(np.uint8)
-    layers = layers[:, :100, :100]
-    pose = at(u, v, yaw_deg)
-    cells = observe(LayerBits.of(layers), GRID, pose, size_cells=41, cell_size_m=1.0)
-    back = to_map(Evidence(classes=("a",), cells=cells, cell_size_m=1.0), pose, GRID)
-    known = back != UNKNOWN
-    inside = shapely.contains_xy(
-        shapely.buffer(footprint(pose, size_m=(41.0, 41.0)), -0.01),
-        *GRID.to_centres_m(np.argwhere(np.ones((100, 100)))).T,
-    )
-    outside = ~shapely.contains_xy(
-        shapely.buffer(footprint(pose, size_m=(41.0, 41.0)), 0.01),
-        *GRID.to_centres_m(np.argwhere(np.ones((100, 100)))).T,
-    )
-    assert known[0].ravel()[inside].all()
-    assert not known[0].ravel()[outside].any()
-    assert (back[known] == layers[known]).mean() > 0.8
-
-
 def test_beyond_the_map_and_beyond_what_is_mapped_all_is_unknown():
     layers = np.full((2, 100, 100), PRESENT, dtype=np.uint8)
     layers[:, :, 60:] = OUTSIDE
@@ -121,12 +97,6 @@ def test_beyond_the_map_and_beyond_what_is_mapped_all_is_unknown():
     assert (seen[:, :, :100] == UNKNOWN).all()
     assert (seen[:, 60:140, 100:160] == PRESENT).all()
     assert (seen[:, :, 160:] == UNKNOWN).all()
-
-
-def test_unknown_cells_say_nothing_after_a_warp():
-    cells = np.full((1, 21, 21), UNKNOWN, dtype=np.uint8)
-    laid = to_map(Evidence(classes=("a",), cells=cells, cell_size_m=1.0), at(50, 50, 33.0), GRID)
-    assert (laid == UNKNOWN).all()
 
 
 @pytest.mark.parametrize("size_cells", [96, 192, 384])

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import patch
 
 import geopandas as gpd
 import numpy as np
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.osm.features import DTYPES, make_features
-from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES, GraphRules, build_graph
+from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES, build_graph
 from sasgeo_bench.regions.region import MapGraph
 
 Row = dict[str, Any]
@@ -261,8 +262,6 @@ def test_a_free_ring_has_no_junction() -> None:
 def test_the_gap_of_the_rules_decides_what_is_a_cluster(gap_m: float, clusters: int) -> None:
     houses = [area(i, "building", i * (10 + gap_m), 0, i * (10 + gap_m) + 10, 8) for i in range(3)]
     assert len(places(build_graph(table(*houses)), "building_cluster")) == clusters
-    wider = build_graph(table(*houses), rules=GraphRules(cluster_gap_m=20.0))
-    assert len(places(wider, "building_cluster")) == 1
 
 
 def differences(left: MapGraph, right: MapGraph) -> list[str]:
@@ -305,8 +304,6 @@ ways = st.tuples(
     st.lists(corners, min_size=2, max_size=4, unique=True),
     st.integers(-1, 1),
 )
-# Diagonals of the lattice turn by 45 deg exactly: what the last bits decide is no property of the map.
-LATTICE_RULES = GraphRules(bend_turn_deg=40.0)
 houses = st.tuples(st.integers(0, 40), st.integers(0, 40))
 places_drawn = st.tuples(st.lists(ways, max_size=7), st.lists(houses, max_size=6, unique=True))
 
@@ -326,15 +323,17 @@ def test_the_order_of_the_features_does_not_matter(place: tuple[list[Any], list[
     assert differences(build_graph(table(*rows)), build_graph(table(*shuffled))) == []
 
 
+# Diagonals of the lattice turn by 45 deg exactly: what the last bits decide is no property of the map.
+@patch("sasgeo_bench.regions.graph.BEND_TURN_DEG", 40.0)
 @settings(max_examples=40, deadline=None)
 @given(place=places_drawn, east=st.integers(-9, 9), north=st.integers(-9, 9))
 def test_moving_the_map_moves_the_nodes_and_nothing_else(
     place: tuple[list[Any], list[Any]], east: int, north: int
 ) -> None:
     here = table(*drawn(place))
-    there = build_graph(moved(here, [1, 0, 0, 1, east * 65536, north * 65536]), rules=LATTICE_RULES)
+    there = build_graph(moved(here, [1, 0, 0, 1, east * 65536, north * 65536]))
     back = unordered(there, lambda x, y: (x - east * 65536, y - north * 65536), 0)
-    assert back == unordered(build_graph(here, rules=LATTICE_RULES), lambda x, y: (x, y), 0)
+    assert back == unordered(build_graph(here), lambda x, y: (x, y), 0)
 
 
 @settings(max_examples=40, deadline=None)

@@ -15,20 +15,12 @@ Morphology = Literal["grid", "old_town", "suburb", "industrial", "riverside", "a
 
 
 def draw(morphology: Morphology, sketch: Sketch) -> None:
-    """Draw one kind of place.
-
-    Examples
-    --------
-    >>> sketch = Sketch(half_m=300.0, rng=np.random.default_rng(1))
-    >>> draw("suburb", sketch)
-    >>> any("building" in way.tags for way in sketch.ways)
-    True
-    """
+    """Draw one kind of place on a sketch."""
     _DRAWINGS[morphology](sketch)
 
 
 def _grid(sketch: Sketch) -> None:
-    """Avenues and streets at right angles, perimeter blocks with courtyards, a square, a railway below the avenues."""
+    """Draw avenues and streets at right angles, perimeter blocks, a square, a railway below the avenues."""
     half, rng = sketch.half_m, sketch.rng
     rail_y = -0.62 * half
     _railway(sketch, [(-half, rail_y), (half, rail_y)], tunnel_from_m=1.55 * half)
@@ -60,7 +52,7 @@ def _grid(sketch: Sketch) -> None:
 
 
 def _city_block(sketch: Sketch, block: shapely.Polygon, rng: np.random.Generator) -> None:
-    """A block of a grid city: one perimeter building with a court, a row of lots, or a car park."""
+    """Draw a block of a grid city: one perimeter building with a courtyard, a row of lots, or a car park."""
     kind = rng.random()
     if kind < 0.3:
         sketch.build(block.difference(block.buffer(-15, join_style="mitre")), building="apartments")
@@ -82,7 +74,7 @@ def _city_block(sketch: Sketch, block: shapely.Polygon, rng: np.random.Generator
 
 
 def _old_town(sketch: Sketch) -> None:
-    """Crooked lanes within a wall, perimeter blocks with courtyards, a market square and a church."""
+    """Draw crooked lanes within a wall, perimeter blocks with courtyards, a market square and a church."""
     half, rng = sketch.half_m, sketch.rng
     spokes = 16
     rings = [share * half for share in (0.14, 0.28, 0.42, 0.56, 0.7, 0.86)]
@@ -116,7 +108,7 @@ def _old_town(sketch: Sketch) -> None:
 
 
 def _ring_road(corners: list[tuple[float, float]]) -> Line:
-    """A closed smooth line through corners: one turn out of a longer curve, so that it has no kink where it closes."""
+    """Return a closed smooth line through corners: one turn of a longer curve, so that it closes without a kink."""
     line = curve([*corners[-2:], *corners, *corners[:3]])
     start, end = np.flatnonzero(np.hypot(*(line - corners[0]).T) < 0.02)[[0, -1]]
     return np.vstack((line[start:end], line[start : start + 1]))
@@ -134,7 +126,7 @@ def _market_square(sketch: Sketch, radius_m: float) -> None:
 
 
 def _perimeter_block(sketch: Sketch, block: shapely.Geometry) -> None:
-    """Houses wall to wall around a court, or one closed block with a court inside."""
+    """Draw terraced houses around a courtyard, or one closed block with a courtyard."""
     rng = sketch.rng
     if block.geom_type != "Polygon" or block.area < 150:
         return
@@ -177,7 +169,7 @@ def _park_ring(sketch: Sketch, radius_m: float) -> None:
 
 
 def _suburb(sketch: Sketch) -> None:
-    """Curving streets, cul-de-sacs, detached houses with gardens and hedges, a school field and a pond."""
+    """Draw curving streets, cul-de-sacs, detached houses with gardens and hedges, a sports field and a pond."""
     half, rng = sketch.half_m, sketch.rng
     main = curve([(-half, -0.15 * half), (-0.4 * half, 0.12 * half), (0.15 * half, -0.1 * half), (half, 0.2 * half)])
     sketch.street(main, highway="secondary", width="7.5")
@@ -222,7 +214,7 @@ def _suburb(sketch: Sketch) -> None:
 
 
 def _hedges_between(sketch: Sketch, reach_m: float) -> None:
-    """Hedges on some plots: beside every fifth house, where nothing stands in the way."""
+    """Draw a hedge at every fifth house, where nothing is in the way."""
     houses = [way for way in sketch.ways if way.tags.get("building") == "house"]
     for way in houses[::5]:
         box = shapely.Polygon(way.line).minimum_rotated_rectangle
@@ -233,7 +225,7 @@ def _hedges_between(sketch: Sketch, reach_m: float) -> None:
 
 
 def _school(sketch: Sketch, centre: tuple[float, float]) -> None:
-    """A building relation: an outline without tags of its own, and its parts."""
+    """Draw a building relation: an outline without tags of its own, and its parts."""
     x, y = centre
     wing = shapely.union_all([shapely.box(x, y, x + 60, y + 16), shapely.box(x, y, x + 16, y + 46)])
     if not sketch.is_taken(wing):
@@ -246,7 +238,7 @@ def _building_relation(outline: shapely.Polygon) -> Area:
 
 
 def _industrial(sketch: Sketch) -> None:
-    """Halls, sidings, car parks, a canal and wide roads."""
+    """Draw halls, sidings, car parks, a canal and wide roads."""
     half, rng = sketch.half_m, sketch.rng
     canal = curve([(-half, 0.72 * half), (0.0, 0.76 * half), (half, 0.7 * half)])
     sketch.line(canal, waterway="canal", width="22")
@@ -302,7 +294,7 @@ def _industrial(sketch: Sketch) -> None:
 
 
 def _riverside(sketch: Sketch) -> None:
-    """A meandering river with an island, bridges and embankments, streets on both banks, a railway into a tunnel."""
+    """Draw a meandering river with an island and bridges, streets on both banks, a railway into a tunnel."""
     half, rng = sketch.half_m, sketch.rng
     river = curve(
         [
@@ -352,7 +344,7 @@ def _riverside(sketch: Sketch) -> None:
 
 
 def _agricultural(sketch: Sketch) -> None:
-    """Parcels that share their borders, hedges, tracks, a stream, a wood with a clearing, farmsteads, a road."""
+    """Draw parcels that share their borders, hedges, tracks, a stream, a wood with a clearing, farmsteads, a road."""
     half, rng = sketch.half_m, sketch.rng
     road = curve([(-half, -0.3 * half), (-0.2 * half, -0.2 * half), (0.3 * half, -0.34 * half), (half, -0.22 * half)])
     sketch.street(road, highway="tertiary")
@@ -402,7 +394,7 @@ def _agricultural(sketch: Sketch) -> None:
 
 
 def _farmstead(sketch: Sketch, centre: tuple[float, float]) -> None:
-    """A dwelling, two barns around a yard, a wall and a garden."""
+    """Draw a dwelling, two barns around a yard, a wall and a garden."""
     x, y = centre
     turn = float(sketch.rng.uniform(0, np.pi))
     yard = affinity.rotate(shapely.box(x - 30, y - 26, x + 30, y + 26), turn, use_radians=True)
@@ -419,7 +411,7 @@ def _farmstead(sketch: Sketch, centre: tuple[float, float]) -> None:
 
 
 def _stream(sketch: Sketch, line: Line) -> None:
-    """A stream, in a culvert where it passes below a street."""
+    """Draw a stream, in a culvert where it passes below a street."""
     base = shapely.linestrings(line)
     hits = [base.intersection(shapely.linestrings(way.line)) for way in sketch.ways if "highway" in way.tags]
     spots = sorted(float(base.project(point)) for hit in hits for point in shapely.get_parts(hit) if not hit.is_empty)
@@ -436,7 +428,7 @@ def _stream(sketch: Sketch, line: Line) -> None:
 
 
 def _railway(sketch: Sketch, points: list[tuple[float, float]], *, tunnel_from_m: float | None) -> None:
-    """A railway, in a tunnel beyond a distance along it."""
+    """Draw a railway, in a tunnel beyond a distance along it."""
     line = curve(points, step_m=40.0)
     sketch.keep_free(shapely.linestrings(line).buffer(8))
     if tunnel_from_m is None or tunnel_from_m > shapely.linestrings(line).length - 30:
@@ -450,7 +442,7 @@ def _railway(sketch: Sketch, points: list[tuple[float, float]], *, tunnel_from_m
 
 
 def _bridged(sketch: Sketch, line: Line, spans: list[tuple[float, float]], **tags: str) -> None:
-    """A street with bridges in it, each by its middle along the line and its length, metres, in this order."""
+    """Draw a street with bridges, each given by its middle along the line and its length, metres, in this order."""
     rest, passed_m = line, 0.0
     for along_m, span_m in spans:
         before, bridge, rest = split_at(rest, along_m - passed_m - span_m / 2, along_m - passed_m + span_m / 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drawing board of the embedded towns: streets that share nodes, houses along them, areas with holes."""
+"""Sketch of an embedded town: streets that share nodes, houses along them, areas with holes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -46,7 +46,7 @@ class Sketch:
 
     @property
     def square(self) -> shapely.Polygon:
-        """The town's ground."""
+        """Return the ground of the town."""
         return shapely.box(-self.half_m, -self.half_m, self.half_m, self.half_m)
 
     def street(self, line: Sequence[Sequence[float]] | Line, **tags: str) -> None:
@@ -57,7 +57,7 @@ class Sketch:
             self.taken.append(shapely.buffer(shapely.linestrings(np.asarray(line, dtype=np.float64)), half_m))
 
     def line(self, line: Sequence[Sequence[float]] | Line, **tags: str) -> None:
-        """Draw a line that takes no ground: a hedge, a wall, a stream. What lies beyond the town is cut off."""
+        """Draw a line that takes no ground: a hedge, a wall, a stream. The part beyond the town is cut off."""
         points = np.asarray(line, dtype=np.float64)
         if np.abs(points).max() <= self.half_m:
             self.ways.append(Way(line=points, tags=tags))
@@ -67,7 +67,7 @@ class Sketch:
                 self.ways.append(Way(line=shapely.get_coordinates(part), tags=tags))
 
     def ground(self, polygon: shapely.Geometry, *, is_free: bool = True, **tags: str) -> bool:
-        """Draw an area, with holes as a multipolygon; False where the ground is taken or too small."""
+        """Draw an area, with holes as a multipolygon; return False if the ground is taken or too small."""
         if polygon.geom_type == "Polygon" and not self.square.contains(polygon):
             polygon = shapely.intersection(polygon, self.square)
         if polygon.geom_type != "Polygon" or polygon.area < 4.0:  # noqa: PLR2004 - m2
@@ -83,15 +83,15 @@ class Sketch:
         return True
 
     def keep_free(self, polygon: shapely.Geometry) -> None:
-        """Take ground, so that nothing is built there."""
+        """Reserve ground, so that nothing is built there."""
         self.taken.append(polygon)
 
     def is_taken(self, polygon: shapely.Geometry) -> bool:
-        """Whether something stands or runs there already."""
+        """Return whether the ground is taken already."""
         return bool(shapely.intersects(np.array(self.taken, dtype=object), polygon).any()) if self.taken else False
 
     def build(self, polygon: shapely.Geometry, **tags: str) -> bool:
-        """Build a house where the ground is free and within the town."""
+        """Build a house if the ground is free and within the town."""
         if not self.square.contains(polygon) or not self.ground(polygon, is_free=True, **tags):
             return False
         self.taken.append(shapely.buffer(polygon, 1.0))
@@ -124,13 +124,7 @@ class Sketch:
 def house(
     centre: tuple[float, float], width_m: float, depth_m: float, angle: float, rng: np.random.Generator
 ) -> shapely.Polygon:
-    """A rectangle or, one time in three, an L, turned by an angle in radians.
-
-    Examples
-    --------
-    >>> round(house((0.0, 0.0), 10.0, 8.0, 0.0, np.random.default_rng(1)).area)
-    80
-    """
+    """Return a rectangle or, one time in three, an L, turned by an angle in radians."""
     x, y = width_m / 2, depth_m / 2
     corners = np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
     if rng.random() < 1 / 3:
@@ -140,7 +134,7 @@ def house(
 
 
 def curve(points: Sequence[Sequence[float]], *, step_m: float = 12.0) -> Line:
-    """A smooth line through points (Catmull-Rom), sampled about every `step_m` metres.
+    """Return a smooth line through points (Catmull-Rom), sampled about every `step_m` metres.
 
     Examples
     --------
@@ -175,8 +169,8 @@ def wobble(line: Line, amount_m: float, rng: np.random.Generator) -> Line:
 def join_streets(ways: list[Way]) -> list[Way]:
     """Give ways of one layer a common point wherever they cross, so that they share a node there.
 
-    Bridges, tunnels and whatever lies on another layer stay apart; railways join only each other and, at a level
-    crossing, the streets.
+    Bridges, tunnels and other layers stay separate; railways join only each other and, at a level crossing, the
+    streets.
     """
     network = [i for i, way in enumerate(ways) if "highway" in way.tags or "railway" in way.tags]
     lines = np.array([shapely.linestrings(ways[i].line) for i in network], dtype=object)
@@ -207,13 +201,7 @@ def _with_points(line: Line, cuts: list[tuple[float, float]]) -> Line:
 
 
 def split_at(line: Line, start_m: float, end_m: float) -> tuple[Line, Line, Line]:
-    """Cut a line into what lies before, between and after two distances along it.
-
-    Examples
-    --------
-    >>> [len(part) for part in split_at(np.array([(0.0, 0.0), (100.0, 0.0)]), 40.0, 60.0)]
-    [2, 2, 2]
-    """
+    """Cut a line into the parts before, between and after two distances along it."""
     base = shapely.linestrings(line)
     stops = [0.0, start_m, end_m, base.length]
     along = np.array([base.project(shapely.Point(point)) for point in line])

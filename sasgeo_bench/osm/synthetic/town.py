@@ -37,7 +37,7 @@ _GENERATOR: Final = "sasgeo-bench embedded town"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TownPlan:
-    """Which town: its kind, the seed of its chance, the side of its square, and where on Earth its centre lies."""
+    """Identity of a town: its kind, random seed, side of its square, and position of its centre."""
 
     morphology: Morphology
     seed: int
@@ -57,7 +57,7 @@ class _Change(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Thing:
-    """One mapped object and its life. Lines of one ring make a way, more or a kind make a relation."""
+    """One mapped object and its life. One ring makes a way; several rings or a kind make a relation."""
 
     number: int
     rings: tuple[Line, ...]
@@ -68,12 +68,12 @@ class _Thing:
     changes: tuple[_Change, ...]
 
     def alive(self, on: dt.date) -> bool:
-        """Whether it stands in the map at the end of a day."""
+        """Return whether the object is in the map at the end of a day."""
         return self.born <= on and (self.died is None or on < self.died)
 
 
 class _Element(NamedTuple):
-    """One element to be written: a node by its place, a way by its nodes, a relation by its (way id, role) members."""
+    """One element to write: a node by its place, a way by its nodes, a relation by its (way id, role) members."""
 
     rank: int
     osm_id: int
@@ -86,36 +86,11 @@ class _Element(NamedTuple):
 
 
 def write_town(plan: TownPlan, path: Path, *, on: dt.date | None = None) -> None:
-    """Write the state of a town at a date as an .osm.pbf file.
+    """Write the state of a town at a date as an .osm.pbf file, replaced whole; by default at the end of its history.
 
-    Parameters
-    ----------
-    plan : TownPlan
-        The town.
-    path : Path
-        The file; replaced whole if it is there.
-    on : date, optional
-        The day; the end of the simulated history unless given.
-
-    Raises
-    ------
-    ExtractError
-        If the date lies outside the history, or the file cannot be written.
-
-    Notes
-    -----
-    Same plan and date, same bytes: coordinates come from seeded chance, times from the simulated history, and the file
-    is stored without compression, so that no version of zlib can change it.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> plan = TownPlan(morphology="suburb", seed=1, size_m=400.0, center_lonlat=(9.0, 47.0))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "town.osm.pbf"
-    ...     write_town(plan, path)
-    ...     path.stat().st_size > 1000
-    True
+    The same plan and date give the same bytes: coordinates come from seeded random numbers, times from the simulated
+    history, and the file is stored without compression, so that no version of zlib can change it. Raise `ExtractError`
+    if the date lies outside the history, or the file cannot be written.
     """
     day = LAST_DATE if on is None else on
     if not FIRST_DATE <= day <= LAST_DATE:
@@ -134,7 +109,7 @@ def write_town(plan: TownPlan, path: Path, *, on: dt.date | None = None) -> None
 
 
 def _rng(plan: TownPlan, *purpose: object) -> np.random.Generator:
-    """A stream of chance for one purpose, so that what one object does changes nothing for the others."""
+    """Return a random generator for one purpose, so that one object does not change the others."""
     text = "/".join(str(part) for part in (plan.morphology, plan.seed, *purpose))
     return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "big"))
 
@@ -152,7 +127,7 @@ def _things(plan: TownPlan) -> tuple[_Thing, ...]:
 
 
 def _lived(plan: TownPlan, number: int, rings: tuple[Line, ...], tags: Tags, relation: str | None) -> _Thing:
-    """Draw birth, death and edits of one object. Streets, water and parcels stay put: others share their nodes."""
+    """Draw birth, death and edits of one object. Streets, water and parcels do not move: others share their nodes."""
     rng = _rng(plan, "life", number)
     key = next((key for key in _BORN_BEFORE if key in tags), "")
     before, after = (dt.date(2008, 1, 1), FIRST_DATE), (FIRST_DATE, LAST_DATE)
@@ -188,7 +163,7 @@ def _day(rng: np.random.Generator, first: dt.date, last: dt.date) -> dt.date:
 
 
 def _elements(things: Sequence[_Thing], on: dt.date) -> Iterator[_Element]:
-    """Everything alive on a day. Objects of one network share the nodes of equal coordinates; others have their own."""
+    """Yield everything alive on a day. Objects of one network share nodes of equal coordinates."""
     shared: dict[tuple[float, float], int] = {}
     for thing in things:
         own_base = _FIRST_NODE + 10_000 * (thing.number + 1)
@@ -269,7 +244,7 @@ def _to_lonlat(plan: TownPlan) -> "_ToLonLat":
 
 
 class _ToLonLat:
-    """Metres from the centre -> longitude and latitude, rounded as OSM stores them."""
+    """Convert metres from the centre to longitude and latitude, rounded as OSM stores them."""
 
     def __init__(self, transformer: pyproj.Transformer) -> None:
         self._transformer = transformer

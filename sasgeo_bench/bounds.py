@@ -12,7 +12,7 @@ MOST_NAME: Final = 64  # characters of the name of a diagnostic
 MOST_MESSAGE: Final = 300  # characters
 MOST_S: Final = 7 * 86_400.0  # of one answer: no run allows more
 _MOST_M: Final = 1e8  # farther than any projected coordinate on Earth
-_MOST_TURN_DEG: Final = 1e6  # far beyond it the digits of a number do not tell a heading
+_MOST_TURN_DEG: Final = 1e6  # far beyond it a number has too few digits for a heading
 _MOST: Final = 3.4028234663852886e38  # largest single-precision number: squares and differences stay finite
 
 # Least and most of each number; none may be NaN or infinite.
@@ -30,13 +30,7 @@ BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
 
 
 def is_line(text: str, most: int) -> bool:
-    """Return whether a text is one line of printable characters, at most `most` of them; it may be empty.
-
-    Examples
-    --------
-    >>> is_line("margin", 64), is_line("margin" + chr(10), 64), is_line(chr(0xD800), 64)
-    (True, False, False)
-    """
+    """Return whether a text is one line of printable characters, at most `most` of them; it may be empty."""
     return len(text) <= most and text.isprintable()
 
 
@@ -55,8 +49,6 @@ def one_line(text: str) -> str:
 def message_of(error: BaseException) -> str:
     """Return class and text of an error in one line; only the class if its text cannot be made.
 
-    Examples
-    --------
     >>> message_of(ValueError("no index today"))
     'ValueError: no index today'
     """

@@ -13,8 +13,6 @@ from sasgeo_bench.texts import plain, plain_lines
 class PlainFigure(Figure):
     r"""A figure that shows each text letter by letter, dollar signs included, and writes no control characters.
 
-    Examples
-    --------
     >>> figure = PlainFigure(figsize=(1, 1))
     >>> text = figure.text(0, 0, r"cost $\nosuchthing$")
     >>> figure.draw_without_rendering()

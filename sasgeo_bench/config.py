@@ -60,8 +60,6 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     Raise `ConfigError`, with all faults on one line, if the text is no TOML, a key is unknown, a type is wrong or a
     value out of range.
 
-    Examples
-    --------
     >>> class Town(Document):
     ...     seed: int
     >>> parse_toml("sead = 3", Town, source="town.toml")
@@ -71,7 +69,7 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     """
     try:
         content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # too many digits or brackets are no error of TOML's own
+    except (ValueError, RecursionError) as error:  # too many digits or brackets raise other errors
         message = f"{source}: not valid TOML: {error}"
         raise ConfigError(message) from error
     return check_document(content, model, source=source)
@@ -144,7 +142,7 @@ def shipped_dir(kind: Kind) -> Path:
 def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
     """Read a file of a kind that ships; raise `ConfigError`, with all faults on one line, if it is wrong."""
     try:
-        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark of its byte order
+        text = path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark
     except (OSError, UnicodeDecodeError) as error:
         noun = kind.removesuffix("s")
         message = f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"

@@ -12,8 +12,6 @@ MOST_MESSAGE: Final = 2000  # characters
 def counted(count: int, one: str, many: str = "") -> str:
     """Return a count with its noun; the plural is `one` with an s by default.
 
-    Examples
-    --------
     >>> counted(1, "block"), counted(2, "block"), counted(0, "query", "queries")
     ('1 block', '2 blocks', '0 queries')
     """
@@ -23,8 +21,6 @@ def counted(count: int, one: str, many: str = "") -> str:
 def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
     """Return a count with its noun, and the first few by name.
 
-    Examples
-    --------
     >>> named(["monaco", "porto"], "place"), named(list("abcd"), "task", most=2)
     ('2 places (monaco, porto)', '4 tasks (a, b, ...)')
     """
@@ -36,11 +32,6 @@ class SasgeoError(Exception):
     """Base of all errors caused by the input; the command line prints its text and exits with 2.
 
     Its text is one printable line of a bounded length, even if it quotes a file or a library.
-
-    Examples
-    --------
-    >>> str(StoreError(f"a.json: line 1{chr(10)}line 2"))
-    'a.json: line 1 line 2'
     """
 
     def __str__(self) -> str:

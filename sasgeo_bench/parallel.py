@@ -20,7 +20,7 @@ def spread(work: Callable[[Item], Found], items: Sequence[Item], *, jobs: int = 
     if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
         yield from map(work, items)
         return
-    # An interrupt ends the processes where they are: what they write is whole or not there, and the next run goes on.
+    # An interrupt ends the processes at once: files are written whole or not at all, and the next run resumes.
     spawn = get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=signal, initargs=(SIGINT, SIG_DFL)) as pool:
         yield from pool.map(work, items)

@@ -25,8 +25,6 @@ class Progress(Protocol):
 class Lines:
     """Progress as a line every ten seconds.
 
-    Examples
-    --------
     >>> lines = Lines(lambda line: print(line.split(",")[0]), every_s=0.0)
     >>> lines.begin("rejectors", 16)
     >>> lines.advance("rejectors", 4)

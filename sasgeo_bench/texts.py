@@ -8,16 +8,16 @@ import json
 import re
 from typing import Any, Final
 
-# Of what becomes a folder or a key: methods and their versions, then maps and tasks too. None can begin a flag, a
-# formula, a hidden file or a list.
+# Names of folders and keys: of methods, their versions, maps and tasks. None can begin a flag, a formula, a hidden file
+# or a list.
 NAME: Final = r"^[a-z0-9][a-z0-9_-]{0,59}$"
 VERSION: Final = r"^[A-Za-z0-9][A-Za-z0-9._+-]{0,59}$"
 FOLDER: Final = r"^[A-Za-z0-9][A-Za-z0-9+@._-]{0,199}$"
 
 _NUMBER: Final = re.compile(r"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?")
-_FORMULA: Final = tuple("=+-@'\uff1d\uff0b\uff0d\uff20")  # wide forms too; the apostrophe so that it can be taken off
+_FORMULA: Final = tuple("=+-@'\uff1d\uff0b\uff0d\uff20")  # wide forms too; the apostrophe, so that it can be removed
 _PLAIN_NAME: Final = re.compile(r"[A-Za-z0-9@+./][A-Za-z0-9@+._/-]*")
-_INLINE: Final = re.compile(  # marks of emphasis, code, tables, tags and mathematics; links and what is made one
+_INLINE: Final = re.compile(  # marks of emphasis, code, tables, tags and mathematics; links
     r"[\\`*|~$]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])|\](?=[(\[:])|(?<=:)//|(?i:(?<=www)\.)|#(?=#*$)"
 )
 _BLOCK: Final = re.compile(r"\d{0,9}(?P<mark>[-+.)](?=\s|$)|#(?=#{0,5}(?:\s|$))|>|(?:[-=]\s*){3,}$|\[(?=[ xX]\]))")
@@ -29,7 +29,7 @@ _TEX: Final = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "\\": r"\textbackslash{}",
-    '"': r"{\char34}",  # which is no letter alone where a language makes a command of it
+    '"': r"{\char34}",  # some languages of LaTeX make it a command
     "†": r"$^\dagger$",
 }
 _LIGATURE: Final = re.compile(r"(?<=[-`'?!,])(?=[-`',])")
@@ -40,8 +40,6 @@ _NO_GLYPH: Final = frozenset("«»ÐÞðþĄąĐđĘęĦħĮįĸĿŀŉŊŋŦŧŲ
 def plain(text: str) -> str:
     r"""Return one line of printable characters: breaks become spaces, controls and bidirectional marks "?".
 
-    Examples
-    --------
     >>> plain("red: \x1b[31m\nnext \u202egpj.exe")
     'red: ?[31m next ?gpj.exe'
     """
@@ -58,8 +56,6 @@ def plain_lines(text: str) -> str:
 def markdown(text: object) -> str:
     r"""Escape text within a line or a table cell of Markdown.
 
-    Examples
-    --------
     >>> markdown("a|b <i> [x](https://x.org) success_25m")
     'a\\|b &lt;i> [x\\](https:\\//x.org) success_25m'
     """
@@ -70,8 +66,6 @@ def markdown(text: object) -> str:
 def markdown_item(text: object) -> str:
     r"""Escape text of a list item of Markdown, so that it begins no other block there.
 
-    Examples
-    --------
     >>> markdown_item("1. first"), markdown_item("# second")
     ('1\\. first', '\\# second')
     """
@@ -84,8 +78,6 @@ def markdown_item(text: object) -> str:
 def markdown_code(name: str) -> str:
     r"""Format a name as Markdown code; escape anything else as `markdown` does.
 
-    Examples
-    --------
     >>> markdown_code("vaduz@2021-10-28"), markdown_code("a`b")
     ('`vaduz@2021-10-28`', 'a\\`b')
     """
@@ -95,16 +87,13 @@ def markdown_code(name: str) -> str:
 def tex(text: object) -> str:
     r"""Escape text for LaTeX; letters without a glyph in pdfTeX become their code point, for it stops at them.
 
-    Examples
-    --------
     >>> tex(r"100 % of a_b, \input{x}")
     '100 \\% of a\\_b, \\textbackslash{}input\\{x\\}'
     """
     letters = _LIGATURE.sub("\0", plain(str(text)))
     escaped = "".join("{}" if letter == "\0" else _tex_letter(letter) for letter in letters)
-    return (
-        "{}" + escaped if escaped.startswith(("[", "*")) else escaped
-    )  # which belong to the end of the row before, else
+    # At the start of a row "[" and "*" would belong to the end of the previous one.
+    return "{}" + escaped if escaped.startswith(("[", "*")) else escaped
 
 
 def _tex_letter(letter: str) -> str:
@@ -115,8 +104,6 @@ def _tex_letter(letter: str) -> str:
 def csv_cell(value: object) -> object:
     """Return a cell that a spreadsheet reads as text: text that would begin a formula gets an apostrophe.
 
-    Examples
-    --------
     >>> csv_cell("=1+1"), csv_cell("-0.5"), csv_cell(-0.5)
     ("'=1+1", '-0.5', -0.5)
     """
@@ -130,8 +117,6 @@ def csv_cell(value: object) -> object:
 def quoted(text: str) -> str:
     r"""Return text in double quotes as TOML and YAML read them.
 
-    Examples
-    --------
     >>> quoted('a: "b"')
     '"a: \\"b\\""'
     """
@@ -141,8 +126,6 @@ def quoted(text: str) -> str:
 def json_text(content: Any) -> str:  # noqa: ANN401 - whatever JSON can say
     r"""Return a JSON document of printable characters and line feeds, with the same data.
 
-    Examples
-    --------
     >>> json_text({"name": "\x9b31m"})
     '{\n  "name": "\\u009b31m"\n}\n'
     """

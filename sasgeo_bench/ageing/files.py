@@ -79,8 +79,6 @@ def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
 def read_ageing(folder: Path) -> Ageing:
     """Read the output of `write_ageing`; raise `StoreError` if there is none or it is damaged.
 
-    Examples
-    --------
     >>> read_ageing(Path("nowhere"))
     Traceback (most recent call last):
         ...
@@ -161,7 +159,6 @@ def _classes_of(table: pd.DataFrame) -> list[str]:
 
 
 def _control_table(controls: Sequence[Ageing]) -> str:
-    """Format a row for each class, a column for each control."""
     tables = {control.place: control.table.set_index(["span", "class"]) for control in controls}
     lines = [
         [name, *(_control_cell(table, name) for table in tables.values())] for name in _classes_of(_together(controls))
@@ -185,13 +182,7 @@ _PLACE_HEAD: Final = ("place", "km2", "maps", "first", "last")
 
 def _place_cells(ageing: Ageing) -> list[str]:
     first, last = ageing.table["date_from"].min(), ageing.table["date_to"].max()
-    return [
-        ageing.place,
-        f"{ageing.area_km2:,.1f}",
-        str(len(ageing.sources)),
-        f"{first:%Y-%m-%d}",
-        f"{last:%Y-%m-%d}",
-    ]
+    return [ageing.place, f"{ageing.area_km2:,.1f}", str(len(ageing.sources)), f"{first:%Y-%m-%d}", f"{last:%Y-%m-%d}"]
 
 
 _RATE_HEAD: Final = (

@@ -40,48 +40,28 @@ from sasgeo_bench.osm.taxonomy import Kind, load_taxonomy
 
 BLOCK_M: Final = 1000.0
 DAYS_PER_YEAR: Final = 365.25
-LEAST_DAYS: Final = 30  # a yearly rate out of a shorter time would be one day's accident times 365
+LEAST_DAYS: Final = 30  # a yearly rate from a shorter time would multiply the events of single days
 UNITS: Final[dict[Kind, str]] = {"area": "m2", "line": "m"}
 _DECIMALS: Final = 6
 _REASONS: Final = ("world", "catch_up", "retagged")
 
-# Column -> pandas dtype. Shares lie within 0..1 and are NaN where nothing is left to share.
+# Column -> pandas dtype. Shares lie within 0..1 and are NaN of an empty whole.
+_RATES: Final = tuple(f"{what}_per_year{end}" for what in ("vanish", "appear") for end in ("", "_lo", "_hi"))
+_SHARES: Final = (
+    *("vanished_share", "appeared_share", "vanished_number_share", "appeared_number_share", "redrawn_share"),
+    *("retagged_share", "ground_lost_share", "ground_gained_share", "shift_median_m", "shift_p90_m"),
+    "id_vanished_share",
+)
+_EXPLAINED: Final = (
+    *(f"vanished_{reason}_share" for reason in ("world", "retagged", "untold")),
+    *(f"appeared_{reason}_share" for reason in ("world", "catch_up", "retagged", "untold")),
+)
 DTYPES: Final = {
-    "place": "str",
-    "class": "str",
-    "unit": "str",
-    "span": "str",
-    "date_from": "datetime64[ms]",
-    "date_to": "datetime64[ms]",
+    **dict.fromkeys(("place", "class", "unit", "span"), "str"),
+    **dict.fromkeys(("date_from", "date_to"), "datetime64[ms]"),
     "years": "float64",
-    "n_from": "int64",
-    "n_to": "int64",
-    "amount_from": "float64",
-    "amount_to": "float64",
-    "vanished_share": "float64",
-    "appeared_share": "float64",
-    "vanished_number_share": "float64",
-    "appeared_number_share": "float64",
-    "redrawn_share": "float64",
-    "retagged_share": "float64",
-    "ground_lost_share": "float64",
-    "ground_gained_share": "float64",
-    "shift_median_m": "float64",
-    "shift_p90_m": "float64",
-    "id_vanished_share": "float64",
-    "vanish_per_year": "float64",
-    "vanish_per_year_lo": "float64",
-    "vanish_per_year_hi": "float64",
-    "appear_per_year": "float64",
-    "appear_per_year_lo": "float64",
-    "appear_per_year_hi": "float64",
-    "vanished_world_share": "float64",
-    "vanished_retagged_share": "float64",
-    "vanished_untold_share": "float64",
-    "appeared_world_share": "float64",
-    "appeared_catch_up_share": "float64",
-    "appeared_retagged_share": "float64",
-    "appeared_untold_share": "float64",
+    **dict.fromkeys(("n_from", "n_to"), "int64"),
+    **dict.fromkeys(("amount_from", "amount_to", *_SHARES, *_RATES, *_EXPLAINED), "float64"),
     "blocks": "int64",
 }
 
@@ -135,44 +115,15 @@ class Ageing:
 
 
 def measure_ageing(history: History, *, place: str) -> Ageing:
-    """Measure how each class changed between the states (at least two) of a history.
+    """Measure how each class changed between the states (at least two) of a history; `place` seeds the bootstrap.
 
-    Parameters
-    ----------
-    history : History
-        At least two states of one area.
-    place : str
-        Its name; with class and dates it seeds the bootstrap.
+    In the table, `span` is "interval" for neighbouring dates, "whole" for the first against the last, and "pooled" for
+    the rates that explain all intervals together, without shares.
 
-    Returns
-    -------
-    Ageing
-        `span` is "interval" for neighbouring dates, "whole" for the first against the last, and "pooled" for the rates
-        that explain all intervals together, without shares.
-
-    Notes
-    -----
     Only objects visible from above count, as in the layers: a stream put into a culvert has vanished, and is counted as
     retagged. `vanished_share` is of the older amount, `appeared_share` of the newer; `*_number_share` is the same by
     number of things, each of which counts as gone (or new) if more than half of it is. Dates less than `LEAST_DAYS`
     apart get shares but no rates.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.osm.features import DTYPES as COLUMNS, make_features
-    >>> none = np.array([], dtype=object)
-    >>> def state(year, houses):
-    ...     filler = {name: [0] * len(houses) for name in COLUMNS}
-    ...     text = {"osm_type": ["way"] * len(houses), "class": ["building"] * len(houses)}
-    ...     seen = {"osm_id": range(len(houses)), "is_visible": [True] * len(houses), "geometry": houses}
-    ...     table = make_features(filler | text | seen, epsg=32632)
-    ...     hints = Lifecycle(gone=none, rising=none, started={})
-    ...     return State(source="", on=dt.date(year, 1, 1), features=table, lifecycle=hints)
-    >>> old, new = state(2010, shapely.box([0, 50], 0, [9, 59], 9)), state(2020, shapely.box([0], 0, [9], 9))
-    >>> history = History(states=(old, new), area=shapely.box(-99, -99, 99, 99), epsg=32632)
-    >>> table = measure_ageing(history, place="field").table
-    >>> table["span"].tolist(), float(table["vanished_share"][0])
-    (['interval', 'whole', 'pooled'], 0.5)
     """
     kinds: dict[str, Kind] = {item.name: item.kind for item in load_taxonomy().classes}
     stocks = [_stocks(state, history.area, kinds) for state in history.states]
@@ -345,28 +296,22 @@ def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> d
     years = np.array([change.years for change in changes])
     first, last = changes[0].date_from, changes[-1].date_to
     tables = _block_tables(changes)
-    if (last - first).days >= LEAST_DAYS:
-        vanish = bootstrap_rate(
-            *tables[:2],
-            years,
-            things=sum(change.n_from for change in changes),
-            rng=seeded_rng(place, name, span, first, last, "vanish"),
-        )
-        appear = bootstrap_rate(
-            *tables[2:],
-            years,
-            things=sum(change.n_to for change in changes),
-            rng=seeded_rng(place, name, span, first, last, "appear"),
-        )
-    else:
-        vanish = appear = Rate(per_year=np.nan, lo=np.nan, hi=np.nan)
+    sides = {"vanish": (tables[:2], "n_from"), "appear": (tables[2:], "n_to")}
+    rates: dict[str, object] = {}
+    for what, (amounts, count) in sides.items():
+        rate = Rate(per_year=np.nan, lo=np.nan, hi=np.nan)
+        if (last - first).days >= LEAST_DAYS:
+            things = sum(getattr(change, count) for change in changes)
+            rng = seeded_rng(place, name, span, first, last, what)
+            rate = bootstrap_rate(*amounts, years, things=things, rng=rng)
+        column = f"{what}_per_year"
+        rates |= {column: rate.per_year, f"{column}_lo": rate.lo, f"{column}_hi": rate.hi}
     return {
         "span": span,
         "date_from": pd.Timestamp(first),
         "date_to": pd.Timestamp(last),
         "years": float(years.sum()),
-        **_named("vanish_per_year", vanish),
-        **_named("appear_per_year", appear),
+        **rates,
         **_explained("vanished", [(change.old, change.vanished) for change in changes]),
         **_explained("appeared", [(change.new, change.appeared) for change in changes]),
         "blocks": len(tables[0]),
@@ -379,10 +324,6 @@ def _explained(what: str, sides: Sequence[tuple[Verdict, _Why]]) -> dict[str, fl
     shares = {name: _share(sum(getattr(why, name) for _, why in sides), lost) for name in _REASONS}
     shares["untold"] = max(1.0 - sum(shares.values()), 0.0) if lost > 0 else np.nan
     return {f"{what}_{name}_share": shares[name] for name in shares if f"{what}_{name}_share" in DTYPES}
-
-
-def _named(name: str, rate: Rate) -> dict[str, object]:
-    return {name: rate.per_year, f"{name}_lo": rate.lo, f"{name}_hi": rate.hi}
 
 
 def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, Floats]:

@@ -5,17 +5,17 @@ An id shows who drew a thing, not whether it exists: a bulk redraw replaces ids 
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-MATCH_IOU: Final = 0.3  # two areas that share so much are one thing
-NEAR_M: Final = 5.0  # roads in OSM lie within about 6 m of the truth, so re-drawn ones within as much of each other
+MATCH_IOU: Final = 0.3  # of two areas that are one thing
+NEAR_M: Final = 5.0  # roads in OSM lie within about 6 m of the truth, and so do re-drawn ones
 REDRAWN_M: Final = 1.0  # below this a shift is rounding or a tidied corner
-COVER_SHARE: Final = 0.5  # an area that another class or a hint covers by so much is explained by it
+COVER_SHARE: Final = 0.5  # of an area covered by another class or a hint that explains it
 STEP_M: Final = 5.0  # lines are compared in pieces no longer than this
 _CENTIMETRES: Final = 100.0
 _LEAST_M2: Final = 1e-6
@@ -112,8 +112,6 @@ def make_areas(shapes: Geometries) -> Areas:
 def make_pieces(shapes: Geometries) -> Pieces:
     """Cut line things of a table's rows into pieces; areas among them only support other lines.
 
-    Examples
-    --------
     >>> pieces = make_pieces(np.array([shapely.LineString([(0, 0), (12, 0)]), shapely.box(0, 0, 1, 1)]))
     >>> pieces.lengths_m.tolist(), len(pieces.segments)
     ([4.0, 4.0, 4.0], 2)
@@ -166,8 +164,6 @@ def compare_areas(these: Areas, others: Areas) -> Verdict:
     Areas with a counterpart of IoU above `MATCH_IOU` lose nothing; the rest, split, merged or gone, lose what no area
     of the other state covers.
 
-    Examples
-    --------
     >>> old = make_areas(shapely.box([0, 50], 0, [10, 60], 10))
     >>> new = make_areas(shapely.box([2], 0, [12], 10))
     >>> found = compare_areas(old, new)
@@ -207,8 +203,26 @@ class _Overlap:
 
 
 def _overlap(these: Geometries, others: Geometries) -> _Overlap:
-    tree = shapely.STRtree(others)
-    left, right = tree.query(these, predicate="intersects")
+    pairs = _intersections(these, others)
+    best, best_iou = np.zeros(len(these), dtype=np.int64), np.zeros(len(these))
+    ascending = np.argsort(pairs.iou, kind="stable")
+    best[pairs.left[ascending]], best_iou[pairs.left[ascending]] = pairs.right[ascending], pairs.iou[ascending]
+    covered = _covered_m2(pairs.left, pairs.shared, pairs.shared_m2, count=len(these))
+    return _Overlap(best=best, best_iou=best_iou, covered=covered)
+
+
+class _Intersections(NamedTuple):
+    """Rows of areas that overlap, sorted, with what they share and their IoU."""
+
+    left: Ints
+    right: Ints
+    shared: Geometries
+    shared_m2: Floats
+    iou: Floats
+
+
+def _intersections(these: Geometries, others: Geometries) -> _Intersections:
+    left, right = shapely.STRtree(others).query(these, predicate="intersects")
     order = np.lexsort((right, left))
     left, right = left[order], right[order]
     shared = shapely.intersection(these[left], others[right])
@@ -216,10 +230,7 @@ def _overlap(these: Geometries, others: Geometries) -> _Overlap:
     real = shared_m2 > _LEAST_M2
     left, right, shared, shared_m2 = left[real], right[real], shared[real], shared_m2[real]
     iou = shared_m2 / (shapely.area(these)[left] + shapely.area(others)[right] - shared_m2)
-    best, best_iou = np.zeros(len(these), dtype=np.int64), np.zeros(len(these))
-    ascending = np.argsort(iou, kind="stable")
-    best[left[ascending]], best_iou[left[ascending]] = right[ascending], iou[ascending]
-    return _Overlap(best=best, best_iou=best_iou, covered=_covered_m2(left, shared, shared_m2, count=len(these)))
+    return _Intersections(left, right, shared, shared_m2, iou)
 
 
 def _covered_m2(left: Ints, shared: Geometries, shared_m2: Floats, *, count: int) -> Floats:
@@ -238,8 +249,6 @@ def compare_pieces(these: Pieces, others: Pieces) -> Verdict:
 
     The shift of a thing is the median, over its kept length, of the distance to the other state.
 
-    Examples
-    --------
     >>> old = make_pieces(np.array([shapely.LineString([(0, 0), (20, 0)])]))
     >>> new = make_pieces(np.array([shapely.LineString([(0, 2), (10, 2)])]))
     >>> float(compare_pieces(old, new).lost.sum())
@@ -300,8 +309,6 @@ def replaced_share(shapes: Geometries, newcomers: Geometries) -> Floats:
 
     A forest that grows over a house takes the ground, not the place of the house; a car park on its footprint does.
 
-    Examples
-    --------
     >>> house = shapely.box([0], 0, [10], 10)
     >>> replaced_share(house, shapely.box([-500], -500, [500], 500)).tolist()
     [0.0]
@@ -310,12 +317,7 @@ def replaced_share(shapes: Geometries, newcomers: Geometries) -> Floats:
     """
     if len(shapes) == 0 or len(newcomers) == 0:
         return np.zeros(len(shapes))
-    left, right = shapely.STRtree(newcomers).query(shapes, predicate="intersects")
-    order = np.lexsort((right, left))
-    left, right = left[order], right[order]
-    shared = shapely.intersection(shapes[left], newcomers[right])
-    shared_m2, right_m2 = shapely.area(shared), shapely.area(newcomers)[right]
-    iou = shared_m2 / (shapely.area(shapes)[left] + right_m2 - shared_m2)
-    real = (shared_m2 > _LEAST_M2) & ((iou > MATCH_IOU) | (shared_m2 > COVER_SHARE * right_m2))
-    covered = _covered_m2(left[real], shared[real], shared_m2[real], count=len(shapes))
+    pairs = _intersections(shapes, newcomers)
+    real = (pairs.iou > MATCH_IOU) | (pairs.shared_m2 > COVER_SHARE * shapely.area(newcomers)[pairs.right])
+    covered = _covered_m2(pairs.left[real], pairs.shared[real], pairs.shared_m2[real], count=len(shapes))
     return np.asarray(covered / shapely.area(shapes))

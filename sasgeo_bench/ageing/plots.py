@@ -18,7 +18,7 @@ from sasgeo_bench.canvas import PlainFigure
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION
 
-_RANGE: Final = (0.01, 100.0)  # %/year: what is less is drawn at the left edge, what is more at the right one
+_RANGE: Final = (0.01, 100.0)  # %/year: values beyond are drawn at the edges
 _TICKS: Final = (0.01, 0.1, 1.0, 10.0, 100.0)
 _POOLED: Final = "#000000"
 _WHOLE: Final = "#d55e00"
@@ -28,7 +28,7 @@ _ROW_INCHES: Final = 0.42
 _WIDTH_INCHES: Final = 12.0
 _FRAME_INCHES: Final = 2.75
 _TOP_INCHES: Final = 1.0
-# Text stays text, so that it can be searched for; ids and dates come from neither clock nor chance.
+# Text stays searchable; ids are the same in every run.
 _STYLE: Final[dict[Any, Any]] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "sasgeo-bench",
@@ -139,10 +139,10 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
             [],
             color="white",
             mec=_WHOLE,
+            ls="",
             marker="D",
             ms=7,
             mew=1.4,
-            ls="",
             label="first map to last, by geometry (amount)",
         ),
         Line2D([], [], color="none", mec=_WHOLE, ms=5, mew=1.4, label="the same, by number", **common),

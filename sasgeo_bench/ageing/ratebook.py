@@ -13,7 +13,7 @@ from pydantic import Field
 from sasgeo_bench.config import Document
 from sasgeo_bench.errors import ConfigError
 
-LEAST_THINGS: Final = 20  # a rate of fewer things is that of a few accidents
+LEAST_THINGS: Final = 20  # a rate of fewer things is too uncertain
 _BEFORE_DATE: Final = re.compile(r"^(.+?)[-_.]*\d{4}-\d{2}-\d{2}")
 
 Count = Annotated[int, Field(ge=0)]

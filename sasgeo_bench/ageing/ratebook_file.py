@@ -66,12 +66,6 @@ def write_ratebook(path: Path, places: Sequence[Ageing]) -> Path:
 
 @cache
 def load_ratebook() -> RateBook:
-    """Return the rates of the package, those of `docs/ageing`.
-
-    Examples
-    --------
-    >>> round(load_ratebook()["Liechtenstein"].classes["building"].vanish_per_year.best, 4)
-    0.0031
-    """
+    """Return the rates of the package, those of `docs/ageing`."""
     text = resources.files("sasgeo_bench.ageing").joinpath(PACKAGED).read_text(encoding="utf-8")
     return parse_toml(text, RateBook, source=PACKAGED)

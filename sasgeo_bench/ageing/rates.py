@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 DRAWS: Final = 1000
 LEVEL: Final = 0.95
 _NEWTON_STEPS: Final = 60
-_NEVER_SEEN: Final = 0.05  # the chance of seeing none at all that the upper end of a zero rate leaves
+_NEVER_SEEN: Final = 0.05  # probability of no loss at the upper end of a zero rate
 
 Floats = NDArray[np.float64]
 
@@ -35,17 +35,8 @@ def seeded_rng(*purpose: object) -> np.random.Generator:
 def loss_rate(lost: Floats, total: Floats, years: Floats) -> Floats:
     """Estimate the yearly rate of an exponential life by maximum likelihood, from amounts lost between dates.
 
-    Parameters
-    ----------
-    lost, total : ndarray of float, shape (..., K)
-        Amount lost within each of K intervals, and the amount at its beginning.
-    years : ndarray of float, shape (K,)
-        Lengths of the intervals.
-
-    Returns
-    -------
-    ndarray of float, shape (...)
-        NaN if there was nothing to lose, infinite if all was lost.
+    `lost` and `total` have shape (..., K): amounts lost within each of K intervals of lengths `years`, and amounts at
+    their beginnings. The rate, shape (...), is NaN if there was nothing to lose, infinite if all was lost.
 
     Notes
     -----
@@ -55,8 +46,6 @@ def loss_rate(lost: Floats, total: Floats, years: Floats) -> Floats:
 
     Examples
     --------
-    >>> loss_rate(np.array([20.0]), np.array([100.0]), np.array([2.0])).round(4).item()
-    0.1116
     >>> loss_rate(np.array([10.0, 19.0]), np.array([100.0, 100.0]), np.array([1.0, 2.0])).round(4).item()
     0.1054
     """
@@ -89,22 +78,10 @@ def _root(lost: Floats, kept: Floats, some: Floats, years: Floats) -> Floats:
 def bootstrap_rate(lost: Floats, total: Floats, years: Floats, *, things: int, rng: np.random.Generator) -> Rate:
     """Estimate a yearly rate with a 95 % interval from resampled spatial blocks.
 
-    Parameters
-    ----------
-    lost, total : ndarray of float, shape (B, K)
-        Amounts of each of B blocks in each of K intervals.
-    years : ndarray of float, shape (K,)
-        Lengths of the intervals.
-    things : int
-        Number of things at risk. If none was lost, the bootstrap has no variance, and the upper end is the rate at
-        which losing none has a probability of 5 % (the rule of three).
-    rng : numpy.random.Generator
-        Generator of the resampling.
-
-    Returns
-    -------
-    Rate
-        The interval is NaN for fewer than two blocks: neighbours change together, so one block is one sample.
+    `lost` and `total` have shape (B, K): amounts of B blocks in K intervals of lengths `years`. If none of the `things`
+    was lost, the bootstrap has no variance, and the upper end is the rate at which losing none has a probability of 5 %
+    (the rule of three). The interval is NaN for fewer than two blocks: neighbours change together, so one block is one
+    sample.
     """
     best = float(loss_rate(lost.sum(axis=0), total.sum(axis=0), years))
     if math.isnan(best):

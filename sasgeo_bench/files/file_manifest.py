@@ -16,7 +16,7 @@ from sasgeo_bench.files.json import read_json
 
 SITE: Final = "site"
 SITE_SAYS: Final = "site.json"  # without it a folder is no site, and is not replaced
-SITE_FOLDERS: Final = (SITE, f".{SITE}.partial", f".{SITE}.replaced")  # the latter two where publishing was killed
+SITE_FOLDERS: Final = (SITE, f".{SITE}.partial", f".{SITE}.replaced")  # the last two if publishing was killed
 IMAGES: Final = (".webp", ".png", ".jpg", ".jpeg")
 FIGURE_FILES: Final = ("figures/*.svg", "figures/*.svg.gz")
 PICTURE_FILES: Final = ("pictures/pictures.json", *(f"pictures/*{kind}" for kind in IMAGES))
@@ -89,7 +89,7 @@ def check_known(
     )
     if other:
         message = (
-            f"{folder} holds {one_line(named(other, 'file'))} that would be lost, for nothing of it is part of {what}: "
+            f"{folder} holds {one_line(named(other, 'file'))} that would be lost and are not part of {what}: "
             "move that away, or name another folder"
         )
         raise StoreError(message)

@@ -49,7 +49,7 @@ def fresh_folder(target: Path) -> Iterator[Path]:
         yield scratch
         for path in scratch.rglob("*"):
             _flush(path)
-        if os.path.lexists(target):  # a link that leads nowhere stands in the way too
+        if os.path.lexists(target):  # true also for a broken link
             target.rename(replaced)
         scratch.rename(target)
     finally:

@@ -20,8 +20,6 @@ def parse_json(data: bytes | str) -> Any:  # noqa: ANN401 - any document
     Raise `ValueError` if it is no JSON, is nested too deep, repeats a key, holds a number that is not finite or has too
     many digits, or a text that cannot be encoded.
 
-    Examples
-    --------
     >>> parse_json('{"a": 1, "a": 2}')
     Traceback (most recent call last):
         ...

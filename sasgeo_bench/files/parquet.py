@@ -22,15 +22,15 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 
 CHECKED: Final[Mapping[str, Any]] = {"compression": "zstd", "write_page_checksum": True}
 VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
-MOST_ROWS: Final = 1_000_000  # of a table that is turned into rows
-MOST_VALUES: Final = 100_000_000  # of all columns together, lists laid end to end
+MOST_ROWS: Final = 1_000_000  # of a table that is converted to rows
+MOST_VALUES: Final = 100_000_000  # of all columns together, with the items of lists
 _MOST_UNPACKED: Final = 2_000_000_000  # bytes
 _ATTRS: Final = b"PANDAS_ATTRS"  # where pandas itself looks for them
 _SEAL: Final = b"sasgeo_footer_crc32"
 _DIGITS: Final = 8  # of a CRC-32, hexadecimal
 _MARK: Final = _SEAL + bytes((0x18, _DIGITS))  # Thrift's next field, a text of so many bytes
 _TAIL_BYTES: Final = 8  # length of the footer, and the magic number
-_MOST_QUOTED: Final = 200  # characters of what a library says
+_MOST_QUOTED: Final = 200  # characters of a library's error
 
 
 @contextmanager
@@ -47,17 +47,7 @@ def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator[pq.P
 
 
 def write_table(table: pa.Table, path: Path, *, row_group_size: int | None = None, **options: Any) -> None:  # noqa: ANN401
-    """Write a table with checksums; the same table gives the same bytes.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "table.parquet"
-    ...     write_table(pa.table({"a": [1, 2]}), path)
-    ...     read_table(path, mend="write it again").column_names
-    ['a']
-    """
+    """Write a table with checksums; the same table gives the same bytes."""
     with table_writer(path, table.schema, **options) as writer:
         writer.write_table(table, row_group_size)
 
@@ -92,28 +82,9 @@ def open_table(
 ) -> Iterator[pq.ParquetFile]:
     """Open a table of unknown origin: check its footer and bound its size before anything is read.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mend : str
-        Advice if it cannot be read, as in "score it again".
-    most_rows : int
-        Largest number of rows.
-    is_whole : bool
-        Whether it is read whole; otherwise each row group is bounded by itself.
-    **options
-        Those of `pyarrow.parquet.ParquetFile`.
-
-    Yields
-    ------
-    pyarrow.parquet.ParquetFile
-        Pages that carry a checksum are verified as they are read.
-
-    Raises
-    ------
-    StoreError
-        If it is missing, damaged, no table, or too large; also if reading fails while it is open.
+    A table that is not read whole (`is_whole`) is bounded by row group; `options` are those of
+    `pyarrow.parquet.ParquetFile`. Pages that carry a checksum are verified as they are read. Raise `StoreError`, with
+    the advice `mend`, if the file is missing, damaged, no table, or too large, or if reading fails while it is open.
     """
     try:
         _check_footer(path)
@@ -151,11 +122,7 @@ def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True)
     values = sum(chunk.num_values for columns in chunks for chunk in columns)
     sizes = [sum(chunk.total_uncompressed_size for chunk in columns) for columns in chunks]
     unpacked = sum(sizes) if is_whole else max(sizes, default=0)
-    found = {
-        "rows": (rows, most_rows),
-        "values": (values, MOST_VALUES),
-        "bytes unpacked": (unpacked, _MOST_UNPACKED),
-    }
+    found = {"rows": (rows, most_rows), "values": (values, MOST_VALUES), "bytes unpacked": (unpacked, _MOST_UNPACKED)}
     return next((f"{count} {what}, {most} at most" for what, (count, most) in found.items() if count > most), None)
 
 

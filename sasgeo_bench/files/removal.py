@@ -23,7 +23,7 @@ def remove_tree(folder: Path) -> None:
                     name, left, known = above.pop()
                     here = _instead(here, os.open("..", os.O_RDONLY | os.O_DIRECTORY, dir_fd=here))
                     if not os.path.samestat(os.fstat(here), known):
-                        return  # moved meanwhile: whatever lies here is none of it
+                        return  # moved meanwhile: this is another folder
                     with suppress(OSError):
                         os.rmdir(name, dir_fd=here)
                 elif (below := _unlinked(left[-1], here)) is None:
@@ -62,7 +62,7 @@ def _unlinked(name: str, parent: int) -> int | None:
 def _opened(name: str, parent: int | None) -> int:
     """Open a folder with all rights given to its owner; follow no link."""
     flags = os.O_DIRECTORY | os.O_NOFOLLOW
-    if hasattr(os, "O_PATH"):  # opens without the right to read, so that this folder and no other gets its rights
+    if hasattr(os, "O_PATH"):  # opens without the right to read: exactly this folder gets the rights
         known = os.open(name, flags | os.O_PATH, dir_fd=parent)
         try:
             with suppress(OSError):

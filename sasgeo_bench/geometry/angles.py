@@ -14,8 +14,6 @@ def normalize_deg(angle_deg: ArrayLike) -> NDArray[np.float64]:
 def wrap_deg(angle_deg: ArrayLike) -> NDArray[np.float64]:
     """Reduce any angle to [-180, 180), degrees; use it for differences of yaw.
 
-    Examples
-    --------
     >>> float(wrap_deg(350.0 - 10.0))
     -20.0
     """
@@ -25,8 +23,6 @@ def wrap_deg(angle_deg: ArrayLike) -> NDArray[np.float64]:
 def bearing_deg(east_m: ArrayLike, north_m: ArrayLike) -> NDArray[np.float64]:
     """Return the grid bearing of an offset in metres, clockwise from north, [0, 360) degrees; 0 for no offset.
 
-    Examples
-    --------
     >>> bearing_deg([0.0, 1.0, 0.0, -1.0], [1.0, 0.0, -1.0, 0.0]).tolist()
     [0.0, 90.0, 180.0, 270.0]
     """
@@ -36,8 +32,6 @@ def bearing_deg(east_m: ArrayLike, north_m: ArrayLike) -> NDArray[np.float64]:
 def rotation(yaw_deg: float) -> NDArray[np.float64]:
     """Return the matrix from a view's (right, up) to the map's (east, north), shape (2, 2).
 
-    Examples
-    --------
     A landmark due east, seen with yaw 90, is at the top of the view:
 
     >>> (rotation(90.0) @ [0.0, 1.0]).round(9).tolist()

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
@@ -13,15 +13,13 @@ from sasgeo_bench.errors import GridError
 
 Points = NDArray[np.float64]
 
-_SNAP: Final = 1e-6  # of a cell: closer than this to a whole cell is that cell, whatever the last bit says
+_SNAP: Final = 1e-6  # of a cell: closer than this to a whole cell counts as that cell, in spite of rounding
 _MAX_UTM_DEG: Final = (-80.0, 84.0)
 
 
 def utm_epsg(lon_deg: float, lat_deg: float) -> int:
     """Return the EPSG code of the plain six-degree UTM zone (WGS 84) around a point; raise `GridError` beyond UTM.
 
-    Examples
-    --------
     >>> utm_epsg(9.5, 47.1), utm_epsg(-122.4, 37.8), utm_epsg(18.4, -33.9)
     (32632, 32610, 32734)
     """
@@ -46,8 +44,6 @@ class Grid:
     Row 0 is the northernmost row. Continuous raster coordinates (u, v) count cells right and down from the outer corner
     of cell (0, 0), whose centre is therefore (0.5, 0.5): pixel-is-area.
 
-    Examples
-    --------
     >>> grid = Grid(epsg=32632, west_m=500000.0, north_m=5200000.0, cell_size_m=2.0, rows=100, cols=50)
     >>> grid.bounds_m
     (500000.0, 5199800.0, 500100.0, 5200000.0)
@@ -76,8 +72,6 @@ class Grid:
     ) -> Self:
         """Return the smallest grid that covers a box and whose edges are whole multiples of the cell size.
 
-        Examples
-        --------
         >>> Grid.from_bounds(3.0, 3.0, 9.0, 9.0, cell_size_m=2.0, epsg=32632).bounds_m
         (2.0, 2.0, 10.0, 10.0)
         """
@@ -104,8 +98,6 @@ class Grid:
     ) -> Self:
         """Return a grid of a width and height around a point; its edges snap to whole multiples of the cell size.
 
-        Examples
-        --------
         >>> Grid.around(100.4, 100.4, size_m=(20.0, 10.0), cell_size_m=1.0, epsg=32632).bounds_m
         (90.0, 95.0, 110.0, 105.0)
         """
@@ -148,20 +140,12 @@ class Grid:
 
     def window(self, row: int, col: int, rows: int, cols: int) -> Self:
         """Return the part of the grid that begins at a cell; it may reach beyond."""
-        return type(self)(
-            epsg=self.epsg,
-            west_m=self.west_m + col * self.cell_size_m,
-            north_m=self.north_m - row * self.cell_size_m,
-            cell_size_m=self.cell_size_m,
-            rows=rows,
-            cols=cols,
-        )
+        west_m, north_m = self.west_m + col * self.cell_size_m, self.north_m - row * self.cell_size_m
+        return replace(self, west_m=west_m, north_m=north_m, rows=rows, cols=cols)
 
     def windows(self, size_cells: int) -> Iterator[tuple[int, int, Self]]:
         """Tile the grid: yield row, column and window, row by row; the last ones are smaller.
 
-        Examples
-        --------
         >>> grid = Grid(epsg=32632, west_m=0.0, north_m=0.0, cell_size_m=1.0, rows=3, cols=5)
         >>> [(row, col, part.shape) for row, col, part in grid.windows(4)]
         [(0, 0, (3, 4)), (0, 4, (3, 1))]
@@ -173,11 +157,5 @@ class Grid:
 
     def coarsen(self, factor: int) -> Self:
         """Return the grid whose cells are `factor` times as large, from the same corner; it covers at least as much."""
-        return type(self)(
-            epsg=self.epsg,
-            west_m=self.west_m,
-            north_m=self.north_m,
-            cell_size_m=self.cell_size_m * factor,
-            rows=-(-self.rows // factor),
-            cols=-(-self.cols // factor),
-        )
+        rows, cols = -(-self.rows // factor), -(-self.cols // factor)
+        return replace(self, cell_size_m=self.cell_size_m * factor, rows=rows, cols=cols)

@@ -43,8 +43,6 @@ class Pose:
     def to_map(self, offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (right, up) of the view, shape (N, 2), metres, to easting/northing, shape (N, 2).
 
-        Examples
-        --------
         >>> Pose(easting_m=5.0, northing_m=5.0, yaw_deg=90.0).to_map(np.array([[0.0, 2.0]])).round(9).tolist()
         [[7.0, 5.0]]
         """
@@ -54,23 +52,10 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prior:
-    """Knowledge before matching: a disc that holds the place, a yaw and a scale, each with its sigma, or None.
+    """Knowledge before matching: a disc that holds the place, a yaw and a scale; `PoseError` if out of range.
 
-    Parameters
-    ----------
-    center_m : tuple of float, optional
-        Easting and northing of the disc's centre; None if the place may be anywhere in the region.
-    radius_m : float, optional
-        Radius of the disc, given with `center_m`.
-    yaw_deg, yaw_sigma_deg : float, optional
-        Heading and its standard deviation; None if any heading is possible.
-    scale_sigma : float
-        Standard deviation of the view's scale around 1.
-
-    Raises
-    ------
-    PoseError
-        If a value is out of range, or one of a pair is missing.
+    `center_m` (easting, northing) and `radius_m` are None if the place may be anywhere in the region, `yaw_deg` and its
+    standard deviation `yaw_sigma_deg` if any heading is possible. `scale_sigma` is the standard deviation around 1.
     """
 
     center_m: tuple[float, float] | None
@@ -99,8 +84,6 @@ class Prior:
 def inverse(pose: Pose) -> Pose:
     """Return the pose that undoes another: composed with it, either way, it is the identity.
 
-    Examples
-    --------
     >>> inverse(Pose(easting_m=0.0, northing_m=10.0, yaw_deg=0.0)).northing_m
     -10.0
     """

@@ -13,7 +13,7 @@ from sasgeo_bench.osm.locate import CoverageSource
 
 CELL_M: Final = 100.0
 CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie closer together than this
-OPEN_M: Final = 150.0  # thinner than two of these is a road or stream that was kept whole beyond the edge
+OPEN_M: Final = 150.0  # half the width of what is cut off: a road or stream kept whole beyond the edge
 MIN_SHARE: Final = 0.02  # of the largest piece: smaller ones are leftovers of relations that cross the edge
 FULL_SHARE: Final = 0.85  # data that fills this much of the header's box was cut by that box
 _M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the sphere is near enough
@@ -26,8 +26,6 @@ def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
     across the edge) and small leftovers. A region file's `coverage_lonlat` overrules the estimate. Return an empty
     polygon for no vertices.
 
-    Examples
-    --------
     >>> field = np.array([[9 + i / 800, 47 + j / 1200] for i in range(40) for j in range(40)])
     >>> estimate_coverage(field).contains(shapely.Point(9.02, 47.02))
     True

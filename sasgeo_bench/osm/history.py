@@ -28,9 +28,9 @@ from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import Box
 from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, read_header
 
-MARGIN_M: Final = CLOSE_M / 2  # so far does an estimated coverage reach beyond the edge that an extract was cut along
+MARGIN_M: Final = CLOSE_M / 2  # an estimated coverage reaches this far beyond the edge of the cut
 CELL_M: Final = 10.0  # of the grid that frames the reading; nothing is burnt into it
-_EDGE_DEG: Final = 0.01  # a box's straight sides in degrees bend when projected: a corner at least so often
+_EDGE_DEG: Final = 0.01  # spacing of corners: a box's straight sides in degrees bend when projected
 _LEAST_STATES: Final = 2
 _NAMED_DATE: Final = re.compile(r"(?<!\d)(\d{4}-\d{2}-\d{2})(?!\d)")
 _SILENT: Final[Callable[[str], None]] = lambda _: None  # noqa: E731 - a default
@@ -73,15 +73,13 @@ def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple
     Raise `ConfigError` if the dates do not fit the files, two states have one date, or there are fewer than two states,
     and `ExtractError` if a file is missing, damaged or has no date.
 
-    Examples
-    --------
     >>> [str(item.on) for item in date_extracts([Path("a.osh.pbf")], at=[dt.date(2016, 1, 1), dt.date(2014, 1, 1)])]
     ['2014-01-01', '2016-01-01']
     """
     histories = [path for path in paths if is_history(path)]
     if histories:
         if not at:
-            message = f"{histories[0].name} is a full history: say the dates to cut it at with --at"
+            message = f"{histories[0].name} is a full history: give the dates to cut it at with --at"
             raise ConfigError(message)
         dated = [DatedExtract(path=path, on=day) for path in histories for day in at]
         dated += [DatedExtract(path=path, on=_own_date(path)) for path in paths if not is_history(path)]
@@ -102,7 +100,7 @@ def _checked(dated: Sequence[DatedExtract]) -> tuple[DatedExtract, ...]:
     twice = [day for day, count in Counter(item.on for item in dated).items() if count > 1]
     if twice:
         names = ", ".join(sorted(item.path.name for item in dated if item.on == twice[0]))
-        message = f"two states are of {twice[0]} ({names}): leave one out, or date them with --at"
+        message = f"two states have the date {twice[0]} ({names}): leave one out, or date them with --at"
         raise ConfigError(message)
     return tuple(sorted(dated, key=lambda item: item.on))
 
@@ -120,7 +118,7 @@ def _own_date(path: Path) -> dt.date:
     with open_snapshot(path) as snapshot:
         every = elements(osmium.FileProcessor(str(snapshot.path), OBJECTS))
         newest = max((item.timestamp for item in every), default=None)
-    if newest is None or newest.year <= 1970:  # noqa: PLR2004 - what osmium says where a file carries no times
+    if newest is None or newest.year <= 1970:  # noqa: PLR2004 - osmium returns 1970 if a file has no times
         message = f"{path.name} does not say what day it is of: date it with --at, or put YYYY-MM-DD into its name"
         raise ExtractError(message)
     return dt.date(newest.year, newest.month, newest.day)
@@ -135,24 +133,10 @@ def read_history(
 ) -> History:
     """Read dated extracts over the area that all of them map, in a UTM zone; `tell` takes a line about each.
 
-    Parameters
-    ----------
-    dated : sequence of DatedExtract
-        From `date_extracts`.
-    bounds : tuple of float, optional
-        West, south, east, north, degrees: no more than this.
-    margin_m : float
-        Margin to cut off along estimated edges. Two extracts of a country are seldom cut along one line, and what lies
-        between their lines would vanish or appear in a day. States of one file share one edge, so nothing is cut off.
-    tell : callable, optional
-        Receives one line for each extract.
-
-    Raises
-    ------
-    CoverageError
-        If the extracts and the bounds have no area in common.
-    ExtractError
-        If a file is missing, damaged or of an unknown format.
+    `bounds` (west, south, east, north, degrees) limits the area. `margin_m` is cut off along estimated edges: two
+    extracts of a country are seldom cut along one line, and what lies between their lines would vanish or appear in a
+    day. States of one file share one edge, so nothing is cut off. Raise `CoverageError` if extracts and bounds have no
+    area in common, `ExtractError` if a file is missing, damaged or of an unknown format.
     """
     boxes = {path: _frame(path) for path in dict.fromkeys(item.path for item in dated)}
     frame = _common_frame(boxes, bounds)
@@ -168,7 +152,7 @@ def read_history(
             with open_snapshot(plain) as snapshot:
                 lifecycle = read_lifecycle(snapshot.path, epsg=epsg)
         area = shapely.intersection(area, _inner(reading, grid, margin_m=0.0 if is_one_file else margin_m))
-        # The sea is no object that somebody maps or builds; how its coastline changes is told by the coastline.
+        # The sea is not a mapped object: its changes are those of the coastline.
         objects = reading.features[(reading.features["osm_type"] != SEA).to_numpy()]
         states.append(State(source=item.path.name, on=item.on, features=objects, lifecycle=lifecycle))
         tell(_line(item, reading))

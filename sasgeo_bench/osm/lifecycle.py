@@ -17,7 +17,7 @@ from sasgeo_bench.osm.mapped import project
 from sasgeo_bench.osm.scan import Tally, line_wkb
 from sasgeo_bench.osm.snapshot import elements
 
-# The prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix that say "no longer", on the keys of our classes.
+# Prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix for what is gone, on the keys of our classes.
 _PREFIXES: Final = ("demolished", "razed", "removed", "was", "abandoned", "destroyed")
 _KEYS: Final = ("building", "highway", "railway", "waterway", "natural", "landuse", "leisure", "amenity", "barrier")
 _GONE_KEYS: Final = tuple(f"{prefix}:{key}" for prefix in _PREFIXES for key in _KEYS)
@@ -29,7 +29,6 @@ _FACTORY: Final = osmium.geom.WKBFactory()
 _CENTURY: Final = re.compile(r"c(\d{1,2})")
 _DECADE: Final = re.compile(r"(\d{3}0)s")
 _DAY: Final = re.compile(r"(\d{4})(?:-(\d{1,2}))?(?:-(\d{1,2}))?")
-_FIRST_YEAR: Final = 1
 
 
 class ObjectKey(NamedTuple):
@@ -113,8 +112,6 @@ def parse_start(text: str | None) -> Span | None:
 
     It reads "2015", "2015-06", "2015-06-12", "1990s", "C19", "before 1950", and "~2015" (two years either way).
 
-    Examples
-    --------
     >>> [str(day) for day in parse_start("2015-06")]
     ['2015-06-01', '2015-06-30']
     >>> [str(day) for day in parse_start("before 1950")]
@@ -157,7 +154,7 @@ def _within_a_year(year: int, month: int, day: int | None) -> Span | None:
 
 
 def _years(first: int, last: int) -> Span | None:
-    if not _FIRST_YEAR <= first <= last <= dt.MAXYEAR:
+    if not 1 <= first <= last <= dt.MAXYEAR:
         return None
     return Span(dt.date(first, 1, 1), dt.date(last, 12, 31))
 

@@ -22,10 +22,10 @@ from sasgeo_bench.files.hashes import sha256_of
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 _SILENT_S: Final = 30.0  # between two parts of a download
-ANSWER_S: Final = 3.0  # a server that is silent for longer is taken for unreachable
+ANSWER_S: Final = 3.0  # a server silent for longer counts as unreachable
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-# Where it is known from which ground an extract maps.
+# Source of the mapped area of an extract.
 CoverageSource = Literal["region file", "header box", "estimated", "estimated and islands"]
 Morphology = Literal["grid", "old_town", "suburb", "industrial", "riverside", "agricultural"]
 
@@ -121,7 +121,7 @@ def _download(extract: Extract, url: str) -> Path:
         raise ExtractError(message)
     folder = cache_folder()
     load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty())
-    pooch.get_logger().setLevel("WARNING")  # else it prints where its temporary file lies
+    pooch.get_logger().setLevel("WARNING")  # else it prints the path of its temporary file
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".download-") as scratch:
@@ -156,7 +156,7 @@ def answers(url: str) -> bool:
 @cache
 def _server_answers(server: str) -> bool:
     found = Event()
-    # In a thread: the look-up of a name takes as long as the system likes, whatever limit is set on the connection.
+    # In a thread: the lookup of a name ignores the time limit of the connection.
     thread = Thread(target=_ask, args=(server, found), daemon=True)
     thread.start()
     thread.join(ANSWER_S)
@@ -164,7 +164,6 @@ def _server_answers(server: str) -> bool:
 
 
 def _ask(server: str, found: Event) -> None:
-    """Set the event if the server answers."""
     with suppress(OSError, ValueError):
         pooch.HTTPDownloader(timeout=ANSWER_S)(server, None, None, check_only=True)
         found.set()

@@ -16,12 +16,12 @@ from sasgeo_bench.osm.scan import Box
 from sasgeo_bench.osm.sea import find_shore
 
 CUT: Final = "within reach of ways cut at the edge of the extract"
-OFFSHORE_M: Final = 1000.0  # of whole islands the sea is mapped this far out: no view is wider, no strait much narrower
+OFFSHORE_M: Final = 1000.0  # sea mapped around whole islands: no view is wider, no strait much narrower
 _WGS84: Final = 4326
 _EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projected
 _DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
-_AROUND_DEG: Final = 0.5  # coast further off decides nothing here, and a projection holds this far
-_COARSE_M: Final = 20.0  # of outlines of islands, where only what is about a kilometre away counts
+_AROUND_DEG: Final = 0.5  # coast further away has no effect, and a projection holds this far
+_COARSE_M: Final = 20.0  # simplification of islands, of which a buffer of a kilometre is taken
 _AREA: Final = 2  # dimensions of a polygon
 
 Geometries = NDArray[np.object_]
@@ -52,23 +52,9 @@ def map_ground(
 ) -> Mapped:
     """Find the mapped ground of a grid, the sea in it, and what is unknown.
 
-    Parameters
-    ----------
-    grid : Grid
-        The area wanted.
-    area, source : shapely.Geometry, str
-        From `choose_coverage`: the mapped area in longitude and latitude.
-    coast : ndarray of shapely.Geometry
-        Every coastline of the extract, in longitude and latitude; water lies on its right.
-    gaps : ndarray of shapely.Geometry
-        From `find_gaps`.
-    frame : shapely.Geometry
-        Box that holds the extract's vertices, in longitude and latitude.
-
-    Returns
-    -------
-    Mapped
-        Where the area is estimated, whole islands and the sea around them count as mapped too.
+    `area` and `source` come from `choose_coverage`, `gaps` from `find_gaps`; `coast` holds every coastline of the
+    extract, water on its right; `frame` is a box that holds the extract's vertices. All are in longitude and latitude.
+    Where the area is estimated, whole islands and the sea around them count as mapped too.
     """
     west, south, east, north = lonlat_box(grid)
     near = shapely.box(west - _AROUND_DEG, south - _AROUND_DEG, east + _AROUND_DEG, north + _AROUND_DEG)
@@ -94,7 +80,6 @@ def map_ground(
 
 
 def _less(ground: shapely.Geometry, unknown: dict[str, shapely.Geometry]) -> shapely.Geometry:
-    """Return the polygons of the ground less its unknown parts."""
     if all(part.is_empty for part in unknown.values()):
         return ground
     parts = shapely.get_parts(shapely.difference(ground, shapely.union_all(list(unknown.values()))))

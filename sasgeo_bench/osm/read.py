@@ -23,7 +23,7 @@ from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Tr
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
 
-_EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium says 1970-01-01 where a file carries no timestamps
+_EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 if a file has no timestamps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,37 +49,15 @@ class Reading:
 
 
 def read_extract(
-    path: Path,
-    grid: Grid,
-    *,
-    at: dt.date | None = None,
-    stated_coverage: shapely.Geometry | None = None,
+    path: Path, grid: Grid, *, at: dt.date | None = None, stated_coverage: shapely.Geometry | None = None
 ) -> Reading:
-    """Read the features of one extract that touch a grid.
+    """Read the features of one extract that touch a grid, in its CRS, with whole geometries, sorted by class and id.
 
-    Parameters
-    ----------
-    path : Path
-        An OSM file: .osm.pbf, .osm, .osm.gz, .osm.bz2, or a full history (.osh.pbf) with `at`.
-    grid : Grid
-        The area wanted; features get its CRS.
-    at : date, optional
-        For a full history: the state at the end of this day.
-    stated_coverage : shapely.Geometry, optional
-        Mapped area in longitude and latitude, if the user knows it.
+    `at` cuts a full history (.osh.pbf) at the end of a day. `stated_coverage` is the mapped area in longitude and
+    latitude, if the user knows it. A node beyond the globe is removed from its ways and counted in `drops`.
 
-    Returns
-    -------
-    Reading
-        Features with whole geometries, sorted by class and id, whatever the order in the file.
-
-    Raises
-    ------
-    ExtractError
-        If the file is missing, damaged or of an unknown format, or an id, date or coordinate is not a number. A node
-        beyond the globe is removed from its ways and counted in `drops`.
-    CoverageError
-        If the grid lies outside the extract, or no element of any class lies in it.
+    Raise `ExtractError` if the file is missing, damaged or of an unknown format, or an id, date or coordinate is not a
+    number; `CoverageError` if the grid lies outside the extract, or no element of any class lies in it.
     """
     taxonomy = load_taxonomy()
     grid_lonlat = lonlat_box(grid)
@@ -197,7 +175,6 @@ def _with_sea(features: gpd.GeoDataFrame, sea: NDArray[np.object_], taxonomy: Ta
 
 
 def _times(rows: Sequence[ScanRow]) -> NDArray[np.datetime64]:
-    """Return timestamps as UTC milliseconds; NaT if the file has none."""
     known = [row.timestamp.replace(tzinfo=None) if row.timestamp > _EPOCH else None for row in rows]
     return np.array(known, dtype="datetime64[ms]")
 

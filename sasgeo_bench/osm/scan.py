@@ -37,7 +37,7 @@ _POINTS: Final = tuple(struct.Struct(f"<{2 * count}d") for count in range(40))
 
 Get = Callable[[str], str | None]
 Box = tuple[float, float, float, float]
-_NOWHERE: Final = 2**31 - 1  # what osmium has for the place of a node that is missing
+_NOWHERE: Final = 2**31 - 1  # coordinate of a missing node in osmium
 _FACTORY: Final = osmium.geom.WKBFactory()
 
 
@@ -184,8 +184,6 @@ def _integer(text: str | None) -> int:
 def tagged_width_m(width: str | None, lanes: str | None) -> float | None:
     """Return the width in metres from the tags `width` ("6", "6.5 m", "6,5") and `lanes`, or None.
 
-    Examples
-    --------
     >>> tagged_width_m("6.5 m", "2"), tagged_width_m(None, "2"), tagged_width_m("wide", None)
     (6.5, 6.5, None)
     """
@@ -205,8 +203,6 @@ def reaches(wkb: bytes, box: Box) -> bool:
 
     Most objects of an extract are short and lie far from the region; their tags need not be read.
 
-    Examples
-    --------
     >>> line = bytes(shapely.to_wkb(shapely.linestrings([(9.0, 47.0), (9.1, 47.1)])))
     >>> reaches(line, (9.05, 47.0, 9.2, 47.2)), reaches(line, (9.2, 47.0, 9.3, 47.2))
     (True, False)
@@ -237,7 +233,7 @@ def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box) -> Scan:
         for item in _ways_and_areas(path, taxonomy):
             if not item.is_area():
                 _scan_way(item, scan, classifier, expected.ways, box)
-            elif _scan_area(item, scan, classifier, box):  # else assembled without a ring: stays among the lost
+            elif _scan_area(item, scan, classifier, box):  # an area without a ring stays among the lost
                 if item.from_way():
                     assembled.add(item.orig_id())
                 else:
@@ -483,6 +479,5 @@ def _relation_area(relation: _Relation, lines: dict[int, shapely.Geometry]) -> s
 
 
 def _polygons_of(geometry: shapely.Geometry) -> shapely.Geometry:
-    """Return the polygons within a geometry, as one multipolygon."""
     parts = shapely.get_parts(shapely.get_parts(geometry))
     return shapely.MultiPolygon([part for part in parts if part.geom_type == "Polygon"])

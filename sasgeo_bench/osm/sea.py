@@ -13,9 +13,9 @@ from scipy.spatial.distance import cdist
 
 OPEN: Final = "near a gap in the coastline"
 CONTRARY: Final = "between coastlines that contradict each other"
-_STEP_M: Final = 25.0  # the sides of a coastline are looked at once in each straight piece of at most this length
-_OFFSET_M: Final = 0.01  # so far to the side, which is also how finely OSM places a node
-_SLIP_SHARE: Final = 0.01  # of a face's coast: so little that says otherwise is a loop where a line was drawn badly
+_STEP_M: Final = 25.0  # the sides of a coastline are sampled once in each straight piece of at most this length
+_OFFSET_M: Final = 0.01  # to the side of the line; also the resolution of OSM nodes
+_SLIP_SHARE: Final = 0.01  # of a face's coast: less of the other side is a loop of a badly drawn line
 
 Floats = NDArray[np.float64]
 Geometries = NDArray[np.object_]
@@ -37,8 +37,6 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     only left sides land, both unknown, none neither. A coast that ends within the mapped area continues to the nearest
     beginning of another, or to the edge; ground no further from such a link than its length is unknown.
 
-    Examples
-    --------
     >>> shore = find_shore([shapely.LineString([(-9, 3), (19, 3)])], shapely.box(0, 0, 10, 10))
     >>> [float(shapely.area(faces).sum()) for faces in (shore.sea, shore.land)]
     [30.0, 70.0]

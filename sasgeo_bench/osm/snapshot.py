@@ -18,7 +18,7 @@ from sasgeo_bench.errors import ExtractError
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
 _HISTORY_SUFFIXES: Final = tuple(suffix for suffix in SUFFIXES if suffix.startswith(".osh"))
 _PBF_MARK: Final = b"\n\tOSMHeader"  # after four bytes of length
-_MOST_QUOTED: Final = 200  # characters of what osmium says: it quotes a value whole, however long
+_MOST_QUOTED: Final = 200  # characters of an error of osmium, which quotes a value of any length
 _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
 OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
@@ -62,8 +62,6 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
     The yielded path may lie in a temporary folder that is removed when the context ends. Raise `ExtractError` if the
     file is missing, empty, damaged, of a format not in `SUFFIXES`, or a history without a date.
 
-    Examples
-    --------
     >>> with open_snapshot(Path("nowhere.osm.pbf")):
     ...     pass
     Traceback (most recent call last):
@@ -80,7 +78,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
         current = content
         if is_history(path) or header.has_multiple_object_versions:
             if at is None:
-                message = f"{path.name} is a full history: say the date to cut it at"
+                message = f"{path.name} is a full history: give the date to cut it at"
                 raise ExtractError(message)
             current = Path(scratch) / "at-date.osm.pbf"
             _cut_history(content, current, at=at)
@@ -152,10 +150,9 @@ def _one_type() -> Iterator[None]:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn osmium's errors on a damaged file into one line that names the file."""
     try:
         yield
-    except (RuntimeError, UnicodeDecodeError) as error:  # text is decoded only where it is looked at
+    except (RuntimeError, UnicodeDecodeError) as error:  # text is decoded only when it is read
         message = (
             f"{path} cannot be read as OSM data ({str(error)[:_MOST_QUOTED]}): it is damaged, cut short or no OSM "
             "file; get it again"

@@ -28,15 +28,7 @@ class Persistence(Document):
 
 
 class Rule(Document):
-    """One OSM key and the exact values of it that define a class.
-
-    Examples
-    --------
-    >>> Rule(key="highway", geometry="line", widths={"track": 2.5}).takes("track")
-    True
-    >>> Rule(key="building", geometry="area", values=["*"], besides=["no"]).takes("no")
-    False
-    """
+    """One OSM key and the exact values of it that define a class; "*" is every value but those of `besides`."""
 
     key: str
     geometry: Kind
@@ -145,8 +137,6 @@ def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
     Labels come in class order. A line rule labels areas too (filled or by their outline); the reader decides whether
     the object is a line or an area. `unknown` lists "key=value" of taxonomy keys without a rule.
 
-    Examples
-    --------
     >>> found = classify({"highway": "primary", "bridge": "yes"}, load_taxonomy())
     >>> [(label.class_name, label.width_m) for label in found.line]
     [('road_major', 8.0), ('bridge', None)]

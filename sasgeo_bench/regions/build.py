@@ -288,10 +288,7 @@ def _source(plan: BuildPlan) -> Iterator[Path]:
         path = Path(folder) / plan.extract.file
         longitude_deg, latitude_deg = plan.spec.center_lonlat
         shape = TownPlan(
-            morphology=town.morphology,
-            seed=town.seed,
-            size_m=town.size_m,
-            center_lonlat=(longitude_deg, latitude_deg),
+            morphology=town.morphology, seed=town.seed, size_m=town.size_m, center_lonlat=(longitude_deg, latitude_deg)
         )
         write_town(shape, path, on=plan.extract.date)
         yield path

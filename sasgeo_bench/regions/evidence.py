@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Self, TypeVar
+from typing import Final, Self
 
 import numpy as np
 import shapely
@@ -20,32 +20,19 @@ UNKNOWN: Final = 2
 _STATES: Final = 3
 _MOST_CLASSES: Final = 31
 _NOT_KNOWN: Final = np.uint32(1 << 31)
-Value = TypeVar("Value", np.uint8, np.uint32)
 
 CELLS_PER_BYTE: Final = 4
-_SHIFTS: Final = np.arange(0, 8, 2, dtype=np.uint8)  # of the four cells within a byte, the first one lowest
+_SHIFTS: Final = np.arange(0, 8, 2, dtype=np.uint8)  # of the four cells within a byte, first cell lowest
 _CELLS: Final = np.arange(256, dtype=np.uint8)[:, None] >> _SHIFTS & 3  # shape (256, 4): the cells of each byte
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """The state of each class and cell, as observed in one view.
+    """The state of each class and cell, as observed in one view; `ShapeError` if shapes, types or values do not fit.
 
-    Parameters
-    ----------
-    classes : tuple of str
-        Class names in band order.
-    cells : ndarray of uint8, shape (C, rows, cols)
-        ABSENT, PRESENT or UNKNOWN; row 0 is the top of the view. Made read-only.
-    cell_size_m : float
-        Side of a cell on the ground, for scale 1.
-    confidence : ndarray of uint8, shape (C, rows, cols), optional
-        Confidence of perception in each cell, 0..255.
-
-    Raises
-    ------
-    ShapeError
-        If shapes, types or values do not fit.
+    Row 0 of `cells`, uint8 of shape (C, rows, cols), is the top of the view; a cell is ABSENT, PRESENT or UNKNOWN and
+    `cell_size_m` wide on the ground, for scale 1. `confidence` is that of perception, 0..255, of the same shape. Both
+    arrays are made read-only.
     """
 
     classes: tuple[str, ...]
@@ -114,8 +101,6 @@ class LayerBits:
     def of(cls, layers: NDArray[np.uint8]) -> Self:
         """Combine layers, uint8 of shape (C, rows, cols); a cell unknown in one class is unknown in all.
 
-        Examples
-        --------
         >>> LayerBits.of(np.array([[[1, 0, 255]], [[1, 1, 255]]], dtype=np.uint8)).bits.tolist()
         [[3, 2, 2147483648]]
         """
@@ -133,8 +118,6 @@ class LayerBits:
 def pack(cells: NDArray[np.uint8]) -> bytes:
     """Pack three-state cells of any shape to two bits each, in C order, the first of four cells in the lowest bits.
 
-    Examples
-    --------
     >>> pack(np.array([1, 2, 0, 1, 2], dtype=np.uint8)).hex()
     '4902'
     """
@@ -162,31 +145,11 @@ def unpack(packed: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     return np.asarray(cells[:count].reshape(shape), dtype=np.uint8)
 
 
-def observe(
-    layers: LayerBits,
-    grid: Grid,
-    pose: Pose,
-    *,
-    size_cells: int,
-    cell_size_m: float,
-) -> NDArray[np.uint8]:
+def observe(layers: LayerBits, grid: Grid, pose: Pose, *, size_cells: int, cell_size_m: float) -> NDArray[np.uint8]:
     """Return the map as a perfect view from a pose: each view cell takes the map cell under its centre.
 
-    Parameters
-    ----------
-    layers, grid : LayerBits, Grid
-        A region's layers and their lattice.
-    pose : Pose
-        Centre, heading and residual scale of the view.
-    size_cells : int
-        Rows and columns of the view.
-    cell_size_m : float
-        Side of a view cell on the ground, for scale 1.
-
-    Returns
-    -------
-    ndarray of uint8, shape (C, size_cells, size_cells)
-        ABSENT, PRESENT or UNKNOWN; beyond the map everything is UNKNOWN.
+    The result is uint8 of shape (C, size_cells, size_cells), ABSENT, PRESENT or UNKNOWN; beyond the map all is UNKNOWN.
+    `cell_size_m` is the side of a view cell on the ground, for scale 1.
 
     Examples
     --------
@@ -205,7 +168,13 @@ def observe(
     steps_m = (np.arange(size_cells) + 0.5 - size_cells / 2) * cell_size_m
     across, along = np.outer(right - middle, steps_m), middle[:, None] + np.outer(up - middle, -steps_m)
     cols, rows = np.floor(along[:, :, None] + across[:, None, :]).astype(np.int64)
-    bits = _sample(layers.bits, rows, cols, _NOT_KNOWN)
+    height, width = layers.bits.shape
+    at = rows * width + cols
+    if rows.min() >= 0 and rows.max() < height and cols.min() >= 0 and cols.max() < width:
+        bits = layers.bits.ravel()[at]
+    else:
+        within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+        bits = np.where(within, layers.bits.ravel()[np.where(within, at, 0)], _NOT_KNOWN)
     seen = np.empty((layers.count, *shape), dtype=np.uint8)
     for index, layer in enumerate(seen):
         np.bitwise_and(bits >> np.uint32(index), 1, out=layer, casting="unsafe")
@@ -216,41 +185,21 @@ def observe(
 def cell_offsets_m(shape: tuple[int, int], cell_size_m: float) -> NDArray[np.float64]:
     """Return (right, up) of every cell centre of a view from its middle, row by row, shape (rows * cols, 2), metres.
 
-    Examples
-    --------
     >>> cell_offsets_m((2, 2), 1.0).tolist()
     [[-0.5, 0.5], [0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]
     """
-    view = _view_grid(shape, cell_size_m)
-    rows, cols = np.indices(shape)
-    return view.to_centres_m(np.column_stack((rows.ravel(), cols.ravel())))
+    rows, cols = shape
+    west_m, north_m = -cols * cell_size_m / 2, rows * cell_size_m / 2
+    view = Grid(epsg=0, west_m=west_m, north_m=north_m, cell_size_m=cell_size_m, rows=rows, cols=cols)
+    return view.to_centres_m(np.argwhere(np.ones(shape, dtype=bool)))
 
 
 def footprint(pose: Pose, *, size_m: tuple[float, float]) -> shapely.Polygon:
     """Return the outline of a view of a width and height on the map, counter-clockwise.
 
-    Examples
-    --------
     >>> footprint(Pose(easting_m=5.0, northing_m=5.0, yaw_deg=90.0), size_m=(4.0, 2.0)).bounds
     (4.0, 3.0, 6.0, 7.0)
     """
     half = np.array(size_m) / 2
     corners = pose.to_map(np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half)
     return shapely.Polygon(corners.round(9))
-
-
-def _view_grid(shape: tuple[int, int], cell_size_m: float) -> Grid:
-    """Return the view as a lattice of its own whose origin is the middle of the view."""
-    rows, cols = shape
-    west_m, north_m = -cols * cell_size_m / 2, rows * cell_size_m / 2
-    return Grid(epsg=0, west_m=west_m, north_m=north_m, cell_size_m=cell_size_m, rows=rows, cols=cols)
-
-
-def _sample(source: NDArray[Value], rows: NDArray[np.int64], cols: NDArray[np.int64], beyond: Value) -> NDArray[Value]:
-    """Return values of a raster at cells of any shape; `beyond` outside of it."""
-    height, width = source.shape
-    at = rows * width + cols
-    if rows.min() >= 0 and rows.max() < height and cols.min() >= 0 and cols.max() < width:
-        return np.asarray(source.ravel()[at])
-    within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
-    return np.where(within, source.ravel()[np.where(within, at, 0)], beyond)

@@ -37,7 +37,7 @@ KINDS: Final = (
 )
 RELATIONS: Final = ("adjacency", "connectivity", "crossing", "membership")
 AREA_CLASSES: Final = ("farmland", "green", "parking", "water")
-# What a crossing of two layers is called; a railway over a river or another railway is a plain crossing in plan.
+# Kinds of crossings of two layers; that of a railway with a river or a railway is a plain crossing.
 CROSSING_KIND: Final = {(ROAD, RAIL): "road_rail_crossing", (ROAD, WATER): "road_water_crossing"}
 
 # Column -> dtype; `geometry` (Point) comes last.
@@ -90,7 +90,7 @@ def build_graph(features: gpd.GeoDataFrame, *, bounds_m: Bounds | None = None) -
     _draw_ways(draft, ways, bounds_m)
     is_seen = features["is_visible"].to_numpy()
     _draw_buildings(draft, _sorted(features[is_seen & (names == "building").to_numpy()]), bounds_m)
-    # Where the middle of the sea lies tells where the extract was cut, and nothing of the place.
+    # The centroid of the sea depends on where the extract was cut, not on the place.
     is_area = is_seen & names.isin(AREA_CLASSES).to_numpy() & (features["osm_type"] != SEA).to_numpy()
     _draw_areas(draft, _sorted(features[is_area]))
     return draft.finish(features.crs, bounds_m)
@@ -146,7 +146,6 @@ class _Draft:
         return MapGraph(nodes=nodes, edges=self._finish_edges(new_id, en_m[order]))
 
     def _finish_edges(self, new_id: Ints, en_m: Floats) -> pd.DataFrame:
-        """Return the edges between nodes that were kept, sorted by relation and ends."""
         code, source, target, length_m = (np.concatenate(part) for part in zip(*self._edges, strict=True))
         source, target = new_id[source], new_id[target]
         is_mutual = np.isin(code, [RELATIONS.index("adjacency"), RELATIONS.index("connectivity")])
@@ -179,7 +178,6 @@ class _Ways:
 
 
 def _draw_ways(draft: _Draft, ways: gpd.GeoDataFrame, bounds_m: Bounds | None) -> None:
-    """Add junctions, crossings and river bends, and their connections."""
     names = ways["class"].to_numpy(dtype=object)
     level = ways["level"].to_numpy(dtype=np.int64)
     table = _Ways(
@@ -348,7 +346,6 @@ def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops) -> None:
 
 
 def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, bounds_m: Bounds | None) -> None:
-    """Add buildings and their clusters."""
     shapes = np.asarray(buildings.geometry.array)
     en_m = centroids(shapes)
     is_real = np.isfinite(en_m).all(axis=1) & _is_inside(en_m, bounds_m)
@@ -393,7 +390,6 @@ def _draw_areas(draft: _Draft, areas: gpd.GeoDataFrame) -> None:
 
 
 def _typed(columns: Mapping[str, object], dtypes: Mapping[str, str]) -> pd.DataFrame:
-    """Return a table of the columns in the order and with the types of a schema."""
     return pd.DataFrame({name: columns[name] for name in dtypes}).astype(dict(dtypes))
 
 

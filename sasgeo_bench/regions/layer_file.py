@@ -28,13 +28,7 @@ PaintWindow = Callable[[Grid], NDArray[np.uint8]]
 
 
 def overview_factors(grid: Grid) -> tuple[int, ...]:
-    """Return factors of the internal overviews: quartered until the raster fits two blocks.
-
-    Examples
-    --------
-    >>> overview_factors(Grid(epsg=32632, west_m=0.0, north_m=0.0, cell_size_m=1.0, rows=4096, cols=9000))
-    (4, 16)
-    """
+    """Return factors of the internal overviews: quartered until the raster fits two blocks."""
     longest = max(grid.rows, grid.cols)
     return tuple(4**level for level in range(1, 10) if longest > 2 * BLOCK_CELLS * 4 ** (level - 1))
 
@@ -137,7 +131,7 @@ def read_layers(path: Path, *, window: tuple[int, int, int, int] | None = None) 
 
 def cog_faults(path: Path) -> list[str]:
     """List the faults found by a validator of cloud-optimized GeoTIFFs; raise `StoreError` if it cannot be read."""
-    from rio_cogeo.cogeo import cog_validate  # noqa: PLC0415 - an extra: only whoever writes a release needs it
+    from rio_cogeo.cogeo import cog_validate  # noqa: PLC0415 - an extra, needed only to write a release
 
     try:
         is_valid, faults, _ = cog_validate(path, quiet=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 
 PRESENT: Final = 1
-OUTSIDE: Final = 255  # beyond the mapped area: not absent, unknown
+OUTSIDE: Final = 255  # unknown: beyond the mapped area
 
 _ARC_SEGMENTS: Final = 2  # per quarter circle at line ends and bends: 3 % of the radius, a few centimetres on a road
 
@@ -67,8 +67,6 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
 
     The result is uint8 of shape (C, rows, cols). A window of the region's grid gives exactly that window of the whole.
 
-    Examples
-    --------
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4.0, cell_size_m=1.0, rows=4, cols=4)
     >>> house = np.array([shapely.box(1, 1, 3, 3)])
     >>> land = np.array([shapely.box(0, 0, 3, 4)])

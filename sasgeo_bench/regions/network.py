@@ -25,36 +25,16 @@ LINE_TYPE: Final = 1  # of shapely.get_type_id
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
-    """Segments between shared vertices; each undirected segment occurs once per layer.
+    """Segments between shared vertices; each undirected segment occurs once per layer."""
 
-    Parameters
-    ----------
-    vertices : ndarray of float64, shape (V, 2)
-        Easting and northing, metres.
-    keys : ndarray of int64, shape (V,)
-        Ascending key of each vertex on the millimetre lattice of `origin` and `stride`.
-    ends : ndarray of int64, shape (S, 2)
-        Vertices of each segment, in the direction of its way; the segments of a way follow each other.
-    way : ndarray of int64, shape (S,)
-        Row of the way in the source table.
-    layer : ndarray of int64, shape (S,)
-        ROAD, RAIL or WATER.
-    is_visible : ndarray of bool, shape (S,)
-        False in tunnels and under ground.
-    origin : ndarray of float64, shape (2,)
-        Smallest easting and northing, metres.
-    stride : int
-        Cells in a column of the lattice.
-    """
-
-    vertices: Floats
-    keys: Ints
-    ends: Ints
-    way: Ints
-    layer: Ints
-    is_visible: Bools
-    origin: Floats
-    stride: int
+    vertices: Floats  # shape (V, 2): easting and northing, metres
+    keys: Ints  # shape (V,): ascending key of each vertex on the millimetre lattice of `origin` and `stride`
+    ends: Ints  # shape (S, 2): vertices of each segment, in the direction of its way; segments of a way are adjacent
+    way: Ints  # shape (S,): row of the way in the source table
+    layer: Ints  # shape (S,): ROAD, RAIL or WATER
+    is_visible: Bools  # shape (S,): false in tunnels and under ground
+    origin: Floats  # shape (2,): smallest easting and northing, metres
+    stride: int  # cells in a column of the lattice
 
     def lookup(self, en_m: Floats) -> Ints:
         """Return the vertex at each place of shape (N, 2), metres; -1 where there is none."""
@@ -79,8 +59,6 @@ def make_network(ways: gpd.GeoDataFrame) -> Network:
     Areas among them (squares) are left out. A segment drawn by two ways of one layer counts once, and is visible if
     either is.
 
-    Examples
-    --------
     >>> ways = gpd.GeoDataFrame(
     ...     {"class": ["road_minor", "road_minor"], "is_visible": True},
     ...     geometry=shapely.from_wkt(["LINESTRING (0 0, 10 0, 20 0)", "LINESTRING (10 0, 10 9)"]),
@@ -120,8 +98,6 @@ def make_network(ways: gpd.GeoDataFrame) -> Network:
 def pair_keys(pairs: Ints, count: int) -> Ints:
     """Return one integer for each unordered pair, shape (N, 2), of numbers below `count`.
 
-    Examples
-    --------
     >>> pair_keys(np.array([[1, 2], [2, 1]]), 10).tolist()
     [12, 12]
     """
@@ -130,36 +106,16 @@ def pair_keys(pairs: Ints, count: int) -> Ints:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chains:
-    """The segments of one layer, joined into chains.
+    """The segments of one layer, joined into chains."""
 
-    Parameters
-    ----------
-    en_m : ndarray of float64, shape (P, 2)
-        Vertices of all chains, one chain after the other, metres.
-    at_m : ndarray of float64, shape (P,)
-        Distance of each from the start of its chain, metres.
-    first : ndarray of int64, shape (C + 1,)
-        Row of `en_m` where each chain begins; the last entry is P.
-    tips : ndarray of int64, shape (C, 2)
-        Network vertices at either end.
-    length_m : ndarray of float64, shape (C,)
-        Length of each chain, metres.
-    of_segment : ndarray of int64, shape (S,)
-        Chain of each segment of the network; -1 in other layers.
-    segment_at_m : ndarray of float64, shape (S, 2)
-        Distance of each segment's two ends from the start of its chain, metres; NaN in other layers.
-    part_segment : ndarray of int64, shape (P,)
-        Network segment that begins at each row of `en_m`; -1 at the last vertex of a chain.
-    """
-
-    en_m: Floats
-    at_m: Floats
-    first: Ints
-    tips: Ints
-    length_m: Floats
-    of_segment: Ints
-    segment_at_m: Floats
-    part_segment: Ints
+    en_m: Floats  # shape (P, 2): vertices of all chains, one chain after the other, metres
+    at_m: Floats  # shape (P,): distance of each from the start of its chain, metres
+    first: Ints  # shape (C + 1,): row of `en_m` where each chain begins; the last entry is P
+    tips: Ints  # shape (C, 2): network vertices at either end
+    length_m: Floats  # shape (C,): length of each chain, metres
+    of_segment: Ints  # shape (S,): chain of each segment of the network; -1 in other layers
+    segment_at_m: Floats  # shape (S, 2): distance of both ends of each segment from the start of its chain, or NaN
+    part_segment: Ints  # shape (P,): segment that begins at each row of `en_m`; -1 at the last vertex of a chain
 
     def segment_at(self, chain: Ints, at_m: Floats) -> Ints:
         """Return the network segment at a distance along each chain, metres."""
@@ -176,8 +132,6 @@ def make_chains(network: Network, layer: int, *, is_break: Bools) -> Chains:
     fork inside it: a river past its tributaries, a track past its switches. Chain ends depend on the geometry only;
     order and direction of chains follow the order of the ways.
 
-    Examples
-    --------
     >>> ways = gpd.GeoDataFrame(
     ...     {"class": ["road_minor", "road_minor"], "is_visible": True},
     ...     geometry=shapely.from_wkt(["LINESTRING (0 0, 10 0)", "LINESTRING (10 0, 10 9)"]),
@@ -237,24 +191,12 @@ def _pieces(network: Network, chosen: Ints, is_break: Bools) -> Lines:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crossings:
-    """Places where visible ways cross in plan.
+    """Places where visible ways cross in plan."""
 
-    Parameters
-    ----------
-    en_m : ndarray of float64, shape (N, 2)
-        Place, metres.
-    segments : ndarray of int64, shape (N, 2)
-        The two segments; the layer of the first is not the greater one.
-    shares : ndarray of float64, shape (N, 2)
-        Position of the crossing along each of the two, in [0, 1].
-    vertex : ndarray of int64, shape (N,)
-        The shared vertex, or -1.
-    """
-
-    en_m: Floats
-    segments: Ints
-    shares: Floats
-    vertex: Ints
+    en_m: Floats  # shape (N, 2): place, metres
+    segments: Ints  # shape (N, 2): the two segments; the layer of the first is not the greater one
+    shares: Floats  # shape (N, 2): position of the crossing along each of the two, in [0, 1]
+    vertex: Ints  # shape (N,): the shared vertex, or -1
 
 
 def find_crossings(network: Network) -> Crossings:
@@ -263,8 +205,6 @@ def find_crossings(network: Network) -> Crossings:
     A way that ends on another without a shared vertex does not cross it; one that has a vertex on it and continues
     does.
 
-    Examples
-    --------
     >>> ways = gpd.GeoDataFrame(
     ...     {"class": ["road_minor", "waterway"], "is_visible": True},
     ...     geometry=shapely.from_wkt(["LINESTRING (0 0, 20 0)", "LINESTRING (5 -5, 5 5)"]),
@@ -308,8 +248,6 @@ def find_meetings(network: Network, layer: int) -> Crossings:
 
     Where they run along each other (a tram in its street) they do not cross.
 
-    Examples
-    --------
     >>> ways = gpd.GeoDataFrame(
     ...     {"class": ["road_minor", "railway"], "is_visible": True},
     ...     geometry=shapely.from_wkt(["LINESTRING (0 0, 5 0, 20 0)", "LINESTRING (5 -5, 5 0, 5 5)"]),
@@ -334,5 +272,4 @@ def find_meetings(network: Network, layer: int) -> Crossings:
 
 
 def _cross(left: Floats, right: Floats) -> Floats:
-    """Return the cross product of vectors of shape (N, 2)."""
     return np.asarray(left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0])

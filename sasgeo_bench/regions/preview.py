@@ -64,7 +64,6 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
 
 
 def _draw_edge(chart: Axes, manifest: Manifest) -> None:
-    """Draw the outline of the mapped area within the grid."""
     west, south, east, north = manifest.bounds_m
     frame = shapely.boundary(shapely.box(west, south, east, north))
     edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))

@@ -18,8 +18,8 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.texts import FOLDER
 
-SCHEMA_VERSION: Final = 1  # of region.json and the tables beside it
-DATA_VERSION: Final = 2  # of what a build makes of an extract: raised whenever the same input gives another region
+SCHEMA_VERSION: Final = 1  # of region.json and its tables
+DATA_VERSION: Final = 2  # of regions: raised whenever the same input gives another region
 ATTRIBUTION: Final = "(c) OpenStreetMap contributors, ODbL"
 LICENCE: Final = "ODbL-1.0"
 

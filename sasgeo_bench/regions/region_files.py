@@ -58,8 +58,6 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def read_manifest(folder: Path) -> Manifest:
     """Read `region.json`; raise `StoreError` if it is missing, damaged or of another schema.
 
-    Examples
-    --------
     >>> read_manifest(Path("nowhere"))
     Traceback (most recent call last):
         ...
@@ -82,7 +80,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise StoreError(message) from error
     lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
     if lost:
-        message = f"{path} is damaged (its files lack {lost[0]}): build the region again"
+        message = f"{path} is damaged (its files lack {lost[0]}): {_MEND}"
         raise StoreError(message)
     return manifest
 
@@ -122,7 +120,6 @@ def _check_file(path: Path, record: FileRecord) -> None:
 
 
 def _read_geometry(path: Path) -> gpd.GeoDataFrame:
-    """Read a table of geometry after checking its size."""
     with open_table(path, mend=_MEND, most_rows=MOST_VALUES):
         pass
     try:

@@ -28,8 +28,6 @@ Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$
 class RegionFile(NamedDocument):
     """Definition of one region: identity, place, cell size and dated extracts.
 
-    Examples
-    --------
     >>> from sasgeo_bench.config import parse_toml
     >>> text = '''
     ... id = "mine"
@@ -146,9 +144,7 @@ class RegionFile(NamedDocument):
             bounds_m = to_grid.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS, errcheck=True)
             return Grid.from_bounds(*bounds_m, cell_size_m=self.cell_size_m, epsg=epsg)
         except (pyproj.exceptions.ProjError, GridError) as error:
-            message = (
-                f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or mend the place"
-            )
+            message = f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or fix it"
             raise ConfigError(message) from error
 
     def pick(self, date: dt.date | None) -> Extract:
@@ -213,8 +209,6 @@ def list_region_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
 def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     """Find a region file by its id, or return the path of one; raise as `find_document` does.
 
-    Examples
-    --------
     >>> find_region_file("vadus")
     Traceback (most recent call last):
         ...

@@ -23,24 +23,12 @@ CO_CIRCULAR: Final = 1e-6  # sum of two cotangents that counts as 0, dimensionle
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bends:
-    """Bends of lines.
+    """Bends of lines."""
 
-    Parameters
-    ----------
-    en_m : ndarray of float64, shape (N, 2)
-        Place on the line, metres.
-    line : ndarray of int64, shape (N,)
-        Number of the line.
-    at_m : ndarray of float64, shape (N,)
-        Distance along it, metres.
-    inward : ndarray of float64, shape (N, 2)
-        Direction of the bisector of the two arms, towards the inside; any length.
-    """
-
-    en_m: Floats
-    line: Ints
-    at_m: Floats
-    inward: Floats
+    en_m: Floats  # shape (N, 2): place on the line, metres
+    line: Ints  # shape (N,): number of the line
+    at_m: Floats  # shape (N,): distance along it, metres
+    inward: Floats  # shape (N, 2): direction of the bisector of the two arms, towards the inside; any length
 
 
 def find_bends(
@@ -48,19 +36,11 @@ def find_bends(
 ) -> Bends:
     """Find where lines turn most, at most once within half a window; lines shorter than the window have no bend.
 
-    Parameters
-    ----------
-    en_m, at_m : ndarray of float64, shapes (P, 2) and (P,)
-        Vertices of all lines, one line after the other, and the distance of each along its line, metres.
-    first : ndarray of int64, shape (L + 1,)
-        Row where each line begins; the last entry is P.
-    step_m, smoothing_m, window_m : float
-        Spacing of the samples, length of the moving average, and length within which a bend turns, metres.
-    turn_deg : float
-        Least turn within the window.
+    `en_m` and `at_m`, shapes (P, 2) and (P,), are the vertices of all lines, one line after the other, and the distance
+    of each along its line; `first`, shape (L + 1,), is the row where each line begins, and P. `step_m` is the spacing
+    of the samples, `smoothing_m` the length of the moving average, `window_m` the length within which a bend turns by
+    `turn_deg`.
 
-    Examples
-    --------
     >>> corner = np.array([[0.0, 0.0], [200.0, 0.0], [200.0, 200.0]])
     >>> rules = {"step_m": 10.0, "smoothing_m": 60.0, "window_m": 120.0, "turn_deg": 45.0}
     >>> find_bends(corner, np.array([0.0, 200.0, 400.0]), np.array([0, 3]), **rules).en_m.tolist()
@@ -97,7 +77,7 @@ def find_bends(
     near = np.clip(near, start[:, None], last[:, None])
     turns = np.where(is_on_line, turn[near], 0.0)
     # A sharp corner turns the same in every window that holds it; the weights draw the peak to its middle.
-    # Rounded, so that of two equal samples the first is the peak whatever the last bits say.
+    # Rounded, so that the first of two equal samples is the peak in spite of rounding errors.
     score = np.abs(turns @ (1.0 - np.abs(offset) / (reach + 1))).round(6)
     rivals = np.where(is_on_line, score[near], -1.0)
     is_peak = (rivals.argmax(axis=1) == reach) & (np.abs(turns.sum(axis=1)) >= np.radians(turn_deg))
@@ -114,13 +94,7 @@ def centroids(shapes: Shapes) -> Floats:
 
 
 def long_sides(shapes: Shapes) -> Floats:
-    """Return the vector along the long side of each minimum rotated rectangle, shape (N, 2), metres; or NaN.
-
-    Examples
-    --------
-    >>> long_sides(np.array([shapely.box(0, 0, 3, 9)])).round(6).__abs__().tolist()
-    [[0.0, 9.0]]
-    """
+    """Return the vector along the long side of each minimum rotated rectangle, shape (N, 2), metres; or NaN."""
     boxes = np.asarray(shapely.oriented_envelope(shapes), dtype=object)
     found = np.flatnonzero(shapely.get_num_coordinates(boxes) == RING_CORNERS)
     sides = np.full((len(boxes), PLANE), np.nan)
@@ -133,8 +107,6 @@ def long_sides(shapes: Shapes) -> Floats:
 def groups_within(shapes: Shapes, gap_m: float) -> Ints:
     """Number the groups of shapes, shape (N,): shapes at most `gap_m` from each other share one.
 
-    Examples
-    --------
     >>> groups_within(shapely.box([0, 20, 99], 0, [9, 29, 109], 9), 15.0).tolist()
     [0, 0, 1]
     """
@@ -150,8 +122,6 @@ def groups_within(shapes: Shapes, gap_m: float) -> Ints:
 def touching_pairs(shapes: Shapes) -> Ints:
     """Return rows of shapes that touch or overlap, shape (K, 2), smaller row first.
 
-    Examples
-    --------
     >>> touching_pairs(shapely.box([0, 9, 99], 0, [9, 29, 109], 9)).tolist()
     [[0, 1]]
     """
@@ -173,8 +143,6 @@ def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:
     An edge that depends on the choice of the algorithm (a diagonal of four corners on one circle, as among houses on a
     lattice) is left out, so that the pairs turn with the places.
 
-    Examples
-    --------
     >>> delaunay_pairs(np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [0.0, 9.0]]), 60.0).tolist()
     [[0, 1], [0, 3], [1, 2], [2, 3]]
     """

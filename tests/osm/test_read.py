@@ -248,7 +248,7 @@ def test_a_history_is_read_as_it_was_on_a_day(year, roads, tmp_path):
 
 def test_a_history_without_a_day_is_refused(tmp_path):
     write_history(tmp_path / "h.osh.pbf")
-    with pytest.raises(ExtractError, match="say the date"), open_snapshot(tmp_path / "h.osh.pbf"):
+    with pytest.raises(ExtractError, match="give the date"), open_snapshot(tmp_path / "h.osh.pbf"):
         pass
 
 

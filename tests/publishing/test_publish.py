@@ -515,7 +515,7 @@ def test_files_of_ones_own_in_an_older_site_are_never_lost(own, mistake, tmp_pat
     (target / ".git").mkdir()
     (target / ".git" / "HEAD").touch()
     (target / "CNAME").touch()
-    lost = "2 files (.git/HEAD, CNAME) that would be lost, for nothing of it is part of a site: move that away"
+    lost = "2 files (.git/HEAD, CNAME) that would be lost and are not part of a site: move that away"
     assert lost in mistake("publish", "--board", own, "--into", target)
     del said["files"]
     (target / "site.json").write_text(json.dumps(said), encoding="utf-8")

@@ -248,19 +248,9 @@ def _industrial(sketch: Sketch) -> None:
     rail = [(-half, -0.08 * half), (half, 0.02 * half)]
     _railway(sketch, rail, tunnel_from_m=None)
     for offset in (12.0, 24.0):
-        sketch.line(
-            curve(
-                [
-                    (-0.7 * half, -0.05 * half),
-                    (-0.55 * half, -0.05 * half + offset),
-                    (0.5 * half, offset),
-                    (0.8 * half, 0.012 * half),
-                ],
-                step_m=30,
-            ),
-            railway="rail",
-            service="siding",
-        )
+        ends = [(-0.7 * half, -0.05 * half), (-0.55 * half, -0.05 * half + offset), (0.5 * half, offset)]
+        siding = curve([*ends, (0.8 * half, 0.012 * half)], step_m=30)
+        sketch.line(siding, railway="rail", service="siding")
     sketch.keep_free(shapely.linestrings(rail).buffer(34))
     through = shapely.linestrings([(-half, -0.42 * half), (half, -0.42 * half + 10)])
     for number, x in enumerate(np.linspace(-0.85, 0.85, 6) * half):
@@ -296,15 +286,7 @@ def _industrial(sketch: Sketch) -> None:
 def _riverside(sketch: Sketch) -> None:
     """Draw a meandering river with an island and bridges, streets on both banks, a railway into a tunnel."""
     half, rng = sketch.half_m, sketch.rng
-    river = curve(
-        [
-            (-1.3 * half, -0.35 * half),
-            (-0.75 * half, 0.1 * half),
-            (-0.1 * half, -0.12 * half),
-            (0.45 * half, 0.18 * half),
-            (1.3 * half, -0.1 * half),
-        ]
-    )
+    river = curve(half * np.array([(-1.3, -0.35), (-0.75, 0.1), (-0.1, -0.12), (0.45, 0.18), (1.3, -0.1)]))
     bed = shapely.linestrings(river).buffer(0.085 * half, cap_style="flat")
     island = affinity.rotate(
         affinity.scale(shapely.Point(-0.42 * half, 0.012 * half).buffer(0.032 * half), 2.6, 0.9), -14

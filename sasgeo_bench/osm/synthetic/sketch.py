@@ -133,14 +133,8 @@ def house(
     return shapely.Polygon(corners @ turn + np.array(centre))
 
 
-def curve(points: Sequence[Sequence[float]], *, step_m: float = 12.0) -> Line:
-    """Return a smooth line through points (Catmull-Rom), sampled about every `step_m` metres.
-
-    Examples
-    --------
-    >>> curve([(0, 0), (30, 0), (60, 0)], step_m=30.0).tolist()
-    [[0.0, 0.0], [30.0, 0.0], [60.0, 0.0]]
-    """
+def curve(points: Sequence[Sequence[float]] | Line, *, step_m: float = 12.0) -> Line:
+    """Return a smooth line through points (Catmull-Rom), sampled about every `step_m` metres."""
     given = np.asarray(points, dtype=np.float64)
     padded = np.vstack((2 * given[0] - given[1], given, 2 * given[-1] - given[-2]))
     pieces = []

@@ -3,7 +3,7 @@
 
 import datetime as dt
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,8 @@ from osmium.osm.mutable import Way as OsmWay
 from sasgeo_bench.errors import ExtractError
 from sasgeo_bench.osm.synthetic.morphology import Morphology, draw
 from sasgeo_bench.osm.synthetic.sketch import Line, Sketch, Tags, join_streets
+
+_ToLonLat = Callable[[float, float], tuple[float, float]]
 
 FIRST_DATE: Final = dt.date(2012, 1, 1)
 LAST_DATE: Final = dt.date(2026, 1, 1)
@@ -116,7 +118,6 @@ def _rng(plan: TownPlan, *purpose: object) -> np.random.Generator:
 
 @lru_cache(maxsize=8)  # several states of one town are written in a row
 def _things(plan: TownPlan) -> tuple[_Thing, ...]:
-    """Draw the town and give every object a life."""
     sketch = Sketch(half_m=plan.size_m / 2, rng=_rng(plan, "sketch"))
     draw(plan.morphology, sketch)
     drawn: list[tuple[tuple[Line, ...], Tags, str | None]] = [
@@ -235,23 +236,20 @@ def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
             previous = element[:2]
 
 
-def _to_lonlat(plan: TownPlan) -> "_ToLonLat":
+def _to_lonlat(plan: TownPlan) -> _ToLonLat:
+    """Return what converts metres from the centre to longitude and latitude, rounded as OSM stores them."""
     longitude_deg, latitude_deg = plan.center_lonlat
     crs = pyproj.CRS.from_proj4(
         f"+proj=tmerc +lat_0={latitude_deg} +lon_0={longitude_deg} +k=1 +x_0=0 +y_0=0 +datum=WGS84"
     )
-    return _ToLonLat(pyproj.Transformer.from_crs(crs, 4326, always_xy=True))
+    transformer = pyproj.Transformer.from_crs(crs, 4326, always_xy=True)
 
+    def to_lonlat(x_m: float, y_m: float) -> tuple[float, float]:
+        """Convert one place."""
+        lon_deg, lat_deg = transformer.transform(x_m, y_m)
+        return (round(lon_deg, 7), round(lat_deg, 7))
 
-class _ToLonLat:
-    """Convert metres from the centre to longitude and latitude, rounded as OSM stores them."""
-
-    def __init__(self, transformer: pyproj.Transformer) -> None:
-        self._transformer = transformer
-
-    def __call__(self, x_m: float, y_m: float) -> tuple[float, float]:
-        longitude_deg, latitude_deg = self._transformer.transform(x_m, y_m)
-        return (round(longitude_deg, 7), round(latitude_deg, 7))
+    return to_lonlat
 
 
 def _add(writer: osmium.SimpleWriter, element: _Element, to_lonlat: _ToLonLat) -> None:

@@ -25,22 +25,21 @@ TEXT: Final = "ageing.md"
 PLOT: Final = "ageing.svg"
 
 _READING: Final = f"""\
-Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g} or, where split or merged, by the ground
-they share; lines by the length within {NEAR_M:g} m of a line of the other map. Vanished is a share of the older amount,
-appeared of the newer: of the ground or length ("amount"), and of the number of things, each of which counts where more
-than half of it does. Small things make the two differ. Re-drawn is what was kept and moved by more than {REDRAWN_M:g} m
-(areas: their centroid, so an area that grew has moved too). Ground lost and gained is what the class no longer, or
-newly, covers. Rates are those of an exponential life whose end is known only to lie between two dates, by amount, with
-95 % intervals from 1,000 draws of blocks of 1 km. Of what vanished or appeared, some is retagged (another class of its
-kind gave or took its place), some tags tell to be the world's change (construction, demolished, a start date after the
-older map) or the map's catching up (a start date before); the rest cannot be told. A dash: nothing to measure, or a
-rate of dates less than {LEAST_DAYS} days apart; "all": no bound."""
+Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g} or, if split or merged, by the ground
+they share; lines by the length within {NEAR_M:g} m of a line of the other map. Vanished is a share of the older map,
+appeared of the newer: by amount (ground or length), and by number, which counts each thing of which more than half
+vanished or appeared. The two differ where things are small. Re-drawn is what was kept and moved by more than
+{REDRAWN_M:g} m (areas: their centroid, so an area that grew has moved too). Ground lost and gained is what the class no
+longer, or newly, covers. Rates are those of an exponential life whose end is known only to lie between two dates, by
+amount, with 95 % intervals from 1,000 draws of blocks of 1 km. Part of what vanished or appeared is retagged: another
+class of its kind replaced it, or was replaced. Tags attribute part to the world (construction, demolished, a start
+date after the older map) or to mapping that catches up (a start date before). The rest is untold (unexplained). A
+dash: nothing to measure, or a rate from dates less than {LEAST_DAYS} days apart; "all": no bound."""
 
 _BOTH_WAYS: Final = ("vanished", "vanished_number", "appeared", "appeared_number")
 _CONTROLS: Final = """\
-Pairs of maps so near in time that next to nothing can have changed: what is found here is not ageing but the floor of
-the method, mostly things that one extract was cut to hold and the other was not. Shares of the amount that vanished,
-appeared."""
+Pairs of maps so close in time that almost nothing can have changed. The shares of the amount that vanished, appeared
+are the noise floor of the method: mostly things that only one of the two extracts was cut to hold."""
 
 
 def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:

@@ -15,7 +15,7 @@ from sasgeo_bench.files.hashes import sha256_of
 from sasgeo_bench.files.json import read_json
 
 SITE: Final = "site"
-SITE_SAYS: Final = "site.json"  # without it a folder is no site, and is not replaced
+SITE_MANIFEST: Final = "site.json"  # without it a folder is no site, and is not replaced
 SITE_FOLDERS: Final = (SITE, f".{SITE}.partial", f".{SITE}.replaced")  # the last two if publishing was killed
 IMAGES: Final = (".webp", ".png", ".jpg", ".jpeg")
 FIGURE_FILES: Final = ("figures/*.svg", "figures/*.svg.gz")
@@ -23,7 +23,7 @@ PICTURE_FILES: Final = ("pictures/pictures.json", *(f"pictures/*{kind}" for kind
 _OLD_SITE: Final = ("*.html", "site.css", "site.js", "files/*", *FIGURE_FILES, *PICTURE_FILES)  # listed no files
 
 
-def led_to(path: Path) -> Path:
+def resolve_link(path: Path) -> Path:
     """Return the target of a symbolic link, any other path unchanged; raise `StoreError` if links form a circle."""
     try:
         return path.resolve() if path.is_symlink() else path
@@ -62,7 +62,7 @@ def hashes_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
     return {name: sha256_of(folder / name) for name in names}
 
 
-def differing(folder: Path, recorded: Mapping[str, str], *, without: Collection[str] = ()) -> str | None:
+def first_difference(folder: Path, recorded: Mapping[str, str], *, without: Collection[str] = ()) -> str | None:
     """Describe the first missing, unlisted or changed file of a folder, or return None."""
     there = list_files(folder, without=without)
     missing = sorted(set(recorded) - set(there))
@@ -98,13 +98,13 @@ def check_known(
 def check_site(folder: Path) -> None:
     """Refuse to replace a site that holds somebody else's files; raise `StoreError` naming them."""
     try:
-        known = read_json(folder / SITE_SAYS, mend="publish again")["files"]
+        known = read_json(folder / SITE_MANIFEST, mend="publish again")["files"]
     except (StoreError, KeyError, TypeError):
         known = None
     if isinstance(known, list):
-        check_known(folder, {SITE_SAYS, *map(str, known)}, "a site")
+        check_known(folder, {SITE_MANIFEST, *map(str, known)}, "a site")
     else:
-        check_known(folder, {SITE_SAYS}, "a site", patterns=_OLD_SITE)
+        check_known(folder, {SITE_MANIFEST}, "a site", patterns=_OLD_SITE)
 
 
 def check_room(folder: Path) -> None:

@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import SITE_FOLDERS, hashes_of, led_to, list_files
+from sasgeo_bench.files.file_manifest import SITE_FOLDERS, hashes_of, list_files, resolve_link
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_table, write_table
@@ -128,7 +128,7 @@ def write_pack(
         was there before is as it was.
     """
     check_replaced(folder)
-    folder = led_to(folder)
+    folder = resolve_link(folder)
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
             list_files(board, without=SITE_FOLDERS)  # a link would be followed to what it leads to

@@ -18,9 +18,9 @@ from sasgeo_bench.files.file_manifest import (
     check_known,
     check_room,
     check_site,
-    differing,
-    led_to,
+    first_difference,
     list_files,
+    resolve_link,
 )
 from sasgeo_bench.files.hashes import sha256_of
 from sasgeo_bench.leaderboard.archive_record import PackSaid, VersionSaid, parse_said
@@ -73,7 +73,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
             list_files(folder, without=SITE_FOLDERS)
             return said.model_dump()
         files = {**said.files, PACK: sha256_of(folder / PACK)}
-        fault = differing(folder, files, without=SITE_FOLDERS)
+        fault = first_difference(folder, files, without=SITE_FOLDERS)
         if fault is not None:
             message = f"{folder} differs from what {PACK} says ({one_line(fault)}): fetch the results again"
             raise StoreError(message)
@@ -112,7 +112,7 @@ def check_results(folder: Path, board: Path) -> None:
         If it holds something else, is a file or cannot be written, or one of the two would lie in the other.
     """
     check_replaced(folder)
-    mine, other = led_to(folder).absolute(), led_to(board).absolute()
+    mine, other = resolve_link(folder).absolute(), resolve_link(board).absolute()
     mine, other = mine.parent.resolve() / mine.name, other.parent.resolve() / other.name
     around = next((one for one in mine.parents if one == other or (one / BOARD).is_file()), None)
     if around is not None or mine == other or mine in other.parents:
@@ -122,7 +122,7 @@ def check_results(folder: Path, board: Path) -> None:
             else f"{folder} would take the place of the board {board}: name another folder"
         )
         raise StoreError(message)
-    check_room(led_to(folder))
+    check_room(resolve_link(folder))
 
 
 def check_replaced(folder: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Final
 from sasgeo_bench.ageing.ratebook_file import load_ratebook
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.file_manifest import SITE, led_to
+from sasgeo_bench.files.file_manifest import SITE, resolve_link
 from sasgeo_bench.leaderboard.board_files import LEADERBOARD
 from sasgeo_bench.leaderboard.board_schema import check_shape
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
@@ -67,7 +67,7 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
     if into is None and (board / SITE).is_symlink():
         message = f"{board / SITE} is a link: name where it leads with --into"
         raise StoreError(message)
-    target = board / SITE if into is None else led_to(into)
+    target = board / SITE if into is None else resolve_link(into)
     place, whole = target.parent.resolve() / target.name, board.resolve()
     if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
         message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"

@@ -17,7 +17,7 @@ import pyarrow as pa
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.file_manifest import IMAGES, SITE_FOLDERS, check_site, list_files
-from sasgeo_bench.files.file_manifest import SITE_SAYS as MANIFEST
+from sasgeo_bench.files.file_manifest import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame

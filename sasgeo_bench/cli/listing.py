@@ -5,7 +5,8 @@ from collections.abc import Mapping
 
 from rich.table import Table
 
-from sasgeo_bench.cli.console import RegionFolders, print_table
+from sasgeo_bench.cli.console import print_table
+from sasgeo_bench.cli.options import RegionFolders
 from sasgeo_bench.matching.plugins import MATCHERS, ORACLE, REJECTORS, list_entry_points
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE

@@ -2,13 +2,14 @@
 """Schema of classified geometry: a GeoDataFrame with one row per OSM object and semantic class."""
 
 import hashlib
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
-import pandas as pd
 import shapely
 
 from sasgeo_bench.errors import ShapeError
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 SEA: Final = "coastline"  # `osm_type` of sea: no object of OSM, but ground to the right of its coastlines
 # Column -> pandas dtype; `geometry` comes last. `width_m` is the drawn width of a line, NaN for an area.
@@ -27,7 +28,7 @@ DTYPES: Final = {
 }
 
 
-def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
+def make_features(columns: dict[str, object], *, epsg: int) -> "gpd.GeoDataFrame":
     """Build a feature table with the right column order and types.
 
     Parameters
@@ -52,6 +53,9 @@ def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
     >>> len(make_features({name: [] for name in (*DTYPES, "geometry")}, epsg=32632))
     0
     """
+    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+    import pandas as pd  # noqa: PLC0415
+
     missing = [name for name in (*DTYPES, "geometry") if name not in columns]
     if missing:
         message = f"a feature table needs the columns {missing!r} too"
@@ -62,7 +66,7 @@ def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
     return check_features(gpd.GeoDataFrame(table, geometry=gpd.GeoSeries(columns["geometry"], crs=epsg)))
 
 
-def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def check_features(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return the table unchanged if it is a feature table.
 
     Raises
@@ -92,7 +96,7 @@ def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     return features
 
 
-def fingerprint(features: gpd.GeoDataFrame) -> str:
+def fingerprint(features: "gpd.GeoDataFrame") -> str:
     """Hash what a table holds, whatever the order of its rows: types, ids, versions, classes and centroids.
 
     Coordinates are rounded to a millimetre, so another version of PROJ does not change the fingerprint.

@@ -14,7 +14,6 @@ from threading import Event, Thread
 from typing import Annotated, Final, Literal, Self
 from urllib.parse import urlsplit
 
-import pooch
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from sasgeo_bench.config import Document, Line
@@ -92,6 +91,8 @@ def cache_folder() -> Path:
     >>> cache_folder().name
     'sasgeo-bench'
     """
+    import pooch  # noqa: PLC0415 - only downloads need it
+
     return Path(pooch.os_cache("sasgeo-bench"))
 
 
@@ -167,6 +168,8 @@ def _check_hash(path: Path, extract: Extract, source: str) -> None:
 
 def _download(extract: Extract, url: str) -> Path:
     """Download into the cache; the file gets its name only when its hash is one of those accepted."""
+    import pooch  # noqa: PLC0415 - only downloads need it
+
     if not answers(url):
         message = f"{url} cannot be reached"
         raise ExtractError(message)
@@ -209,6 +212,8 @@ def answers(url: str) -> bool:
 
 @cache
 def _server_answers(server: str) -> bool:
+    import pooch  # noqa: PLC0415 - only downloads need it
+
     found = Event()
 
     def ask() -> None:

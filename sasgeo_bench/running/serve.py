@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import psutil
 
@@ -74,11 +74,12 @@ class Server:
         if message["kind"] == "learn":
             return _learn(self.matcher, message, blob)
         if message["kind"] == "prepare":
-            region = read_region(Path(message["region"]))
-            before, start = _resident_bytes(), time.perf_counter()
-            self.matcher.prepare(region, message["learned"])
-            seconds = time.perf_counter() - start
-            return {"status": "ok", "seconds": seconds, "grown_bytes": max(0, _resident_bytes() - before)}
+            reading = _Cost()
+            region = read_region(Path(message["region"]), around=lambda: reading)
+            with (preparing := _Cost()):
+                self.matcher.prepare(region, message["learned"])
+            grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
+            return {"status": "ok", "seconds": preparing.seconds - reading.seconds, "grown_bytes": grown_bytes}
         query = query_from(blob)
         start, start_cpu = time.perf_counter(), time.process_time()
         found = self.matcher.match(query, top_k=message["top_k"])
@@ -89,6 +90,23 @@ class Server:
             "cpu_s": cpu_s,
             "match": match_row(check_match(found, query, top_k=message["top_k"])),
         }
+
+
+class _Cost:
+    """Seconds by the clock, and resident bytes that this process has grown by, while it is entered."""
+
+    def __init__(self) -> None:
+        self.seconds, self.grown_bytes = 0.0, 0
+
+    def __enter__(self) -> Self:
+        """Begin to count."""
+        self._before, self._start = _resident_bytes(), time.perf_counter()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Add what it took."""
+        self.seconds += time.perf_counter() - self._start
+        self.grown_bytes += _resident_bytes() - self._before
 
 
 def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import ast
 import inspect
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 import sasgeo_bench as sgb
 from sasgeo_bench.cli.program import load
 from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.regions.region_files import read_region
 
 ROOT = Path(__file__).parents[1]
 STUB = ast.parse((ROOT / "sasgeo_bench" / "__init__.pyi").read_text(encoding="utf-8"))
@@ -101,3 +103,33 @@ def test_a_dry_run_returns_the_folders_and_writes_none(tmp_path):
     assert folders == (tmp_path / "regions/town-grid", tmp_path / "regions/town-suburb")
     assert "town-suburb" in plan[0]
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("code", "unused"),
+    [
+        ("sasgeo_bench.running.serve", {"pandas", "geopandas", "rasterio", "pyproj", "scipy", "matplotlib"}),
+        ("sasgeo_bench.cli.listing", {"numpy", "pandas", "pydantic"}),
+        ("sasgeo_bench.cli.regions", {"matplotlib", "scipy.optimize"}),
+    ],
+)
+def test_a_process_imports_slow_libraries_only_where_it_uses_them(code, unused):
+    code = f"import sys, {code}; print({unused!r} & set(sys.modules))"
+    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)  # noqa: S603 - our own
+    assert ended.stdout == "set()\n"
+
+
+def test_features_and_graph_of_a_stored_region_are_read_when_they_are_first_asked_for(towns):
+    entered = []
+
+    @contextmanager
+    def around():
+        entered.append("read")
+        yield
+
+    region = read_region(towns / "regions/town-grid", around=around)
+    assert region.layers.any()
+    assert entered == []
+    assert region.graph.nodes is region.graph.nodes
+    assert region.features is region.features
+    assert entered == ["read", "read"]

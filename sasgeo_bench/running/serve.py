@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a matcher's process does once it is shut in: load, learn, prepare, match; every failure becomes a message."""
+"""Serve a runner inside the sandbox: load, learn, prepare, match; every failure becomes a message."""
 
 import errno
 import hashlib
@@ -121,7 +121,7 @@ def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, 
 
 
 class Maps(Mapping[str, Region]):
-    """Regions that are read when they are asked for: all those of a split at once would not fit into memory.
+    """Regions read on demand: all of a split at once would not fit into memory.
 
     Examples
     --------
@@ -134,7 +134,7 @@ class Maps(Mapping[str, Region]):
         self._kept: OrderedDict[str, Region] = OrderedDict()
 
     def __getitem__(self, name: str) -> Region:
-        """Read a map, or give the one that was asked for a moment ago."""
+        """Read a map, or return it from the cache."""
         folder = self._folders[name]
         if name not in self._kept:
             while len(self._kept) >= MOST_MAPS:
@@ -144,15 +144,15 @@ class Maps(Mapping[str, Region]):
         return self._kept[name]
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a map of that name, without reading it."""
+        """True if there is a map of that name; reads nothing."""
         return name in self._folders
 
     def __iter__(self) -> Iterator[str]:
-        """Names, without reading anything."""
+        """Iterate over the names; reads nothing."""
         return iter(self._folders)
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of maps."""
         return len(self._folders)
 
 
@@ -186,7 +186,7 @@ def code_hash(matcher: Matcher) -> str:
 
 
 def _resident_bytes() -> int:
-    """Of this process, under the number that /proc knows it by: in a namespace it may have another for itself."""
+    """Resident memory of this process, by its number in /proc: in a namespace its own number differs."""
     try:
         number = int(os.readlink("/proc/self"))  # noqa: PTH115 - no file, a number
     except OSError:
@@ -195,7 +195,7 @@ def _resident_bytes() -> int:
 
 
 def match_row(match: Match) -> dict[str, Any]:
-    """A checked answer as plain numbers."""
+    """Turn a checked answer into plain numbers."""
     return {
         "candidates": [
             [pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale, score]

@@ -2,6 +2,11 @@
 # The public names, and where each comes from: for type checkers, and for `lazy_loader`, which reads them here.
 
 from .bounds import MOST_CANDIDATES as MOST_CANDIDATES
+from .cli.boards import score as score
+from .cli.publishing import publish as publish
+from .cli.queries import make_tasks as make_tasks
+from .cli.regions import build_region as build_region
+from .cli.runs import run as run
 from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior

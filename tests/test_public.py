@@ -2,14 +2,18 @@
 """The public names: each is there, none costs anything before it is asked for, and plugins need no others."""
 
 import ast
+import inspect
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 import sasgeo_bench as sgb
+from sasgeo_bench.cli.program import load
 from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.regions.region_files import read_region
 
 ROOT = Path(__file__).parents[1]
 STUB = ast.parse((ROOT / "sasgeo_bench" / "__init__.pyi").read_text(encoding="utf-8"))
@@ -51,3 +55,81 @@ def test_a_new_plugin_begins_with_public_names_alone():
     files = plugin_files("my-matcher")
     assert not [name for path, text in files.items() if path.endswith(".py") for name in inner_imports(text)]
     assert any("from sasgeo_bench import" in text for text in files.values())
+
+
+STEPS = {
+    "build-region": "build_region",
+    "make-queries": "make_tasks",
+    "run": "run",
+    "score": "score",
+    "publish": "publish",
+}
+NOT_FLAGS = ("say", "tell", "progress")  # where lines go, and what counts
+
+
+@pytest.mark.parametrize(("command", "function"), STEPS.items())
+def test_a_function_takes_the_words_of_the_flags_of_its_command(command, function):
+    flags = {item.name: item for item in load(command).params}
+    words = inspect.signature(getattr(sgb, function)).parameters
+    assert list(words) == [*flags, *NOT_FLAGS]
+    for name, flag in flags.items():
+        assert flag.param_type_name == "argument" or f"--{name.replace('_', '-')}" in flag.opts
+        assert flag.required == (words[name].default is inspect.Parameter.empty)
+        assert flag.required or flag.default in (words[name].default, str(words[name].default))
+        assert f"\n{name} : " in getattr(sgb, function).__doc__
+
+
+def test_a_town_is_driven_from_region_to_site_by_functions_alone(tmp_path, capfd):
+    out, notes = tmp_path / "out", []
+    (folder,) = sgb.build_region("town-grid", out=out)
+    region = sgb.read_region(folder)
+    assert region.layers.any()
+    tasks = sgb.make_tasks(suite="clean", regions="town-grid", n=2, out=str(out))
+    assert tasks == (out / "tasks/clean/town-grid",)
+    for matcher in (names := {"oracle_pose", "prior_centre"}):
+        report = sgb.run(matcher=matcher, tasks=tasks, out=out, tell=notes.append)
+        assert report.counts == {"ok": len(list(sgb.read_queries(tasks[0])))}
+    assert any("ok" in line for line in notes)
+    board = sgb.score(predictions=out / "runs", draws=100, cases=False, out=out)
+    assert set(board.scores) == names
+    site = sgb.publish(board=out / "boards/board", into=tmp_path / "site")
+    assert (site.folder / "index.html").is_file()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_dry_run_returns_the_folders_and_writes_none(tmp_path):
+    plan = []
+    folders = sgb.build_region(["town-grid", "town-suburb"], out=tmp_path, dry_run=True, say=plan.append)
+    assert folders == (tmp_path / "regions/town-grid", tmp_path / "regions/town-suburb")
+    assert "town-suburb" in plan[0]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("code", "unused"),
+    [
+        ("sasgeo_bench.running.serve", {"pandas", "geopandas", "rasterio", "pyproj", "scipy", "matplotlib"}),
+        ("sasgeo_bench.cli.listing", {"numpy", "pandas", "pydantic"}),
+        ("sasgeo_bench.cli.regions", {"matplotlib", "scipy.optimize"}),
+    ],
+)
+def test_a_process_imports_slow_libraries_only_where_it_uses_them(code, unused):
+    code = f"import sys, {code}; print({unused!r} & set(sys.modules))"
+    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)  # noqa: S603 - our own
+    assert ended.stdout == "set()\n"
+
+
+def test_features_and_graph_of_a_stored_region_are_read_when_they_are_first_asked_for(towns):
+    entered = []
+
+    @contextmanager
+    def around():
+        entered.append("read")
+        yield
+
+    region = read_region(towns / "regions/town-grid", around=around)
+    assert region.layers.any()
+    assert entered == []
+    assert region.graph.nodes is region.graph.nodes
+    assert region.features is region.features
+    assert entered == ["read", "read"]

@@ -1,23 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that score predictions and publish what came of them."""
+"""Score predictions and carry out experiments: the function and the commands."""
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import (
-    ExtractFolders,
-    Out,
-    RegionFolders,
-    print_table,
-    say,
-    shown_progress,
-    tell,
-)
+from sasgeo_bench.cli.console import print_table, say, shown_progress, tell
+from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
@@ -74,67 +67,100 @@ Private = Annotated[
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
-def score_command(  # noqa: PLR0913 - a command has as many flags as its users need
-    *,
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions(Options):
+    """Flags of score."""
+
     predictions: Annotated[
         list[Path],
         typer.Option(help="folder with runs in it or of stored results, or file of predictions; may be repeated"),
-    ],
+    ]
     tasks: Annotated[
         list[Path] | None, typer.Option(help="task folder; may be repeated; default: all that are answered")
-    ] = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="folder of the truths, beside the tasks; default: OUT/truth")
-    ] = None,
-    name: Annotated[str, typer.Option(help="of the board: OUT/boards/NAME")] = "board",
+    ] = None
+    truth: Annotated[Path | None, typer.Option(help="folder of the truths, beside the tasks; default: OUT/truth")] = (
+        None
+    )
+    name: Annotated[str, typer.Option(help="of the board: OUT/boards/NAME")] = "board"
     split: Annotated[
         str | None,
         typer.Option(
             help="id of a shipped split, or a file of your own (*.toml); default: crossfit, or that of stored results"
         ),
-    ] = None,
-    rejector: Rejectors = None,
-    submissions: Submissions = None,
-    private: Private = None,
-    region_folders: RegionFolders = None,
+    ] = None
+    rejector: Rejectors = None
+    submissions: Submissions = None
+    private: Private = None
+    region_files: RegionFolders = None
     without: Annotated[
         list[str] | None, typer.Option(help="region whose queries are left out, on each of its maps; may be repeated")
-    ] = None,
+    ] = None
     draws: Annotated[
         int | None,
         typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
-    ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="processes that fit rejectors")] = 1,
-    results: Results = None,
-    cases: Cases = True,
-    out: Out = Path("out"),
-) -> None:
-    """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
-    _check_names(name, truth)
-    submitted = submissions_for(board_of(predictions), submissions, tell=tell) if submissions else ()
+    ] = None
+    jobs: Annotated[int, typer.Option(min=1, help="processes that fit rejectors")] = 1
+    results: Results = None
+    cases: Cases = True
+    out: Out = Path("out")
+
+
+@takes(ScoreOptions)
+def score(options: ScoreOptions) -> Board:
+    """Score predictions against the truths and write a board: `out/boards/<name>/leaderboard.parquet` and more.
+
+    Returns
+    -------
+    Board
+        `table` is the leaderboard, `scores` the row of each query by matcher, `verdicts` say which controls hold.
+
+    Raises
+    ------
+    ConfigError
+        If a name is not sound, or nothing is left to score.
+    StoreError
+        If predictions, tasks or truths are missing or damaged.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> board = sgb.score(predictions="out/runs", name="mine", jobs=2)  # doctest: +SKIP
+    >>> board.table[["matcher", "track", "recall_1"]]  # doctest: +SKIP
+    """
+    _check_names(options.name, options.truth)
+    submissions = options.submissions
+    submitted = submissions_for(board_of(options.predictions), submissions, tell=options.tell) if submissions else ()
     usual = request_of(
-        predictions,
-        board=out / "boards" / name,
-        root=out if truth is None else truth.resolve().parent,
-        split=split,
-        folders=region_folders or (),
-        rejectors=rejector or (),
+        options.predictions,
+        board=options.out / "boards" / options.name,
+        root=options.out if options.truth is None else options.truth.resolve().parent,
+        split=options.split,
+        folders=options.region_files or (),
+        rejectors=options.rejector or (),
     )
     request = replace(
         usual,
-        tasks=tasks or (),
-        truth=truth,
-        draws=draws or usual.draws,
-        without=without or (),
+        tasks=options.tasks or (),
+        truth=options.truth,
+        draws=options.draws or usual.draws,
+        without=options.without or (),
         submissions=submitted,
-        private=private,
-        jobs=jobs,
+        private=options.private,
+        jobs=options.jobs,
     )
+    return score_all(
+        request, tell=options.tell, progress=options.progress, has_cases=options.cases, results=options.results
+    )
+
+
+def score_command(options: ScoreOptions) -> None:
+    """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
     with shown_progress() as progress:
-        board = score_all(request, tell=tell, progress=progress, has_cases=cases, results=results)
+        board = score(**vars(options) | {"tell": tell, "progress": progress})
     show_board(board)
-    say(request.board)
-    tell(_how_to_publish(request.board))
+    folder = options.out / "boards" / options.name
+    say(folder)
+    tell(_how_to_publish(folder))
     _check_controls(board)
 
 
@@ -147,47 +173,54 @@ def _check_names(name: str, truth: Path | None) -> None:
         raise ConfigError(message)
 
 
-def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its users need
-    pipeline: Annotated[str, typer.Argument(help="id of a shipped pipeline, or a file of your own (*.toml)")],
-    *,
+@dataclass(frozen=True, kw_only=True)
+class LeaderboardOptions(Options):
+    """Flags of leaderboard."""
+
+    pipeline: Annotated[str, typer.Argument(help="id of a shipped pipeline, or a file of your own (*.toml)")]
     matcher: Annotated[
         list[str] | None,
         typer.Option(help="one more than the file names: a name, or module:Class; may be repeated"),
-    ] = None,
-    extracts: ExtractFolders = None,
-    region_folders: RegionFolders = None,
-    jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1,
-    dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None,
-    seed_file: SeedFile = None,
-    private: Private = None,
-    results: Results = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")
-    ] = False,
-    cases: Cases = True,
-    out: Out = Path("out"),
-) -> None:
-    """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
-    spec = read_pipeline_file(find_pipeline_file(pipeline))
-    plan = plan_pipeline(
-        spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(matcher or ()))))}),
-        out=out,
-        tell=tell,
-        extract_folders=tuple(extracts or ()),
-        region_folders=tuple(region_folders or ()),
-        jobs=jobs,
-        dask=dask,
-        private=private_seed(seed_file),
+    ] = None
+    extracts: ExtractFolders = None
+    region_files: RegionFolders = None
+    jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1
+    dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None
+    seed_file: SeedFile = None
+    private: Private = None
+    results: Results = None
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")] = (
+        False
     )
-    if dry_run:
+    cases: Cases = True
+    out: Out = Path("out")
+
+
+def leaderboard_command(options: LeaderboardOptions) -> None:
+    """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
+    spec = read_pipeline_file(find_pipeline_file(options.pipeline))
+    plan = plan_pipeline(
+        spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
+        out=options.out,
+        tell=tell,
+        extract_folders=tuple(options.extracts or ()),
+        region_folders=tuple(options.region_files or ()),
+        jobs=options.jobs,
+        dask=options.dask,
+        private=private_seed(options.seed_file, tell=tell),
+    )
+    if options.dry_run:
         say(plan.to_text())
         return
+    results, private = options.results, options.private
     if plan.private is not None and (results is not None or private is not None):
         check_public(seed_said(plan.private), str(board_folder(plan)))
     if private is not None:
         read_private(private, plan.spec.said)
     with shown_progress() as progress:
-        board = run_pipeline(plan, tell=tell, progress=progress, results=results, has_cases=cases, private=private)
+        board = run_pipeline(
+            plan, tell=tell, progress=progress, results=results, has_cases=options.cases, private=private
+        )
     show_board(board)
     say(board_folder(plan))
     if plan.private is not None:
@@ -195,8 +228,9 @@ def leaderboard_command(  # noqa: PLR0913 - a command has as many flags as its u
         _check_controls(board)
         return
     tell(_how_to_publish(board_folder(plan)))
-    if not matcher:
-        tell(f"next: sasgeo-bench leaderboard {pipeline} --matcher NAME adds one of yours (new-matcher begins one)")
+    if not options.matcher:
+        more = f"sasgeo-bench leaderboard {options.pipeline} --matcher NAME"
+        tell(f"next: {more} adds one of yours (new-matcher begins one)")
     _check_controls(board)
 
 

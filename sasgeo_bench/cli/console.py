@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all commands share: the two outlets, the common options, and reading what was typed."""
+"""The two outlets of a command, progress bars, and reading of dates."""
 
 import datetime as dt
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Final, Self
+from typing import Any, Final, Self
 
 import typer
 from rich.console import Console
@@ -31,19 +30,6 @@ class _PlainConsole(Console):
 
 
 errors = _PlainConsole(stderr=True, soft_wrap=True, highlight=False)
-
-Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
-RegionFolders = Annotated[
-    list[Path] | None,
-    typer.Option("--region-files", "--regions", help="folder with region files of your own; may be repeated"),
-]
-OwnRegionFolders = Annotated[  # of commands whose --regions are ids
-    list[Path] | None, typer.Option("--region-files", help="folder with region files of your own; may be repeated")
-]
-ExtractFolders = Annotated[
-    list[Path] | None,
-    typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
-]
 
 
 def read_date(text: str | None) -> dt.date | None:

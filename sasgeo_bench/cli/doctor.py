@@ -5,8 +5,9 @@ from pathlib import Path
 
 from rich.table import Table
 
-from sasgeo_bench.cli.console import ExtractFolders, Out, print_table
+from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.environment import examine
+from sasgeo_bench.cli.options import ExtractFolders, Out
 
 
 def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:

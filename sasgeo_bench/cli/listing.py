@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that list what there is."""
+"""List regions, suites, matchers and rejectors; each command imports what it lists."""
 
 from collections.abc import Mapping
 
 from rich.table import Table
 
-from sasgeo_bench.cli.console import RegionFolders, print_table
+from sasgeo_bench.cli.console import print_table
+from sasgeo_bench.cli.options import RegionFolders
 from sasgeo_bench.matching.plugins import MATCHERS, ORACLE, REJECTORS, list_entry_points
-from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
 
 def list_regions_command(regions: RegionFolders = None) -> None:
     """List the regions that come with the package, and your own."""
+    from sasgeo_bench.regions.region_spec import list_region_files, read_region_file  # noqa: PLC0415
+
     table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
     for name, path in sorted(list_region_files(folders=regions or ()).items()):
         spec = read_region_file(path)
@@ -26,6 +27,8 @@ def list_regions_command(regions: RegionFolders = None) -> None:
 
 def list_suites_command() -> None:
     """List the suites: what each does and what it separates."""
+    from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE  # noqa: PLC0415
+
     table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
     for name, suite in EVERY_SUITE.items():
         card = suite.card

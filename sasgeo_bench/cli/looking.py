@@ -7,7 +7,8 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, Out, RegionFolders, print_table, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
+from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.case_plot import case_pixels
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.cli.console import EXIT_USER, say, tell
+from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
 
 EXIT_INTERRUPTED: Final = 130
@@ -75,7 +76,7 @@ def load(name: str) -> Any:  # noqa: ANN401 - typer makes its commands of a clas
     """The command of a name, as typer makes it of the function behind it."""
     file = next(group[name] for group in COMMANDS.values() if name in group)
     alone = typer.Typer(add_completion=False)
-    alone.command(name)(getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name)))
+    alone.command(name)(with_flags(getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name))))
     return typer.main.get_command(alone)
 
 

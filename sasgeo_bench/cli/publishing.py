@@ -1,34 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that publishes a board."""
+"""Publish a board as a site: the function and its command."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import Out, say, tell
+from sasgeo_bench.cli.console import say, tell
+from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.publishing import build
 from sasgeo_bench.publishing.archive import board_of
-from sasgeo_bench.publishing.build import publish
+from sasgeo_bench.publishing.site_files import Written
 from sasgeo_bench.publishing.submissions import with_submissions
 
 
-def publish_command(
-    *,
-    board: Annotated[Path, typer.Option(help="folder of a board (OUT/boards/<name>), or of stored results")],
-    into: Annotated[Path | None, typer.Option(help="folder to write; default: site in the board's folder")] = None,
+@dataclass(frozen=True, kw_only=True)
+class PublishOptions(Options):
+    """Flags of publish."""
+
+    board: Annotated[Path, typer.Option(help="folder of a board (OUT/boards/<name>), or of stored results")]
+    into: Annotated[Path | None, typer.Option(help="folder to write; default: site in the board's folder")] = None
     submissions: Annotated[
         list[Path] | None,
         typer.Option(
             help="a submission, or a folder of them, to be scored with stored results first: OUT/boards/<id>; may be "
             "repeated"
         ),
-    ] = None,
-    out: Out = Path("out"),
-) -> None:
+    ] = None
+    out: Out = Path("out")
+
+
+@takes(PublishOptions)
+def publish(options: PublishOptions) -> Written:
+    """Make the static site of a board: plain files that open without a server.
+
+    Returns
+    -------
+    Written
+        `folder` is where the site is; `index.html` in it is the first page.
+
+    Raises
+    ------
+    StoreError
+        If there is no sound board, or the site cannot be written; an older site is then as it was.
+    ConfigError
+        If the board is of a private seed.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.publish(board="out/boards/demo", into="out/boards/demo/figures")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: out/boards/demo/figures is the board itself, or would be a strange folder in it: \
+name another one with --into
+    """
+    board = options.board
+    if options.submissions:
+        board = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
+        with_submissions(options.board, options.submissions, board, tell=options.tell)
+    return build.publish(board, options.into, tell=options.tell)
+
+
+def publish_command(options: PublishOptions) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
-    if submissions:
-        stored, board = board, out / "boards" / (board_of([board]) or board.resolve().name)
-        with_submissions(stored, submissions, board, tell=tell)
-    written = publish(board, into, tell=tell)
+    written = publish(**vars(options) | {"say": say, "tell": tell})
     tell(written.to_text())
     say(written.folder / "index.html")

@@ -1,90 +1,124 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that draw queries and list the suites they are drawn by."""
+"""Draw queries: the function and its command."""
 
+from dataclasses import dataclass
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import (
-    ExtractFolders,
-    Out,
-    OwnRegionFolders,
-    say,
-    tell,
-)
+from sasgeo_bench.cli.console import say, tell
+from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.parallel import spread
-from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
 
-def make_queries_command(  # noqa: PLR0913 - a command has as many flags as its users need
-    *,
+@dataclass(frozen=True, kw_only=True)
+class QueryOptions(Options):
+    """Flags of make-queries."""
+
     suite: Annotated[
         list[str] | None, typer.Option(help="name from list-suites; may be repeated; default: all but controls")
-    ] = None,
+    ] = None
     regions: Annotated[
         list[str] | None,
         typer.Option(
             "--regions", help="id from list-regions, or own file; may be repeated; default: all that can be built"
         ),
-    ] = None,
-    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit",
-    n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8,
-    seed: Annotated[int | None, typer.Option(help="public seed, the root of all chance; default: 0")] = None,
-    seed_file: SeedFile = None,
-    prior: Annotated[
-        str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")
-    ] = None,
-    extracts: ExtractFolders = None,
-    region_folders: OwnRegionFolders = None,
-    out: Out = Path("out"),
-    up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False,
-    skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="regions at once")] = 1,
-) -> None:
-    """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
-    private = private_seed(seed_file, public=seed)
-    wanted = Wanted(
-        suites=tuple(suite or SUITES),
-        regions=tuple(regions or ()),
-        split=split,
-        count=n,
-        seed=private or seed or 0,
-        group=PriorGroup.parse(prior) if prior else None,
-        extract_folders=tuple(extracts or ()),
-        region_folders=tuple(region_folders or ()),
-        out=root_of(out, private),
-        may_be_fewer=up_to,
+    ] = None
+    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit"
+    n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8
+    seed: Annotated[int | None, typer.Option(help="public seed, the root of all chance; default: 0")] = None
+    seed_file: SeedFile = None
+    prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
+        None
     )
-    requests = plan_requests(wanted, tell=tell)
-    if dry_run:
+    extracts: ExtractFolders = None
+    region_files: OwnRegionFolders = None
+    out: Out = Path("out")
+    up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False
+    skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
+    jobs: Annotated[int, typer.Option(min=1, help="regions at once")] = 1
+
+
+@takes(QueryOptions)
+def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
+    """Draw the queries of suites on regions, and their truths; regions that are not built yet are built.
+
+    Returns
+    -------
+    tuple of Path
+        Task folders, `out/tasks/<suite>/<region>`; the truths lie in `out/truth/<suite>/<region>`.
+
+    Raises
+    ------
+    ConfigError
+        If a suite, region or split is unknown, or a region cannot carry a suite (unless `skip`).
+    ExtractError
+        If a region cannot be built since its extract is missing.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> folders = sgb.make_tasks(suite="clean", regions="town-grid", n=4, dry_run=True, say=print)
+    clean on town-grid: at most 4 sites, 112 queries, out/tasks/clean/town-grid
+    """
+    private = private_seed(options.seed_file, public=options.seed, tell=options.tell)
+    wanted = Wanted(
+        suites=tuple(options.suite or SUITES),
+        regions=tuple(options.regions or ()),
+        split=options.split,
+        count=options.n,
+        seed=private or options.seed or 0,
+        group=PriorGroup.parse(options.prior) if options.prior else None,
+        extract_folders=tuple(options.extracts or ()),
+        region_folders=tuple(options.region_files or ()),
+        out=root_of(options.out, private),
+        may_be_fewer=options.up_to,
+    )
+    requests = plan_requests(wanted, tell=options.tell)
+    if options.dry_run:
         for item in requests:
-            per_site = len(find_suite(item.suite).variants) * len(find_suite(item.suite).card.tracks)
-            folder = item.out / "tasks" / item.suite / item.region.id
-            most = f"at most {item.count} sites, {item.count * per_site} queries"
-            say(f"{item.suite} on {item.region.id}: {most}, {folder}")
-        return
-    by_region: dict[str, list[Request]] = {}
-    for item in requests:
-        by_region.setdefault(item.region.id, []).append(item)
-    work = partial(_make_all, skip=skip)
-    for _ in spread(work, list(by_region.values()), jobs=jobs):
-        pass
+            options.say(_in_words(item))
+        return tuple(map(_folder, requests))
+    by_region = [list(items) for _, items in groupby(requests, key=lambda item: item.region.id)]
+    made = spread(partial(_make_all, skip=options.skip, tell=options.tell), by_region, jobs=options.jobs)
+    return tuple(folder for folders in made for folder in folders)
 
 
-def _make_all(requests: list[Request], *, skip: bool) -> None:
+def make_queries_command(options: QueryOptions) -> None:
+    """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
+    make_tasks(**vars(options) | {"say": say, "tell": tell})
+
+
+def _folder(request: Request) -> Path:
+    return request.out / "tasks" / request.suite / request.region.id
+
+
+def _in_words(request: Request) -> str:
+    suite = find_suite(request.suite)
+    queries = request.count * len(suite.variants) * len(suite.card.tracks)
+    most = f"at most {request.count} sites, {queries} queries"
+    return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
+
+
+def _make_all(requests: list[Request], *, skip: bool, tell: Tell) -> list[Path]:
     """Make the tasks of one region in turn."""
+    folders = []
     for request in requests:
         try:
-            make_tasks(request, tell=tell)
+            folders += [made.folder for made in build.make_tasks(request, tell=tell)]
         except ConfigError as error:
             if not skip:
                 raise
             tell(f"{request.suite} on {request.region.id}: passed over, {error}")
+    return folders

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The private seed as a command takes it."""
+"""Read the private seed that a command is given."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import tell
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.progress import Tell
 from sasgeo_bench.tasks.private_seed import LEAST_BITS, REPRODUCING_BITS, PrivateSeed
 from sasgeo_bench.tasks.seed_file import VARIABLE, take_seed
 from sasgeo_bench.tasks.task_plan import PRIVATE_ROOT
@@ -21,7 +21,7 @@ SeedFile = Annotated[
 ]
 
 
-def private_seed(file: Path | None, *, public: int | None = None) -> PrivateSeed | None:
+def private_seed(file: Path | None, *, tell: Tell, public: int | None = None) -> PrivateSeed | None:
     """Take the private seed of a file or of the environment, and say what is to be known of it; None without one."""
     seed = take_seed(file)
     if seed is None:

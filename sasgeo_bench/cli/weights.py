@@ -10,7 +10,8 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import Out, print_table, say
+from sasgeo_bench.cli.console import print_table, say
+from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.lookalike import SIDE_M, find_lookalike, sheet_of
 from sasgeo_bench.leaderboard.lookalike_plot import draw_lookalike

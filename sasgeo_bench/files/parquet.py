@@ -12,13 +12,15 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CHECKED: Final[Mapping[str, Any]] = {"compression": "zstd", "write_page_checksum": True}
 VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
@@ -52,14 +54,14 @@ def write_table(table: pa.Table, path: Path, *, row_group_size: int | None = Non
         writer.write_table(table, row_group_size)
 
 
-def write_frame(frame: pd.DataFrame, path: Path, *, attrs: Mapping[str, Any], **metadata: str) -> None:
+def write_frame(frame: "pd.DataFrame", path: Path, *, attrs: Mapping[str, Any], **metadata: str) -> None:
     """Write a data frame with checksums, its `attrs`, and further metadata of the file."""
     table = pa.Table.from_pandas(frame, preserve_index=False)
     about = {**(table.schema.metadata or {}), **metadata, _ATTRS: json.dumps(attrs)}
     write_table(table.replace_schema_metadata(about), path)
 
 
-def read_frame(path: Path, *, mend: str) -> pd.DataFrame:
+def read_frame(path: Path, *, mend: str) -> "pd.DataFrame":
     """Read the output of `write_frame`, with its `attrs`; raise as `open_table` does."""
     table = read_table(path, mend=mend, most_rows=MOST_VALUES)
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a matcher has learnt on disk: a text for people to read, and what `run.json` says of it."""
+"""Learned text of a matcher on disk, and its record in `run.json`."""
 
 import os
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ FOLDER: Final = "learned"  # beside the suites of a run
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearnedSaid:
-    """What `run.json` says of learning.
+    """Record of a training in `run.json`.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def learned_path(run: Path, lesson_sha256: str) -> Path:
 
 
 def read_learned(path: Path) -> str | None:
-    """What was learnt before, or None where nothing was.
+    """Read the learned text; None where there is none.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The door: what a matcher is, what it says of itself, and what it answers."""
+"""Interface of a matcher: its methods, its card, and its answers."""
 
 import math
 import re
@@ -25,7 +25,7 @@ SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatcherCard:
-    """What a matcher says of itself; printed on the board beside its row.
+    """Description of a matcher, printed on the board beside its row.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ WITHHELD: Final = Match(poses=(), scores=(), confidence=0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Training:
-    """What a matcher may learn from: maps, queries and truths of places that it is not asked about.
+    """Training data of a matcher: maps, queries and truths of places that it is not asked about.
 
     Parameters
     ----------

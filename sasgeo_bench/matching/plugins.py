@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding plugins: by name through entry points, or by module:Class; built-in ones win a clash of names."""
+"""Find plugins by the name of an entry point, or by module:Class; built-in ones win a clash of names."""
 
 import difflib
 import importlib
@@ -7,12 +7,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from importlib.metadata import Distribution, EntryPoint, entry_points
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matching.matcher import Matcher, MatcherCard
-from sasgeo_bench.matching.rejector import Rejector, RejectorCard
+
+if TYPE_CHECKING:
+    from sasgeo_bench.matching.matcher import Matcher
+    from sasgeo_bench.matching.rejector import Rejector
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
@@ -23,7 +25,7 @@ ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the tr
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
-    """Every entry point of a group by its name; of two with one name the built-in one, else the first to be listed.
+    """Return the entry points of a group by name; of two with one name the built-in one, else the first listed.
 
     Warns
     -----
@@ -49,7 +51,7 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
 
 
 def _installed(group: str) -> list[EntryPoint]:
-    """Entry points of a group, those of ours first."""
+    """Return the entry points of a group, our own first."""
     try:
         installed = entry_points(group=group)
     except Exception as error:
@@ -61,7 +63,7 @@ def _installed(group: str) -> list[EntryPoint]:
 
 
 def _clash(first: EntryPoint, other: EntryPoint) -> str:
-    """Name both of two plugins of one name, and say which is used: ours, or else none."""
+    """Name two plugins with the same name, and say which is used: ours, otherwise neither."""
     lost = f"{_home(other)} ({other.value})"
     if _home(first) in _OURS:
         return f"two plugins are named {first.name!r}: {_home(first)} is used, {lost} is not"
@@ -72,7 +74,7 @@ def _clash(first: EntryPoint, other: EntryPoint) -> str:
 
 
 def shipped_names() -> frozenset[str]:
-    """Names of the matchers that ship, which no other plugin may bear.
+    """Return the names of shipped matchers, which no other plugin may use.
 
     Examples
     --------
@@ -83,7 +85,7 @@ def shipped_names() -> frozenset[str]:
 
 
 def check_card_name(spec: str, name: str) -> None:
-    """Refuse a matcher of others whose card bears the name of one that ships: its row would pass for that one's.
+    """Refuse the card name of a shipped matcher for any other matcher: its row would pass for the shipped one's.
 
     Parameters
     ----------
@@ -119,7 +121,7 @@ def _name_of(distribution: Distribution) -> str:
     return distribution.name
 
 
-def load_matcher(spec: str) -> Matcher:
+def load_matcher(spec: str) -> "Matcher":
     """Import a matcher and make one.
 
     Parameters
@@ -139,12 +141,14 @@ def load_matcher(spec: str) -> Matcher:
         ...
     sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list-matchers shows all; or module:Class)
     """
+    from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - names are listed without it
+
     matcher: Matcher = _made(spec, _find(spec, MATCHERS, "matcher"))
     _check(spec, matcher, MatcherCard, "matcher", ("prepare", "match"))
     return matcher
 
 
-def load_rejector(spec: str) -> Rejector:
+def load_rejector(spec: str) -> "Rejector":
     """Import a rejector and make one.
 
     Parameters
@@ -160,8 +164,8 @@ def load_rejector(spec: str) -> Rejector:
     return rejector_maker(spec)()
 
 
-def rejector_maker(spec: str) -> Callable[[], Rejector]:
-    """What makes rejectors of a name, as `load_rejector` does, but looks for them once: a board makes thousands.
+def rejector_maker(spec: str) -> "Callable[[], Rejector]":
+    """Return a function that makes rejectors as `load_rejector` does, but looks for the name once.
 
     Parameters
     ----------
@@ -176,14 +180,16 @@ def rejector_maker(spec: str) -> Callable[[], Rejector]:
     return partial(_rejector, spec, _find(spec, REJECTORS, "rejector"))
 
 
-def _rejector(spec: str, target: Callable[[], Any]) -> Rejector:
+def _rejector(spec: str, target: Callable[[], Any]) -> "Rejector":
+    from sasgeo_bench.matching.rejector import RejectorCard  # noqa: PLC0415 - as in load_matcher
+
     rejector: Rejector = _made(spec, target)
     _check(spec, rejector, RejectorCard, "rejector", ("fit", "p_false"))
     return rejector
 
 
 def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequence[str]) -> None:
-    """Refuse what has not the card and the verbs of its kind."""
+    """Refuse a plugin without the card and the methods of its kind."""
     try:
         card = getattr(plugin, "card", None)
         missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
@@ -200,12 +206,12 @@ def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequenc
 
 
 def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
-    """The class behind a name or module:Class."""
+    """Return the class behind a name or module:Class."""
     return _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
 
 
 def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever the plugin is
-    """One of it; what goes wrong is told in one line."""
+    """Make a plugin; a failure is reported in one line."""
     try:
         return target()
     except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
@@ -237,7 +243,7 @@ def _known(name: str, group: str, kind: str) -> EntryPoint:
 
 
 def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) -> None:
-    """Refuse names that no installed package has; nothing is imported, and module:Class is taken at its word.
+    """Refuse names that no installed package registers. Imports nothing, and accepts any module:Class.
 
     Raises
     ------
@@ -255,7 +261,7 @@ def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) 
 
 
 def check_registered(rejectors: Sequence[str], *, source: str) -> None:
-    """Refuse rejectors that data name by module:Class: whoever imports what a file names runs whatever it names.
+    """Refuse rejectors that a data file names by module:Class: importing them would run any code that it names.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from sasgeo_bench.matching.results import Prediction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RejectorCard:
-    """What a rejector says of itself; the fields are those of a `MatcherCard`, and one more.
+    """Description of a rejector: the fields of a `MatcherCard`, and one more.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Rejector(Protocol):
 
 
 def remark_of(rejector: Rejector) -> str:
-    """What a rejector says of its last fit, in one line; nothing where it has no `remark`.
+    """Return a rejector's remark on its last fit in one line; empty where it has no `remark`.
 
     Examples
     --------

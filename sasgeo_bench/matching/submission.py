@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a submission says: the card that its author writes, and what stands beside the answers in `submission.json`."""
+"""Description of a submission: the card that its author writes, and `submission.json`."""
 
 from collections.abc import Mapping
 from typing import Annotated, Final
@@ -46,7 +46,7 @@ TrainedOn = Annotated[str | list[str] | dict[str, list[str]], BeforeValidator(_t
 
 
 class Card(Document):
-    """What an author says of a method; on the board beside its row, always as text.
+    """Author's description of a method, shown on the board as text.
 
     Parameters
     ----------
@@ -90,12 +90,12 @@ class Card(Document):
 
     @property
     def is_by_half(self) -> bool:
-        """Whether the two halves of a cross-fit were answered after other training."""
+        """True if the two halves of a cross-fit were answered after different training."""
         return isinstance(self.trained_on, dict)
 
     @property
     def places(self) -> tuple[str, ...]:
-        """All places that taught it, by name."""
+        """Names of all training places."""
         return tuple(sorted({place for half in HALVES for place in self.taught(half)}))
 
     def taught(self, half: Half | None) -> tuple[str, ...]:

@@ -2,13 +2,14 @@
 """Schema of classified geometry: a GeoDataFrame with one row per OSM object and semantic class."""
 
 import hashlib
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
-import pandas as pd
 import shapely
 
 from sasgeo_bench.errors import ShapeError
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 SEA: Final = "coastline"  # `osm_type` of sea: no object of OSM, but ground to the right of its coastlines
 # Column -> pandas dtype; `geometry` comes last. `width_m` is the drawn width of a line, NaN for an area.
@@ -27,11 +28,14 @@ DTYPES: Final = {
 }
 
 
-def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
+def make_features(columns: dict[str, object], *, epsg: int) -> "gpd.GeoDataFrame":
     """Build a checked feature table from one array for each column of `DTYPES` and `geometry`, metres in CRS `epsg`.
 
     Raise `ShapeError` if a column is missing.
     """
+    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+    import pandas as pd  # noqa: PLC0415
+
     missing = [name for name in (*DTYPES, "geometry") if name not in columns]
     if missing:
         message = f"a feature table needs the columns {missing!r} too"
@@ -42,7 +46,7 @@ def make_features(columns: dict[str, object], *, epsg: int) -> gpd.GeoDataFrame:
     return check_features(gpd.GeoDataFrame(table, geometry=gpd.GeoSeries(columns["geometry"], crs=epsg)))
 
 
-def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def check_features(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return a feature table unchanged; raise `ShapeError` if columns, types or CRS (projected, metres) are wrong."""
     wanted = [*DTYPES, "geometry"]
     if list(features.columns) != wanted:
@@ -60,7 +64,7 @@ def check_features(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     return features
 
 
-def fingerprint(features: gpd.GeoDataFrame) -> str:
+def fingerprint(features: "gpd.GeoDataFrame") -> str:
     """Hash types, ids, versions, classes and centroids of a table, whatever the order of its rows.
 
     Coordinates are rounded to a millimetre, so that another version of PROJ gives the same fingerprint.

@@ -13,7 +13,6 @@ from threading import Event, Thread
 from typing import Annotated, Final, Literal, Self
 from urllib.parse import urlsplit
 
-import pooch
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from sasgeo_bench.config import Document, Line
@@ -75,6 +74,8 @@ def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
 
 def cache_folder() -> Path:
     """Return the folder of downloaded extracts."""
+    import pooch  # noqa: PLC0415 - only downloads need it
+
     return Path(pooch.os_cache("sasgeo-bench"))
 
 
@@ -116,6 +117,8 @@ def _not_found(extract: Extract, folders: Sequence[Path], reasons: Sequence[str]
 
 def _download(extract: Extract, url: str) -> Path:
     """Download into the cache; the file gets its name only if its hash is accepted."""
+    import pooch  # noqa: PLC0415 - only downloads need it
+
     if not answers(url):
         message = f"{url} cannot be reached"
         raise ExtractError(message)
@@ -155,6 +158,7 @@ def answers(url: str) -> bool:
 
 @cache
 def _server_answers(server: str) -> bool:
+
     found = Event()
     # In a thread: the lookup of a name ignores the time limit of the connection.
     thread = Thread(target=_ask, args=(server, found), daemon=True)
@@ -164,6 +168,8 @@ def _server_answers(server: str) -> bool:
 
 
 def _ask(server: str, found: Event) -> None:
+    import pooch  # noqa: PLC0415 - only downloads need it
+
     with suppress(OSError, ValueError):
         pooch.HTTPDownloader(timeout=ANSWER_S)(server, None, None, check_only=True)
         found.set()

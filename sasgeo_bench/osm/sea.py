@@ -8,8 +8,6 @@ from typing import Final
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
 OPEN: Final = "near a gap in the coastline"
 CONTRARY: Final = "between coastlines that contradict each other"
@@ -87,6 +85,9 @@ def _links(lines: Geometries, mapped: shapely.Geometry, edge: shapely.Geometry) 
     tips = np.concatenate((loose_ends, loose_begins))
     if len(tips) == 0:
         return []
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - slow to import, and most places have no sea
+    from scipy.spatial.distance import cdist  # noqa: PLC0415
+
     to_edge = [_beyond(shapely.shortest_line(shapely.Point(tip), edge)) for tip in tips]
     first = len(loose_ends)
     cost = np.zeros((len(tips), len(tips)))

@@ -33,7 +33,6 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.layer_file import PaintWindow, read_overview, write_layers
 from sasgeo_bench.regions.layers import burn_layers, make_paint
-from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import (
     ATTRIBUTION,
     DATA_VERSION,
@@ -194,6 +193,8 @@ def _write_into(
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
     if with_preview:
+        from sasgeo_bench.regions.preview import write_preview  # noqa: PLC0415 - only a picture needs matplotlib
+
         overview = read_overview(scratch / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
         write_preview(scratch / region_files.PREVIEW, manifest=manifest, overview=overview)
     files = {path.name: file_record(path) for path in sorted(scratch.iterdir())}

@@ -3,14 +3,16 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 PRESENT: Final = 1
 OUTSIDE: Final = 255  # unknown: beyond the mapped area
@@ -33,7 +35,7 @@ class Paint:
 
 
 def make_paint(
-    features: gpd.GeoDataFrame, classes: tuple[str, ...], coverage: shapely.Geometry, *, least_width_m: float = 0.0
+    features: "gpd.GeoDataFrame", classes: tuple[str, ...], coverage: shapely.Geometry, *, least_width_m: float = 0.0
 ) -> Paint:
     """Turn visible features into polygons for `burn_layers`: lines are buffered to their width, areas stay as they are.
 

@@ -2,12 +2,11 @@
 """Region: grid, layers, graph, features, coverage and provenance; immutable."""
 
 import datetime as dt
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, cast
 
-import geopandas as gpd
 import numpy as np
-import pandas as pd
 import shapely
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
@@ -18,12 +17,17 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.texts import FOLDER
 
+if TYPE_CHECKING:
+    import geopandas as gpd
+    import pandas as pd
+
 SCHEMA_VERSION: Final = 1  # of region.json and its tables
 DATA_VERSION: Final = 2  # of regions: raised whenever the same input gives another region
 ATTRIBUTION: Final = "(c) OpenStreetMap contributors, ODbL"
 LICENCE: Final = "ODbL-1.0"
 
 Count = Annotated[int, Field(ge=0)]
+Value = TypeVar("Value")
 
 
 class _Record(Document):
@@ -128,22 +132,55 @@ class MapGraph:
         of its roads, a membership from the building to its cluster. `distance_m` is straight, `length_m` along the way.
     """
 
-    nodes: gpd.GeoDataFrame
-    edges: pd.DataFrame
+    nodes: "gpd.GeoDataFrame"
+    edges: "pd.DataFrame"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+class Late(Generic[Value]):
+    """A field of a frozen dataclass that may be given as a function, which is called when the field is first read.
+
+    Examples
+    --------
+    >>> @dataclass(frozen=True)
+    ... class Place:
+    ...     height_m: Late[float] = Late()
+    >>> place = Place(lambda: print("reading") or 2.5)
+    >>> place.height_m + place.height_m
+    reading
+    5.0
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Remember the field's name."""
+        self._name = name
+
+    def __get__(self, instance: Any, owner: type) -> Value:  # noqa: ANN401 - of any class
+        """Return the value, read now if it was not read before."""
+        if instance is None:  # a dataclass asks for the default: there is none
+            raise AttributeError(self._name)
+        value = vars(instance)[self._name]
+        if callable(value):
+            value = vars(instance)[self._name] = value()
+        return cast("Value", value)
+
+    def __set__(self, instance: Any, value: Value | Callable[[], Value]) -> None:  # noqa: ANN401 - of any class
+        """Keep a value, or what reads it."""
+        vars(instance)[self._name] = value
+
+
+@dataclass(frozen=True, kw_only=True)
 class Region:
     """One mapped place.
 
     `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
-    `coverage` is the mapped area in the region's CRS.
+    `coverage` is the mapped area in the region's CRS. `features` and `graph` of a stored region are read when they are
+    first asked for.
     """
 
     manifest: Manifest
     layers: NDArray[np.uint8]
-    features: gpd.GeoDataFrame
-    graph: MapGraph
+    features: Late["gpd.GeoDataFrame"] = Late()
+    graph: Late[MapGraph] = Late()
     coverage: shapely.Geometry
 
     @property

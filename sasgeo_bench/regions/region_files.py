@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read and write a region on disk: `region.json` and the files it names; written whole or not at all."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-import geopandas as gpd
-import pandas as pd
 import pyarrow as pa
 import shapely
-from pyproj import CRS
-from pyproj.exceptions import CRSError
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, GridError, StoreError
@@ -18,11 +15,14 @@ from sasgeo_bench.files.hashes import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
 from sasgeo_bench.osm.features import check_features
-from sasgeo_bench.regions.layer_file import read_layers
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
 from sasgeo_bench.texts import json_text
 
-Table = TypeVar("Table", bound=pd.DataFrame)
+if TYPE_CHECKING:
+    import geopandas as gpd
+    import pandas as pd
+
+Table = TypeVar("Table", bound="pd.DataFrame")
 
 MANIFEST: Final = "region.json"
 LAYERS: Final = "layers.tif"
@@ -34,7 +34,7 @@ _ORIGIN: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICE
 _MEND: Final = "build the region again"
 
 
-def write_tables(folder: Path, features: gpd.GeoDataFrame, graph: MapGraph) -> None:
+def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph) -> None:
     """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder."""
     geographic = {**CHECKED, "schema_version": "1.1.0"}
     _attributed(features).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
@@ -63,6 +63,9 @@ def read_manifest(folder: Path) -> Manifest:
         ...
     sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
     """
+    from pyproj import CRS  # noqa: PLC0415 - with GDAL and pandas the slowest import: only reading needs it
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
     path = folder / MANIFEST
     if not path.is_file():
         message = f"{folder} holds no {MANIFEST}: build the region first"
@@ -85,21 +88,36 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def read_region(folder: Path) -> Region:
-    """Read a region whole; raise `StoreError` if a file is missing, changed or unreadable."""
+def read_region(folder: Path, *, around: Callable[[], AbstractContextManager[object]] = nullcontext) -> Region:
+    """Read a region: its layers now, its features and graph when they are first used.
+
+    All files are checked against their hashes now. `around` gives a context that is entered while features or graph
+    are read. Raise `StoreError` if a file is missing, changed or unreadable.
+    """
+    from sasgeo_bench.regions.layer_file import read_layers  # noqa: PLC0415 - imports GDAL
+
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
+
+    def features() -> "gpd.GeoDataFrame":
+        with around():
+            return check_features(_read_geometry(folder / FEATURES))
+
+    def graph() -> MapGraph:
+        with around():
+            return MapGraph(nodes=_read_geometry(folder / NODES), edges=read_frame(folder / EDGES, mend=_MEND))
+
     return Region(
         manifest=manifest,
         layers=read_layers(folder / LAYERS),
-        features=check_features(_read_geometry(folder / FEATURES)),
-        graph=MapGraph(nodes=_read_geometry(folder / NODES), edges=read_frame(folder / EDGES, mend=_MEND)),
+        features=features,
+        graph=graph,
         coverage=shapely.from_wkt(manifest.coverage.wkt),
     )
 
 
-def read_features(folder: Path) -> gpd.GeoDataFrame:
+def read_features(folder: Path) -> "gpd.GeoDataFrame":
     """Read a region's features alone; raise `StoreError` as `read_region` does."""
     manifest = read_manifest(folder)
     _check_file(folder / FEATURES, manifest.files[FEATURES])
@@ -119,7 +137,11 @@ def _check_file(path: Path, record: FileRecord) -> None:
         raise StoreError(message)
 
 
-def _read_geometry(path: Path) -> gpd.GeoDataFrame:
+def _read_geometry(path: Path) -> "gpd.GeoDataFrame":
+    """Read a table of geometry, after a check of its size."""
+    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
     with open_table(path, mend=_MEND, most_rows=MOST_VALUES):
         pass
     try:

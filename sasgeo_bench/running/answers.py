@@ -36,7 +36,7 @@ Question = tuple["_Writer", Query, bytes]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """What some rows took.
+    """Cost of some rows: time, memory, counts.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
 
 
 class Watch:
-    """Whoever is told how tasks come along, by several threads at once; this one takes no note.
+    """Observer of the progress of tasks, called by several threads at once; this one does nothing.
 
     Examples
     --------
@@ -98,13 +98,13 @@ class Watch:
     """
 
     def begin(self, part: RunPart) -> None:
-        """Take note that a task is begun."""
+        """Record that a task has begun."""
 
     def advance(self, part: RunPart) -> None:
-        """Take note that one more query has a row."""
+        """Record that one more query has a row."""
 
     def end(self, part: RunPart, cost: Cost) -> None:
-        """Take note that all rows there will be are written, and what they took."""
+        """Record that all rows are written, and their cost."""
 
 
 def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) -> Cost:
@@ -157,7 +157,7 @@ def _ask_all(schedule: Schedule[Question], maps: Sequence["_Map"]) -> None:
 
 
 def _write_in_time(writers: Sequence["_Writer"], schedule: Schedule[Question]) -> None:
-    """Write rows every now and then; whoever cannot stops the run."""
+    """Write rows now and then; a failure to write stops the run."""
     try:
         while not schedule.wait_for_stop(PART_S):
             for writer in writers:
@@ -211,7 +211,7 @@ class _Map:
                 writer.add(self._row(query, reply), cpu_s=reply.cpu_s)
 
     def _row(self, query: Query, reply: Reply) -> Prediction:
-        """A row out of a reply, checked once more on this side."""
+        """Make a row of a reply, checked again on this side."""
         try:
             return _prediction(query, reply, self._plan.request.top_k)
         except Exception as error:  # noqa: BLE001 - whatever is made of an answer costs its own row
@@ -219,7 +219,7 @@ class _Map:
             return Prediction(query_id=query.query_id, status=failed.status, message=failed.message)
 
     def _unlearned(self) -> Reply | None:
-        """What every query gets where nothing came of learning: no process is started for it."""
+        """Return the reply to every query after a failed training; starts no process."""
         learned = self._plan.learned
         if learned is None or learned.text is not None:
             return None
@@ -235,7 +235,7 @@ class _Map:
             check_files(part.region)
 
     def _asked(self) -> Worker | Oracle:
-        """Whoever is asked: a plugin in a process of its own, or the one control that is given the truth."""
+        """Return what answers: a plugin in its own process, or the control that is given the truth."""
         request, part = self._plan.request, self._writers[0].part
         if request.spec == ORACLE:
             return Oracle(part.truth)
@@ -243,7 +243,7 @@ class _Map:
 
 
 def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
-    """A row out of a reply, held to the query."""
+    """Make a row of a reply, checked against the query."""
     if reply.status != "ok":
         return Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
     if reply.match is None:
@@ -277,7 +277,7 @@ class _Writer:
         self._is_open = False
 
     def begin(self) -> None:
-        """Take rows from here on."""
+        """Begin to collect rows."""
         self._watch.begin(self.part)
         self._is_open = True
 
@@ -301,7 +301,7 @@ class _Writer:
                 self.end()
 
     def flush(self) -> None:
-        """Write what there is."""
+        """Write the rows collected so far."""
         with self._lock:
             if self._rows:
                 prediction_files.write_part(self.part.folder, self._rows, asked=self.part.asked)
@@ -317,14 +317,14 @@ class _Writer:
 
     @property
     def cost(self) -> Cost:
-        """What the rows have taken so far, and the processes they come from."""
+        """Cost of the rows so far and of their processes."""
         with self._lock:
             own = Cost(counts=dict(self._counts), cpu_s=self._cpu_s, messages=dict(self._messages))
             return pool_costs([own, *(_process_cost(*asker) for asker in self._askers.values())])
 
 
 def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
-    """What a process has told of its map and of itself."""
+    """Cost that a process reported for its map and for itself."""
     return Cost(
         prepare_s=ready.own_s if ready.own_s is None or ready.seconds is None else min(ready.own_s, ready.seconds),
         index_bytes=ready.grown_bytes,

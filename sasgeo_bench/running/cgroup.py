@@ -94,7 +94,7 @@ class Group:
         return next(filter(None, (_number(self.memory / name) for name in names)), 0)
 
     def is_full(self) -> bool:
-        """Whether the kernel has killed a process of it for its memory."""
+        """True if the kernel killed one of its processes for its memory."""
         name = "memory.oom_control" if self.version == 1 else "memory.events"
         found = dict(line.split() for line in _lines(self.memory / name))
         return int(found.get("oom_kill", 0)) > 0
@@ -138,7 +138,7 @@ def _folder(root: str, where: str, path: str | None) -> Path | None:
 
 
 def _offers(folder: Path) -> bool:
-    """Whether groups in a folder of version 2 have the controllers that are needed."""
+    """True if groups in a version 2 folder have the controllers that are needed."""
     names = " ".join(_lines(folder / "cgroup.subtree_control")).split()
     return set(_NEEDED) <= set(names) and os.access(folder, os.W_OK)
 
@@ -153,7 +153,7 @@ def _namespace() -> str:
 
 
 def _begun(number: int) -> str:
-    """When a process began, in ticks since the machine did; empty if there is none."""
+    """Return the start of a process in ticks since boot; empty if there is no such process."""
     lines = _lines(Path(f"/proc/{number}/stat"))
     return lines[0].rpartition(")")[2].split()[19] if lines else ""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the failure of one contestant costs: its own rows. Why is kept in a line, and the traceback in a log."""
+"""Limit the failure of one entry to its own rows; keep the cause as a line, and the traceback in a log."""
 
 import errno
 import traceback
@@ -19,7 +19,7 @@ Item = TypeVar("Item")
 
 
 def stops_all(error: BaseException | None) -> bool:
-    """Whether an error is no contestant's fault, but that of a disk that is full, read-only or broken.
+    """True if an error comes from a disk that is full, read-only or broken, and from no entry.
 
     Examples
     --------
@@ -43,7 +43,7 @@ def write_log(log: Path, name: str, error: BaseException) -> None:
 
 
 def log_beside(board: Path) -> Path:
-    """Where tracebacks of what failed on a board go.
+    """Return the path of a board's log of tracebacks.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def log_beside(board: Path) -> Path:
 
 
 class Failures:
-    """Who failed and why, by name: a line each.
+    """Failed entries by name, and the cause of each as one line.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Failures:
 
     @property
     def first(self) -> Exception | None:
-        """What was raised first."""
+        """Return the error that was raised first."""
         return next(iter(self.errors.values()), None)
 
     @contextmanager

@@ -94,7 +94,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
 
 
 def outermost(paths: Sequence[str]) -> list[str]:
-    """Where paths lead to that exist, without those that lie within another: what is covered has nothing within.
+    """Resolve paths that exist, and drop those inside another one: a covered folder needs no second cover.
 
     Examples
     --------

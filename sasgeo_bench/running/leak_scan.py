@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lies beside the code and tells answers: queries, truths, results, runs, boards, releases, sites, other maps.
+"""Find files beside the code that reveal answers: queries, truths, results, boards, releases, other maps.
 
 A matcher reads the folders that it is imported from. They are walked here, no links followed, so that whatever in them
 tells where a query was taken can be hidden; how far the walk came is part of what it finds.
@@ -149,7 +149,7 @@ def walk(roots: Sequence[str], *, most_entries: int = MOST_ENTRIES, most_depth: 
 
 
 def _is_interpreters(folder: str) -> bool:
-    """Whether a folder is the interpreter's own, or holds installed packages."""
+    """True if a folder is the interpreter's own, or holds installed packages."""
     prefixes = {os.path.realpath(path) for path in (sys.prefix, sys.base_prefix)}
     installed = {os.path.realpath(path) for path in sysconfig.get_paths().values()} - prefixes
     return folder in prefixes or any(Path(folder).is_relative_to(path) for path in installed)
@@ -170,7 +170,7 @@ def _listed(folder: str, most: int) -> dict[str, bool]:
 
 
 def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]:
-    """What of a folder tells answers, and the folders in it that are to be looked at."""
+    """Return what reveals answers in a folder, and its subfolders still to scan."""
     names = held.keys()
     if names & _INTERPRETER or folder in {*SYSTEM, "/dev"}:
         return [], []

@@ -61,12 +61,12 @@ class MemoryWatch:
     _thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Look until it is told to stop."""
+        """Measure until stopped."""
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop measuring."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -77,7 +77,7 @@ class MemoryWatch:
         return max(self._sampled, self.group.peak_bytes() if self.group else 0)
 
     def look(self) -> bool:
-        """Measure once; whether it takes more than it may. Whoever keeps us from measuring does, too."""
+        """Measure once; true if the memory exceeds the limit, or cannot be measured."""
         for _ in range(_TRIES):
             try:
                 return self._measure()
@@ -89,7 +89,7 @@ class MemoryWatch:
 
     @property
     def why(self) -> str:
-        """Why it was ended."""
+        """Return why the process was ended."""
         if self.fault:
             return f"its memory could not be looked at ({self.fault})"
         return f"takes more than the {self.most_bytes / 1e6:.0f} MB of memory that are allowed"
@@ -119,7 +119,7 @@ class MemoryWatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Shared:
-    """What lies in memory as a file, mapped or not: its size, and what it is known by in a list of mappings."""
+    """A file in memory, mapped or not: its size, and its key in a list of mappings."""
 
     sizes: Mapping[tuple[int, int], int]
     scratch_bytes: int = 0

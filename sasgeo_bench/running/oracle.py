@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control that is given the truth: what nobody can beat. No plugin has this door."""
+"""The control that is given the truth, an upper bound for all matchers; no plugin can do this."""
 
 import time
 from dataclasses import replace

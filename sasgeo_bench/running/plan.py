@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run is asked to do, and what of it is left."""
+"""Plan a run: what was requested, and which queries are pending."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ _LEAST_MB, _MOST_MB = 64, 4_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
-    """What is asked for.
+    """Request for a run.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class RunPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Learned:
-    """What came of learning: a text, or a status and a line that say why there is none."""
+    """Result of training: a text, or the status and one line of cause where there is none."""
 
     text: str | None = None
     status: Status = "ok"
@@ -121,7 +121,7 @@ class Learned:
 
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
-    """What a run will do, after the plugin's card was read in a process of its own.
+    """Plan of a run, made after the plugin's card was read in its own process.
 
     `lesson` is what a matcher that learns is to learn from, `learned` what came of it, None until it was tried.
     """
@@ -136,22 +136,22 @@ class RunPlan:
 
     @property
     def run_folder(self) -> Path:
-        """Where the rows of all tasks go."""
+        """Folder of the rows of all tasks."""
         return _run_folder(self.request, self.card, self.hash)
 
     @property
     def key(self) -> str | None:
-        """What rows are tied to besides what is asked; None where there is nothing to learn from."""
+        """Hash that ties rows to the training result; None without training."""
         return None if self.lesson is None else _key(self.lesson, self.learned)
 
     @property
     def learned_file(self) -> Path | None:
-        """Where the text is kept, whether it is there yet or not."""
+        """Path of the learned text, which may not exist yet."""
         return None if self.lesson is None else learned_path(self.run_folder, self.lesson.sha256)
 
     @property
     def said(self) -> LearnedSaid | None:
-        """What `run.json` says of learning."""
+        """Record of the training for `run.json`."""
         if self.lesson is None or self.key is None or self.learned_file is None:
             return None
         has_text = self.learned is not None and self.learned.text is not None
@@ -159,14 +159,14 @@ class RunPlan:
         return LearnedSaid(key=self.key, file=file, trained_on=self.lesson.places, pairs=self.lesson.count)
 
     def lesson_lines(self) -> list[str]:
-        """What is learnt before anything is asked, in a line; none where nobody asked for it."""
+        """Describe the training in a line; no line if none was requested."""
         if self.lesson is not None:
             state = "to be learnt from" if self.learned is None else "has learnt from"
             return [f"{state} {self.lesson.to_text()}"]
         return ["does not learn: what there is to learn from is passed over"] if self.request.train else []
 
     def to_text(self) -> str:
-        """What is learnt, what is left and done in all, and a line for each of the first tasks."""
+        """Describe the training, the pending and finished queries, and each of the first tasks in a line."""
         lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
         lines += [f"  {line}" for line in self.lesson_lines()]
         lines += [f"  {part.folder}: {_state((part,))}" for part in self.parts[:MOST_LINES]]
@@ -178,7 +178,7 @@ class RunPlan:
 
 
 def _state(parts: Sequence[RunPart]) -> str:
-    """How far some tasks are."""
+    """Count the pending and finished queries of some tasks."""
     left, done, aside = (sum(column) for column in zip(*((len(x.left), x.done, x.aside) for x in parts), strict=True))
     others = f", {counted(aside, 'answer')} to other queries set aside" if aside else ""
     return f"{counted(left, 'query', 'queries')} left, {done} done{others}"
@@ -258,7 +258,7 @@ def _key(lesson: Lesson, learned: Learned | None) -> str:
 
 
 def _check(request: RunRequest) -> None:
-    """Refuse numbers that make no sense."""
+    """Refuse numbers out of range."""
     index, count = request.shard
     if not 1 <= index <= count:
         message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
@@ -389,5 +389,5 @@ def _check_old(
 
 
 def _shard_of(query_id: str, count: int) -> int:
-    """Which of `count` parts a query belongs to; it depends on the id alone."""
+    """Return the shard of a query, out of `count`; it depends on the id alone."""
     return int.from_bytes(hashlib.sha256(query_id.encode()).digest()[:8], "big") % count

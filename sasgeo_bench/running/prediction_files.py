@@ -100,7 +100,7 @@ def parts_of(path: Path) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class Tie:
-    """What a row answers: the id of a query, what came of it, and the hash of what was asked.
+    """Link of a row to its query: id, status, and hash of the question.
 
     The hash is empty in files of predictions and in runs of an older program: their rows answer whatever has their id.
     Whoever takes them for answers must know from elsewhere to which queries.
@@ -111,7 +111,7 @@ class Tie:
     asked: str
 
     def answers(self, asked: Mapping[str, str], *, is_tied: bool = True) -> bool:
-        """Whether the row answers one of these queries, as they are now; one without a hash does if `is_tied`.
+        """True if the row answers one of these queries as they are now; without a hash it does if `is_tied`.
 
         Examples
         --------
@@ -164,7 +164,7 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
 
 
 def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
-    """What rows of a run's folder must say that they answer: what is asked, and what `run.json` says was learnt.
+    """Return the hash that each row must carry: of its query, and of what `run.json` says was learnt.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def read_key(folder: Path) -> str | None:
-    """What `run.json` says was learnt, as rows are tied to it; None for nothing.
+    """Read the hash of the training result from `run.json`; None without training.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
 
 
 def _to_merge(path: Path, asked: Mapping[str, str] | None) -> Iterable[Prediction]:
-    """All rows of a file; of a folder those that are asked for."""
+    """Read all rows of a file, or the requested rows of a folder."""
     if asked is None or not path.is_dir() or not parts_of(path):
         return read_predictions(path)
     return read_answers(path, asked).found.values()
@@ -360,7 +360,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def read_ties(folder: Path) -> list[Tie]:
-    """What the rows of a run's folder answer, in the order they were written.
+    """Read which queries the rows of a run's folder answer, in the order they were written.
 
     Raises
     ------
@@ -383,7 +383,7 @@ def _ties_of(table: pa.Table) -> list[Tie]:
 
 
 def tie_of(row: Mapping[str, Any]) -> Tie:
-    """What one row answers."""
+    """Return the link of one row to its query."""
     return Tie(str(row["query_id"]), str(row["status"]), str(row.get(ASKED) or ""))
 
 
@@ -422,7 +422,7 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
 
 
 def read_run(folder: Path) -> dict[str, Any] | None:
-    """What `run.json` says, or None where there is none.
+    """Read `run.json`; None where there is none.
 
     Raises
     ------

@@ -129,7 +129,7 @@ _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowFault:
-    """What is wrong in one row: its number, the column, what stands there and what was expected."""
+    """A fault in one row: row number, column, value found, and value expected."""
 
     row: int
     column: str

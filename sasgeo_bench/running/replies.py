@@ -30,7 +30,7 @@ _SHOWN: Final = 60  # characters of where a fault is
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """What came of a question: a status, a line that says why, seconds by the runner's clock, the answer.
+    """Reply to a question: status, cause as one line, seconds by the runner's clock, answer.
 
     Of the process itself: seconds by its own clock, and of its processors. Of a plugin that was loaded: its card, a
     hash of its code, and whether it has a `learn`; of a map: by how much memory grew; of a lesson: what was learnt.
@@ -118,7 +118,7 @@ class _Loaded(_Strict):
     learns: bool
 
     def reply(self) -> Reply:
-        """As a runner takes it."""
+        """Return the reply for the runner."""
         said: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
         return Reply(status="ok", card=MatcherCard(**said), code=self.code, learns=self.learns)
 
@@ -129,7 +129,7 @@ class _Learnt(_Strict):
     learned: str
 
     def reply(self) -> Reply:
-        """As a runner takes it."""
+        """Return the reply for the runner."""
         return Reply(status="ok", own_s=self.seconds, learned=check_learned(self.learned))
 
 
@@ -139,7 +139,7 @@ class _Prepared(_Strict):
     grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)]
 
     def reply(self) -> Reply:
-        """As a runner takes it."""
+        """Return the reply for the runner."""
         return Reply(status="ok", own_s=self.seconds, grown_bytes=self.grown_bytes)
 
 
@@ -156,7 +156,7 @@ class _Matched(_Strict):
     match: _Row
 
     def reply(self) -> Reply:
-        """As a runner takes it."""
+        """Return the reply for the runner."""
         row = self.match
         match = Match(
             poses=[Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in row.candidates],
@@ -176,7 +176,7 @@ _KINDS: Final[Mapping[str, type[_Loaded | _Learnt | _Prepared | _Matched]]] = {
 
 
 def read_reply(kind: str, said: Mapping[str, Any], *, nonce: str) -> Reply:
-    """What a message says, as the reply to a question.
+    """Read a message as the reply to a question.
 
     Parameters
     ----------

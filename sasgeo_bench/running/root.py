@@ -82,7 +82,7 @@ def enter_root(scratch: str, *, shown: Iterable[str], hidden: Sequence[str], scr
 
 
 def has_own_proc() -> bool:
-    """Whether /proc is that of our own process namespace."""
+    """True if /proc shows our own process namespace."""
     return os.readlink("/proc/self") == str(os.getpid())
 
 
@@ -161,7 +161,7 @@ def _parts(path: str) -> list[str]:
 
 
 def _resolve(path: str, links: dict[str, str]) -> str:
-    """Where a path leads to; the links on the way are added, so that they can be laid out anew."""
+    """Resolve a path, and collect the links on the way so that they can be made again."""
     at, rest, count = "", path.split("/")[::-1], 0
     while rest:
         name = rest.pop()

@@ -25,7 +25,7 @@ _COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earl
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunReport:
-    """How many rows of which status a run has added, and what the first of each without an answer said."""
+    """Rows that a run has added by status, the first message of each status without an answer, and the folders."""
 
     counts: dict[str, int]
     messages: dict[str, str]
@@ -33,7 +33,7 @@ class RunReport:
 
 
 def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunReport:
-    """Ask everything that is left.
+    """Ask every pending query.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _lock(locks: ExitStack, parts: Sequence[RunPart], tell: Tell) -> None:
 
 
 def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
-    """What nobody has answered while the locks were waited for; tasks of which nothing is left are gone."""
+    """Return the queries still pending after the locks were acquired; drop tasks without any."""
     found = []
     for part in parts:
         done = prediction_files.ids_done(part.folder, part.asked, again=plan.request.again)
@@ -196,7 +196,7 @@ def _begin(plan: RunPlan, part: RunPart) -> Cost:
 
 
 def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
-    """Write `run.json`: what the run is, and what it and the runs before it have taken."""
+    """Write `run.json`: the run, and its cost together with that of earlier runs."""
     about = part.about
     told: dict[str, Any] = asdict(pool_costs([before, cost]))
     del told["counts"], told["messages"]

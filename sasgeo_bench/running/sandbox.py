@@ -40,7 +40,7 @@ OWN_PROC: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Policy:
-    """What a process may do.
+    """Permissions of a process.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Policy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Isolation:
-    """What was done, a promise each, in words for people; what the system offers no way for is said too."""
+    """Protections that were applied, each in words; also those that the system lacks."""
 
     files_read: str
     files_changed: str
@@ -193,7 +193,7 @@ def joined(said: Iterable[Mapping[str, str]]) -> dict[str, str]:
 
 
 def keeps_truth(isolation: Mapping[str, str]) -> bool:
-    """Whether truths were kept from all processes of a run, as far as it says.
+    """True if a record says that truths were kept from all processes of a run.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who works on what: a map for each thread first, then help for the map that has most left."""
+"""Share maps among threads: one map each first, then help for the map with most pending queries."""
 
 import threading
 import time
@@ -14,7 +14,7 @@ LEAST_ITEMS: Final = 8
 
 
 def pays(*, left: int, askers: int, start_s: float, pace_s: float | None) -> bool:
-    """Whether one more process for some queries is worth its start: its share must take as long at least.
+    """True if one more process is worth its start: its share of the queries must take at least as long.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Schedule(Generic[Item]):
 
     @property
     def is_stopped(self) -> bool:
-        """Whether nothing more is given."""
+        """True if no more work is given."""
         return self._is_stopped
 
     def take(self) -> int | None:
@@ -82,7 +82,7 @@ class Schedule(Generic[Item]):
         return None
 
     def _in_need(self) -> "_Line[Item] | None":
-        """Of the maps where help pays, the one with most queries left for each who would work on it."""
+        """Return the map where help pays and that has most pending queries per worker."""
         in_need = (line for line in self._lines if line.pays())
         return max(in_need, key=lambda line: line.left / (line.askers + 1), default=None)
 
@@ -103,12 +103,12 @@ class Schedule(Generic[Item]):
             self._changed.notify_all()
 
     def wait_for_stop(self, seconds: float) -> bool:
-        """Whether nothing more is given, from now or within some seconds."""
+        """True if no more work is given, now or within some seconds."""
         with self._changed:
             return self._changed.wait_for(lambda: self._is_stopped, timeout=seconds)
 
     def stop(self) -> None:
-        """Give nothing more, and let nobody wait."""
+        """Give no more work, and wake all waiting threads."""
         with self._changed:
             self._is_stopped = True
             self._changed.notify_all()
@@ -140,6 +140,6 @@ class _Line(Generic[Item]):
             self._spent_s, self._count = self._spent_s + seconds, self._count + 1
 
     def pays(self) -> bool:
-        """Whether help would be worth its start."""
+        """True if help is worth its start."""
         pace_s = self._spent_s / self._count if self._count else None
         return self.left > 0 and pays(left=self.left, askers=self.askers, start_s=self._start_s, pace_s=pace_s)

@@ -62,7 +62,7 @@ _CLONE3: Final = 435
 
 
 def is_offered() -> bool:
-    """Whether this machine's kind of processor is one whose numbers are known here."""
+    """True if the system call numbers of this processor are known here."""
     return os.uname().sysname == "Linux" and os.uname().machine in _ARCHITECTURE and struct.calcsize("P") == 8  # noqa: PLR2004 - bytes of a pointer
 
 

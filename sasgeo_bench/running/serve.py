@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a matcher's process does once it is shut in: load, learn, prepare, match; every failure becomes a message."""
+"""Serve a runner inside the sandbox: load, learn, prepare, match; every failure becomes a message."""
 
 import errno
 import hashlib
@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import psutil
 
@@ -74,11 +74,12 @@ class Server:
         if message["kind"] == "learn":
             return _learn(self.matcher, message, blob)
         if message["kind"] == "prepare":
-            region = read_region(Path(message["region"]))
-            before, start = _resident_bytes(), time.perf_counter()
-            self.matcher.prepare(region, message["learned"])
-            seconds = time.perf_counter() - start
-            return {"status": "ok", "seconds": seconds, "grown_bytes": max(0, _resident_bytes() - before)}
+            reading = _Cost()
+            region = read_region(Path(message["region"]), around=lambda: reading)
+            with (preparing := _Cost()):
+                self.matcher.prepare(region, message["learned"])
+            grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
+            return {"status": "ok", "seconds": preparing.seconds - reading.seconds, "grown_bytes": grown_bytes}
         query = query_from(blob)
         start, start_cpu = time.perf_counter(), time.process_time()
         found = self.matcher.match(query, top_k=message["top_k"])
@@ -89,6 +90,23 @@ class Server:
             "cpu_s": cpu_s,
             "match": match_row(check_match(found, query, top_k=message["top_k"])),
         }
+
+
+class _Cost:
+    """Seconds by the clock, and resident bytes that this process has grown by, while it is entered."""
+
+    def __init__(self) -> None:
+        self.seconds, self.grown_bytes = 0.0, 0
+
+    def __enter__(self) -> Self:
+        """Begin to count."""
+        self._before, self._start = _resident_bytes(), time.perf_counter()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Add what it took."""
+        self.seconds += time.perf_counter() - self._start
+        self.grown_bytes += _resident_bytes() - self._before
 
 
 def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
@@ -103,7 +121,7 @@ def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, 
 
 
 class Maps(Mapping[str, Region]):
-    """Regions that are read when they are asked for: all those of a split at once would not fit into memory.
+    """Regions read on demand: all of a split at once would not fit into memory.
 
     Examples
     --------
@@ -116,7 +134,7 @@ class Maps(Mapping[str, Region]):
         self._kept: OrderedDict[str, Region] = OrderedDict()
 
     def __getitem__(self, name: str) -> Region:
-        """Read a map, or give the one that was asked for a moment ago."""
+        """Read a map, or return it from the cache."""
         folder = self._folders[name]
         if name not in self._kept:
             while len(self._kept) >= MOST_MAPS:
@@ -126,15 +144,15 @@ class Maps(Mapping[str, Region]):
         return self._kept[name]
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a map of that name, without reading it."""
+        """True if there is a map of that name; reads nothing."""
         return name in self._folders
 
     def __iter__(self) -> Iterator[str]:
-        """Names, without reading anything."""
+        """Iterate over the names; reads nothing."""
         return iter(self._folders)
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of maps."""
         return len(self._folders)
 
 
@@ -168,7 +186,7 @@ def code_hash(matcher: Matcher) -> str:
 
 
 def _resident_bytes() -> int:
-    """Of this process, under the number that /proc knows it by: in a namespace it may have another for itself."""
+    """Resident memory of this process, by its number in /proc: in a namespace its own number differs."""
     try:
         number = int(os.readlink("/proc/self"))  # noqa: PTH115 - no file, a number
     except OSError:
@@ -177,7 +195,7 @@ def _resident_bytes() -> int:
 
 
 def match_row(match: Match) -> dict[str, Any]:
-    """A checked answer as plain numbers."""
+    """Turn a checked answer into plain numbers."""
     return {
         "candidates": [
             [pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale, score]

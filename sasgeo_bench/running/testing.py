@@ -70,7 +70,7 @@ class TinyPlace:
 
     @property
     def map_folder(self) -> Path:
-        """Where the map lies."""
+        """Folder of the map."""
         return self.folder / "regions" / self.region.manifest.id
 
 
@@ -175,7 +175,7 @@ def check_matcher(
 
 @dataclass(frozen=True, kw_only=True)
 class _Taught:
-    """What a matcher has learnt of the tiny place, what it was refused meanwhile, and the row of the table."""
+    """Return what a matcher learnt of the tiny place, which accesses were refused, and the row of the table."""
 
     text: str | None
     refused: str
@@ -202,7 +202,7 @@ def _taught(worker: Worker, place: TinyPlace) -> _Taught:
 
 
 def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
-    """Whether a matcher that learns answers where there was nothing to learn from, unless its card says it cannot."""
+    """Check that a matcher that learns also answers untrained, unless its card says that it cannot."""
     name = "answers without training"
     if "training" in card.needs:
         return Check(name=name, outcome="not applicable", found="the card needs training")
@@ -217,7 +217,7 @@ def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
 
 
 def _listing(folder: Path) -> dict[str, tuple[int, int]]:
-    """Everything below a folder; of files, their size and when they were written."""
+    """List everything below a folder; for files with size and time of writing."""
     found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
     status = {name: path.stat() for name, path in found.items() if path.is_file()}
     return {name: (status[name].st_size, status[name].st_mtime_ns) if name in status else (0, 0) for name in found}
@@ -228,7 +228,7 @@ def _refusal(reply: Reply) -> str:
 
 
 def _kept(refused: str, before: dict[str, tuple[int, int]], after: dict[str, tuple[int, int]], limited: str) -> Check:
-    """Whether anything outside of the scratch folder was asked for and refused, or written where nothing refuses it."""
+    """Check that nothing outside the scratch folder was refused, or written where no sandbox refuses it."""
     name = "kept to its scratch folder"
     changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
     if refused:
@@ -270,7 +270,7 @@ class _Kit:
     second: dict[str, Reply] = field(default_factory=dict)
 
     def checks(self) -> Iterator[Check]:
-        """Every check in turn."""
+        """Run every check in turn."""
         able = _chosen(query for query in self.place.queries if self._lacks(query) is None)
         if not able:
             yield Check(name="answers a query", outcome="not applicable", found="the card's needs leave no query")
@@ -420,7 +420,7 @@ class _Kit:
 
 
 def _fault(reply: Reply, query: Query, *, top_k: int = TOP_K) -> str | None:
-    """Why a reply is no sound answer."""
+    """Return why a reply is not a sound answer."""
     if reply.status != "ok" or reply.match is None:
         return f"{reply.status}: {reply.message}"
     try:

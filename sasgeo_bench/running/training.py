@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a matcher learns before it is asked: once for a lesson, in a process of its own, kept as a text."""
+"""Train a matcher before the first query: once for each training set, in its own process, kept as a text."""
 
 from collections.abc import Callable
 from functools import partial
@@ -76,7 +76,7 @@ def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
 
 
 def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
-    """What a query gets about which our own code raised something; the log beside the run says where."""
+    """Return the reply to a query where our own code failed; the log beside the run has the traceback."""
     write_log(plan.run_folder / LOG, plan.card.name, error)
     return Reply(
         status="crash", message=one_line(f"not its own process failed, but ours: {message_of(error)} (see {LOG})")
@@ -84,7 +84,7 @@ def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
 
 
 def _failed(reply: Reply) -> Learned:
-    """What all rows say of a lesson from which nothing was learnt."""
+    """Return the message of all rows after a failed training."""
     if reply.status == "ok":
         return Learned(status="invalid", message="while learning: no text in an answer")
     return Learned(status=reply.status, message=one_line(f"while learning: {reply.message}"))

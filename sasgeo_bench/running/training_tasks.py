@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a matcher is to learn from: tasks that are far from all that is asked, and which of their queries are taken."""
+"""Choose the training set: tasks far from all queries of the run, and which of their queries are used."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ class Taken:
 
 @dataclass(frozen=True, kw_only=True)
 class Lesson:
-    """All that a matcher is to learn from at once; `sha256` is that of its queries, maps and truths."""
+    """A training set; `sha256` is the hash of its queries, maps and truths."""
 
     taken: tuple[Taken, ...]
     places: tuple[str, ...]
@@ -63,7 +63,7 @@ class _Pair:
 
 
 def plan_lesson(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> Lesson:
-    """Choose what is learnt from; nothing is read twice and nothing written.
+    """Choose the training set; reads nothing twice and writes nothing.
 
     Parameters
     ----------

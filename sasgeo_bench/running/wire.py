@@ -27,7 +27,7 @@ class Late(Exception):  # noqa: N818
 
 
 class Garbled(Exception):  # noqa: N818
-    """What came is whole, and no message."""
+    """The data is complete, but not a message."""
 
 
 def send(channel: socket.socket, message: dict[str, Any], blob: bytes = b"", *, deadline: float | None = None) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One matcher in one process, seen from outside: started, asked, watched, and ended when it must be."""
+"""A matcher's process, seen from outside: start it, ask it, watch it, and end it."""
 
 import contextlib
 import os
@@ -44,7 +44,7 @@ _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What a matcher may take.
+    """Limits of a matcher: time, memory, files, processes.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reach:
-    """What a matcher may read, what is hidden from it, and whether it is shut in at all."""
+    """Folders that a matcher may read, folders hidden from it, and whether it runs in the sandbox."""
 
     readable: Sequence[Path]
     hidden: Sequence[Path]
@@ -254,7 +254,7 @@ class Worker:
         }
 
     def _last_words(self, closed: str) -> str:
-        """How a process ended, and the last line it printed."""
+        """Describe how a process ended, with the last line it printed."""
         code = None
         if self._process is not None:
             try:
@@ -305,7 +305,7 @@ def _command(channel: int, *, is_shut_in: bool) -> list[str]:
 
 
 def _code() -> list[Path]:
-    """Where the interpreter and everything importable lies."""
+    """Folders of the interpreter and of everything importable."""
     found = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.executable), Path(os.getcwd())]  # noqa: PTH109
     found += [Path(entry) for entry in sys.path if entry]
     found.append(Path(sasgeo_bench.running.child.__file__).parents[2] / "sasgeo_bench")

@@ -3,13 +3,14 @@
 
 import datetime as dt
 from dataclasses import dataclass, field
-from typing import Final, Literal, Self
-
-import geopandas as gpd
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 TWIN_EAST, TWIN_NORTH = "twin_east_m", "twin_north_m"  # measured: from a site to its copy
 TASK_VERSION: Final = 2  # of queries.parquet and truth.parquet: raised whenever the same request gives other queries
@@ -142,7 +143,7 @@ class Query:
     prior: Prior
     prior_group: str
     candidates: tuple[Pose, ...] = ()
-    vectors: gpd.GeoDataFrame | None = None
+    vectors: "gpd.GeoDataFrame | None" = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

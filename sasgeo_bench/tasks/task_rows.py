@@ -6,9 +6,8 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import geopandas as gpd
 import numpy as np
 import pyarrow as pa
 import shapely
@@ -17,6 +16,9 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 POSE_FIELDS: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
 _POSE: Final = pa.struct([(name, pa.float64()) for name in POSE_FIELDS])
@@ -162,7 +164,7 @@ def _pose_row(pose: Pose) -> dict[str, float]:
     return {"easting_m": pose.easting_m, "northing_m": pose.northing_m, "yaw_deg": pose.yaw_deg, "scale": pose.scale}
 
 
-def _vector_rows(vectors: gpd.GeoDataFrame) -> list[dict[str, Any]]:
+def _vector_rows(vectors: "gpd.GeoDataFrame") -> list[dict[str, Any]]:
     columns = [vectors[name].to_list() for name in ("class", "level", "is_bridge")]
     shapes = [bytes(shape) for shape in shapely.to_wkb(vectors.geometry.to_numpy())]
     return [
@@ -206,7 +208,9 @@ def query_of(row: dict[str, Any]) -> Query:
     )
 
 
-def _vectors_of(rows: list[dict[str, Any]]) -> gpd.GeoDataFrame:
+def _vectors_of(rows: list[dict[str, Any]]) -> "gpd.GeoDataFrame":
+    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+
     return gpd.GeoDataFrame(
         {
             "class": np.array([row["class"] for row in rows], dtype=object),

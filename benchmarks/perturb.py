@@ -27,14 +27,10 @@ from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
 from sasgeo_bench.tasks.perturbations.crop import CentralCrop
 from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
 from sasgeo_bench.tasks.perturbations.glare import Glare
-from sasgeo_bench.tasks.perturbations.line_width import LayerOffset, LineWidth
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
 from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
 from sasgeo_bench.tasks.perturbations.perception import Perception
-from sasgeo_bench.tasks.perturbations.rotation import Rotation
-from sasgeo_bench.tasks.perturbations.scale import Scale
 from sasgeo_bench.tasks.perturbations.season import Season
-from sasgeo_bench.tasks.perturbations.tilt import Tilt
 from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
 
 TOWNS = ("town-suburb", "town-riverside", "town-agricultural")
@@ -54,12 +50,7 @@ MEASURED: dict[str, Perturbation] = {
     "adversarial mask 0.3": AdversarialMask(share=0.3),
     "false unknown 0.2": FalseUnknown(share=0.2),
     "local warp 10 m": LocalWarp(rms_m=10.0),
-    "tilt 3 deg": Tilt(tilt_deg=3.0),
     "central crop 0.3": CentralCrop(share=0.3),
-    "rotation 5 deg": Rotation(angle_deg=5.0),
-    "scale 0.1": Scale(excess=0.1),
-    "lines wider by 1 m": LineWidth(grow_m=1.0),
-    "layers off by 5 m": LayerOffset(offset_m=5.0),
     "leaf on 0.5": Season(kind="leaf_on", strength=0.5),
     "snow 0.5": Season(kind="snow", strength=0.5),
     "low water 0.5": Season(kind="low_water", strength=0.5),

@@ -15,8 +15,9 @@ from sasgeo_bench.tasks.perturbations.season import Season
 
 
 def rates(vanish=0.0, appear=0.0, places=("elsewhere",), names=("building",)):
-    rows = [{"class": name, "vanish_per_year": vanish, "appear_per_year": appear} for name in names]
-    return AgeingRates.from_rows(rows, places=places)
+    return AgeingRates(
+        classes=dict.fromkeys(names, Rates(vanish_per_year=vanish, appear_per_year=appear)), places=places
+    )
 
 
 def houses(per_side=8, size=192, **others):
@@ -113,22 +114,9 @@ def test_a_place_is_never_aged_by_its_own_rates():
         Ageing(years=5, rates=rates(places=("triesen", "vaduz")), place="vaduz")
 
 
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        ({"class": "building", "vanish_per_year": 0.1}, "lacks appear_per_year"),
-        ({"class": "building", "vanish_per_year": -1.0, "appear_per_year": 0.0}, "vanish_per_year lies between"),
-    ],
-)
-def test_rates_that_are_none_are_refused(row, words):
-    with pytest.raises(PerturbError, match=words):
-        AgeingRates.from_rows([row], places=["a"])
-
-
-def test_a_class_named_twice_is_refused():
-    row = {"class": "building", "vanish_per_year": 0.1, "appear_per_year": 0.1}
-    with pytest.raises(PerturbError, match="a second time"):
-        AgeingRates.from_rows([row, row], places=["a"])
+def test_rates_that_are_none_are_refused():
+    with pytest.raises(PerturbError, match="vanish_per_year lies between"):
+        rates(vanish=-1.0)
 
 
 def test_the_rates_set_by_hand_are_those_of_the_taxonomy():

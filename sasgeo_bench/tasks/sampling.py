@@ -21,13 +21,14 @@ from sasgeo_bench.tasks.suites.base import (
     Draft,
     Scene,
     Seeds,
+    Shot,
     Site,
     State,
     Suite,
     Variant,
     changed_share,
 )
-from sasgeo_bench.tasks.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, least_apart_m, mine
+from sasgeo_bench.tasks.suites.mining import STRIDE_M, Decoys, Windows, candidates, describe, min_distance_m, mine
 
 CANDIDATES: Final = (10, 50, 200)  # of a site, in turn
 LEAST_DRAWN: Final = 0.01  # of a view's cells: a map that shows less at the truth leaves nothing to find it by
@@ -104,7 +105,7 @@ class Drawer:
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""
         site, seeds = job.site, self._site_seeds(job.site)
-        draft = self.suite.draw(self.scene, site, job.variant, seeds)
+        draft = self.suite.draw(Shot(scene=self.scene, site=site, variant=job.variant, seeds=seeds))
         group = draft.group or self.group
         if job.track == "retrieval":  # the candidates say where; a disc around the truth would tell which of them
             group = replace(group, radius_m=None)
@@ -211,7 +212,7 @@ class Drawer:
         """Decoys as far from the site's twins as from the site, shape (N, 2)."""
         points = self._mined(state, job.site, job.variant.side_m).points_m
         for twin in self.scene.twins.get(job.site.index, ()):
-            points = points[np.hypot(*(points - twin).T) >= least_apart_m(job.variant.side_m / 2)]
+            points = points[np.hypot(*(points - twin).T) >= min_distance_m(job.variant.side_m / 2)]
         return points
 
     def _candidates(self, job: Job, draft: Draft, state: State, prior: Prior) -> tuple[tuple[Pose, ...], int]:

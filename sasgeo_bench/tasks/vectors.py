@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vectors of a view: lines and outlines in the view's frame, as a table and as features a graph is made of."""
+"""Perceived vectors: lines and outlines in the view's frame, as a table and as features of a graph."""
 
 from typing import Final
 
@@ -18,7 +18,7 @@ _EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere
 
 
 def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.GeoDataFrame:
-    """Gather perceived vectors; coordinates are rounded to a decimetre."""
+    """Return a table of perceived vectors, with coordinates rounded to a decimetre."""
     shapes = np.array([row[3] for row in rows], dtype=object)
     rounded = shapely.transform(shapes, lambda at: at.round(_DECIMALS) + 0.0) if len(rows) else shapes
     return gpd.GeoDataFrame(
@@ -32,10 +32,7 @@ def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.Geo
 
 
 def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.GeoDataFrame:
-    """Instances as the mask alone gives them: one for each connected patch of a class.
-
-    What touches is one; vectors made so carry nothing that the mask does not.
-    """
+    """Return an instance for each connected patch of a class, which adds nothing to the mask."""
     mask = (evidence.layer(class_name) == PRESENT).astype(np.uint8)
     corners = cell_offsets_m(evidence.shape, evidence.cell_size_m)
     step_m = evidence.cell_size_m
@@ -46,13 +43,7 @@ def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.G
 
 
 def as_features(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Perceived vectors as a feature table, so that `graph.build_graph` makes a graph of them.
-
-    Examples
-    --------
-    >>> len(as_features(vector_table([])))
-    0
-    """
+    """Return perceived vectors as a feature table, from which `graph.build_graph` makes a graph."""
     count = len(vectors)
     columns: dict[str, object] = {
         "osm_type": ["way"] * count,

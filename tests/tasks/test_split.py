@@ -132,10 +132,10 @@ def test_a_split_file_with_a_fault_is_refused(text, fault):
         ([TWO[0], TWO[0]], "holdout", "place 'a' is listed twice"),
         ([TWO[0], TWO[1] | {"regions": ["a"]}], "holdout", "region 'a' is listed twice"),
         ([TWO[0], {"name": "b", "regions": ["b"]}], "holdout", "needs a part"),
-        (TWO, "crossfit", "must not say a part"),
-        ([*halved("aabb")[:3], {"name": "d", "regions": ["d"]}], "crossfit", 'place \'d\' needs a half, "a" or "b"'),
+        (TWO, "crossfit", "must not have a part"),
+        ([*halved("aabb")[:3], {"name": "d", "regions": ["d"]}], "crossfit", "place 'd' needs a half"),
         (halved("aaab"), "crossfit", "half 'b' needs two places at least: one is tested, and another one calibrates"),
-        ([TWO[0], TWO[1] | {"half": "a"}], "holdout", "place 'b' must not say a half in a hold-out"),
+        ([TWO[0], TWO[1] | {"half": "a"}], "holdout", "place 'b' must not have a half in a hold-out"),
         ([TWO[0], {"name": "b", "part": "test"}], "holdout", "needs regions or blocks"),
     ],
 )

@@ -140,7 +140,7 @@ class _Look:
         return kept, lost & (self.mixed_up < limit)
 
     def _lose_area(self, mask: Mask, budget_cells: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
-        """Lose whole objects, then edges, then patches; return what is left, and what went apart from the edges."""
+        """Lose whole objects, then edges, then patches; return what is left, and what went elsewhere than at edges."""
         kept = mask & ~_drop(mask, self.errors.dropped * budget_cells, rng)
         edge = _inner_edge(kept, self.noise(detector.EDGE_M, rng), self.errors.frayed * budget_cells, rng)
         kept &= ~edge

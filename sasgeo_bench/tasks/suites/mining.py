@@ -17,18 +17,18 @@ from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State
 
 SCORERS: Final = ("histogram", "rings", "distance", "graph")
 STRIDE_M: Final = 32.0
-LEAST_RADII: Final = 3.0  # no decoy nearer to the truth, in footprint radii (half diagonals)
+LEAST_RADII: Final = 3.0  # least distance of a decoy from the truth, in half diagonals of the footprint
 
 _COARSE_M: Final = 8.0
 RINGS: Final = 4
 _SECTORS: Final = 12
-_FAR_M: Final = 64.0  # distances are cut here: farther than this is far
+_FAR_M: Final = 64.0  # distances are clipped here
 _THIN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "building")
 _NODE_KINDS: Final = (
     *("intersection", "dead_end", "crossing", "building", "building_cluster", "level_crossing"),
     *("river_bend", "road_rail_crossing", "road_water_crossing"),
 )
-_SHORTLIST: Final = 400  # places whose best turn is looked for; the others are too unlike at any turn
+_SHORTLIST: Final = 400  # places whose best rotation is searched; the others are too different at any rotation
 Floats = NDArray[np.float32]
 
 
@@ -82,7 +82,7 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
         np.arange(step // 2, grid.rows, step), np.arange(step // 2, grid.cols, step), indexing="ij"
     )
     square = np.ones((2 * math.ceil(clear_m / grid.cell_size_m) + 1,) * 2, dtype=np.uint8)
-    # Beyond the map nothing is known: the border counts as 0.
+    # Outside the map nothing is known: the border counts as 0.
     whole = (known >= 1).astype(np.uint8)
     mapped = cv2.erode(whole, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)[rows, cols] == 1
     cells = np.column_stack((rows[mapped], cols[mapped])).astype(np.int64)
@@ -195,9 +195,9 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
     No decoy is nearer than `LEAST_RADII` half diagonals to the truth or to another decoy. If decoys were nearer to each
     other than to the truth, the most isolated candidate would be the true one.
     """
-    apart_m = np.hypot(*(windows.points_m - center_m).T)
-    is_far = apart_m >= min_distance_m(windows.radius_m)
-    here = int(np.argmin(apart_m)) if len(apart_m) else -1
+    distance_m = np.hypot(*(windows.points_m - center_m).T)
+    is_far = distance_m >= min_distance_m(windows.radius_m)
+    here = int(np.argmin(distance_m)) if len(distance_m) else -1
     if here < 0 or not is_far.any():
         return Decoys(points_m=np.zeros((0, 2)), scorer=(), alias_index=0.0)
     far = np.flatnonzero(is_far)
@@ -218,9 +218,9 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
 
 def _overlap(shares: Floats, here: int, far: NDArray[np.int64]) -> float:
     """Return the largest overlap of fractions in rings with another place: 1 minus the Bray-Curtis dissimilarity."""
-    apart = np.abs(shares[far] - shares[here]).sum(axis=1)
+    difference = np.abs(shares[far] - shares[here]).sum(axis=1)
     total = (shares[far] + shares[here]).sum(axis=1)
-    return 1.0 - float(np.divide(apart, total, out=np.zeros_like(apart), where=total > 0).min())
+    return 1.0 - float(np.divide(difference, total, out=np.zeros_like(difference), where=total > 0).min())
 
 
 def min_distance_m(radius_m: float) -> float:
@@ -232,7 +232,7 @@ def _distances(windows: Windows, name: str, here: int, far: NDArray[np.int64]) -
     if name in windows.plain:
         table = windows.plain[name]
         return np.asarray(np.linalg.norm(table[far] - table[here], axis=1))
-    # Turns: the spectrum's magnitude is blind to them and picks the short list; there, the best turn counts.
+    # The magnitude of the spectrum does not depend on rotation and gives the short list; there the best one counts.
     rough = np.linalg.norm(windows.spectrum[far] - windows.spectrum[here], axis=1)
     short = np.argsort(rough, kind="stable")[:_SHORTLIST]
     ours, theirs = windows.polar[here], windows.polar[far[short]]
@@ -255,7 +255,7 @@ def _in_turn(
     reach = int(np.ceil(spacing_m / STRIDE_M))
     aside = np.arange(-reach, reach + 1) * STRIDE_M
     disc = np.hypot(aside[:, None], aside[None, :]) < spacing_m
-    # One cell for each place of the lattice, and a rim as wide as the disc, so that it need not be cut.
+    # One cell for each place of the lattice, with a margin as wide as the disc, so that it need not be clipped.
     is_taken = np.zeros(places.max(axis=0) + 1 + 2 * reach, dtype=bool)
     flat = np.ravel_multi_index(tuple((places + reach).T), is_taken.shape)
     taken, at = 0, [0] * len(order)
@@ -298,8 +298,14 @@ def candidates(
     """
     points = decoys_m if truth is None else np.vstack((np.array([truth]), decoys_m))
     moved = points + rng.uniform(-jitter_m, jitter_m, points.shape)
-    order = rng.permutation(len(moved))
-    poses = tuple(
-        Pose(easting_m=round(float(x), 2), northing_m=round(float(y), 2), yaw_deg=yaw_deg) for x, y in moved[order]
-    )
+    poses, order = shuffled_poses(moved, yaw_deg=yaw_deg, rng=rng)
     return poses, -1 if truth is None else int(np.argmin(order))
+
+
+def shuffled_poses(
+    points_m: NDArray[np.float64], *, yaw_deg: float, rng: np.random.Generator
+) -> tuple[tuple[Pose, ...], NDArray[np.int64]]:
+    """Return poses at points, shape (N, 2), in random order, and that order."""
+    order = rng.permutation(len(points_m))
+    easts_norths = points_m[order].tolist()
+    return tuple(Pose(easting_m=round(x, 2), northing_m=round(y, 2), yaw_deg=yaw_deg) for x, y in easts_norths), order

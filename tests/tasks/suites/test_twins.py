@@ -314,9 +314,9 @@ def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_i
         plain_at, changed_at = (pose, site.pose) if is_changed(site) else (site.pose, pose)
         wanted = changed_at if made.suite.falsifier_sees_change else plain_at
         shot = Shot(scene=made.scene, site=site, variant=made.suite.variants[0], seeds=made.seeds)
-        pose = made.suite._uninformative_pose(shot)
-        assert (pose.easting_m, pose.northing_m) == (wanted.easting_m, wanted.northing_m)
-        assert pose.yaw_deg == site.pose.yaw_deg
+        taken = made.suite._uninformative_pose(shot)
+        assert (taken.easting_m, taken.northing_m) == (wanted.easting_m, wanted.northing_m)
+        assert taken.yaw_deg == site.pose.yaw_deg
 
 
 def test_vectors_of_the_instance_falsifier_follow_from_the_mask(carried):

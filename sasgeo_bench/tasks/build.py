@@ -324,18 +324,8 @@ def put_task(
 ) -> Made:
     """Write queries below `out/tasks` and their truths below `out/truth`, each folder whole or not at all.
 
-    Parameters
-    ----------
-    pairs : iterable of (Query, Truth)
-        In the order of the query ids.
-    about : dict
-        Contents of `task.json`; `suite` and `region` name the folders, `sites` counts the sites.
-    hidden : dict
-        Contents of `truth.json`; `task.json` repeats those of a private seed.
-    out : Path
-        Root.
-    tell : callable
-        Receives a line when another run has to finish first.
+    `pairs` are in the order of the query ids. `about` becomes `task.json`; its `suite` and `region` name the folders.
+    `hidden` becomes `truth.json`; `task.json` repeats the commitment of a private seed.
 
     Raises
     ------

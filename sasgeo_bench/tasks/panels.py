@@ -28,20 +28,10 @@ def panels(
     query_id: str | None = None,
     choose: Callable[[Sequence[Truth]], Sequence[Truth]] | None = None,
 ) -> tuple[Panel, ...]:
-    """Choose queries of a task for a contact sheet: each kind and strength of a site, site by site.
+    """Choose up to `count` queries of a task for a contact sheet: each kind and strength of a site, site by site.
 
-    Parameters
-    ----------
-    task_folder, truth_folder : Path
-        A task and its truths.
-    out : Path
-        Root with the regions that the task searches.
-    count : int
-        Largest number of panels.
-    query_id : str, optional
-        Beginning of the id of the only query to show.
-    choose : callable, optional
-        Selects and orders the truths instead.
+    `out` is the root of the regions. With `query_id` only the query whose id begins so is shown; `choose` selects and
+    orders the truths instead.
 
     Raises
     ------

@@ -19,17 +19,8 @@ _DIGITS: Final = re.compile(r"[0-9a-f]{1,1024}")
 class PrivateSeed:
     """A seed that is never written: files hold its commitment, messages and `repr` nothing.
 
-    Parameters
-    ----------
-    text : str
-        Random digits, decimal or hexadecimal, as of `secrets.token_hex(16)`.
-    file : Path, optional
-        File of the seed; matchers must not see it.
-
-    Raises
-    ------
-    ConfigError
-        If the text holds anything but digits; the message does not quote it.
+    `text` holds random digits, decimal or hexadecimal, as of `secrets.token_hex(16)`; anything else raises a
+    ConfigError that does not quote it. Matchers must not see `file`.
 
     Examples
     --------

@@ -294,21 +294,10 @@ def away(
     share_of: Callable[[tuple[float, float], float], float],
     rng: np.random.Generator,
 ) -> Prior:
-    """Move a prior's disc so that the truth is outside, `away_m` to 1.5 `away_m` from its rim.
+    """Move a prior's disc so that the truth `pose` is outside, `away_m` to 1.5 `away_m` from its rim.
 
-    Parameters
-    ----------
-    prior : Prior
-        One with the truth inside.
-    pose : Pose
-        The truth.
-    away_m : float
-        Least distance between the truth and the disc.
-    share_of : callable
-        (centre, radius) -> mapped fraction of a disc. Of many moves the one is taken that keeps this fraction most
-        nearly: a disc half outside the map would reveal that the truth is not in it.
-    rng : numpy.random.Generator
-        Random numbers.
+    `share_of` gives the mapped fraction of a disc (centre, radius). Of many moves the one is taken that keeps this
+    fraction most nearly: a disc half outside the map would reveal that the truth is not in it.
 
     Raises
     ------

@@ -19,17 +19,10 @@ _PR_SET_DUMPABLE: Final = 4
 
 
 def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None) -> PrivateSeed | None:
-    """Take the private seed of a file or of the environment; None without any.
+    """Take the private seed of a file `<name>.seed`, or of the environment; None without any.
 
     The variable is removed from the environment. From then on other processes of the user can read neither the memory
     nor the initial environment of this one (Linux).
-
-    Parameters
-    ----------
-    file : Path, optional
-        A file `<name>.seed` that only its owner can read.
-    environ : mutable mapping, optional
-        The environment of the process unless given.
 
     Raises
     ------

@@ -305,9 +305,7 @@ def nearest_blocks(parts: Mapping[str, Sequence[Block]], *, within_m: float = ma
     return best
 
 
-def _group_pairs(
-    groups: Mapping[tuple[str, str], list[Block]],
-) -> Iterator[tuple[float, list[Block], list[Block]]]:
+def _group_pairs(groups: Mapping[tuple[str, str], list[Block]]) -> Iterator[tuple[float, list[Block], list[Block]]]:
     """Yield pairs of groups of different parts with a lower bound of their distance, metres."""
     centres = {key: _disc(blocks) for key, blocks in groups.items()}
     for first, second in combinations(groups, 2):
@@ -348,9 +346,9 @@ def list_split_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
     return list_documents("splits", SplitFile, folders)
 
 
-def find_split_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
+def find_split_file(id_or_path: str) -> Path:
     """Find a split file by its id or path; raise as `find_document` does."""
-    return find_document(id_or_path, "split", "or name a .toml file", lambda: list_split_files(folders=folders))
+    return find_document(id_or_path, "split", "or name a .toml file", list_split_files)
 
 
 def find_split(id_or_path: str, *, folders: Sequence[Path] = ()) -> Split:

@@ -109,23 +109,10 @@ def write_task(
     about: dict[str, Any],
     hidden: dict[str, Any] | None = None,
 ) -> int:
-    """Write queries and truths, a row group at a time, then `task.json`, which completes the task.
+    """Write queries and truths into two empty folders, by row groups, then `task.json`, which completes the task.
 
-    Parameters
-    ----------
-    task_folder, truth_folder : Path
-        Two empty folders.
-    pairs : iterable of (Query, Truth)
-        In the order of the query ids, which reveals nothing about the answers.
-    about : dict
-        Contents of `task.json` besides counts and hashes.
-    hidden : dict, optional
-        Contents of `truth.json` besides the hash of the queries.
-
-    Returns
-    -------
-    int
-        Number of queries.
+    `pairs` are in the order of the query ids, which reveals nothing about the answers. `about` and `hidden` are the
+    contents of `task.json` and `truth.json` besides counts and hashes. Return the number of queries.
     """
     counts: dict[str, int] = {}
     groups: set[str] = set()
@@ -208,9 +195,12 @@ def read_task(folder: Path) -> dict[str, Any]:
     try:
         check_document(content, TaskManifest, source=TASK)
     except ConfigError as error:
-        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
-        raise StoreError(message) from error
+        raise _damaged(path, error) from error
     return about
+
+
+def _damaged(path: Path, fault: object) -> StoreError:
+    return StoreError(f"{path} is damaged ({str(fault)[:200]}): {_MEND}")
 
 
 def check_queries(folder: Path) -> None:
@@ -407,8 +397,7 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
         for batch in source.iter_batches(batch_size=_ROWS, columns=list(columns)):
             empty = next((name for name in columns if name not in MAY_BE_NULL and batch[name].null_count), None)
             if empty is not None:
-                message = f"{path} is damaged ({empty} is null in a row): {_MEND}"
-                raise StoreError(message)
+                raise _damaged(path, f"{empty} is null in a row")
             yield batch
 
 
@@ -440,8 +429,7 @@ def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:
     try:
         return make(row)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
-        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
-        raise StoreError(message) from error
+        raise _damaged(path, error) from error
 
 
 def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:

@@ -28,22 +28,9 @@ PRIVATE_ROOT: Final = "private"  # below the root of public queries, so that no 
 class Settings:
     """Settings of all requests of a user.
 
-    Parameters
-    ----------
-    count : int
-        Sites; each carries all variants of the suite.
-    seed : int or PrivateSeed
-        Random seed.
-    out : Path
-        Root of the output.
-    group : PriorGroup, optional
-        Priors; those of the suite unless given.
-    extract_folders : sequence of Path
-        Where extracts of regions to build are looked for.
-    may_be_fewer : bool
-        Whether fewer sites will do if the region holds no more.
-    choice : Choice
-        Selected variants of the suite; the selection does not change their queries.
+    `count` is the number of sites, each with all variants of a suite; with `may_be_fewer`, fewer will do if the region
+    holds no more. Priors are those of the suite unless `group` is given. `choice` selects variants and does not change
+    their queries.
     """
 
     count: int
@@ -108,13 +95,7 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         raise ConfigError(message)
     settings = {item.name: getattr(wanted, item.name) for item in fields(Settings)}
     return tuple(
-        Request(
-            suite=name,
-            region=item,
-            split=split,
-            elsewhere=wrong_place(split, item, known),
-            **settings,
-        )
+        Request(suite=name, region=item, split=split, elsewhere=wrong_place(split, item, known), **settings)
         for item in {item.id: item for item in named}.values()
         for name in dict.fromkeys(wanted.suites)
     )

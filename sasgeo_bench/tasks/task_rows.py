@@ -21,15 +21,8 @@ from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth
 POSE_FIELDS: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
 # Columns that are fields of a query, and of its prior.
 _FIELDS: Final = (
-    "query_id",
-    "track",
-    "suite",
-    "suite_version",
-    "part",
-    "region",
-    "observed_on",
-    "season",
-    "prior_group",
+    *("query_id", "track", "suite", "suite_version", "part", "region"),
+    *("observed_on", "season", "prior_group"),
 )
 _PRIOR_FIELDS: Final = ("radius_m", "yaw_deg", "yaw_sigma_deg", "scale_sigma")
 _POSE: Final = pa.struct([(name, pa.float64()) for name in POSE_FIELDS])

@@ -6,7 +6,6 @@ from typing import Final
 import geopandas as gpd
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from rasterio.features import shapes as polygons_of
 
 from sasgeo_bench.osm.features import DTYPES, make_features
@@ -55,12 +54,7 @@ def as_features(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         "is_bridge": vectors["is_bridge"].to_numpy(),
         "is_tunnel": np.zeros(count, dtype=bool),
         "is_visible": np.ones(count, dtype=bool),
-        "width_m": _widths(vectors),
+        "width_m": np.where(shapely.get_dimensions(vectors.geometry.to_numpy()) == 1, 4.0, np.nan),
         "geometry": vectors.geometry.to_numpy(),
     }
     return make_features({name: columns[name] for name in (*DTYPES, "geometry")}, epsg=_EPSG)
-
-
-def _widths(vectors: gpd.GeoDataFrame) -> NDArray[np.float64]:
-    is_line = shapely.get_dimensions(vectors.geometry.to_numpy()) == 1
-    return np.where(is_line, 4.0, np.nan)

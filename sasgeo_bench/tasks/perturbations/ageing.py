@@ -7,7 +7,7 @@ may have been trained on them.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from scipy import ndimage
@@ -97,9 +97,6 @@ class Ageing:
     Traceback (most recent call last):
     sasgeo_bench.errors.PerturbError: Ageing: the rates come from 'vaduz' itself, take those of other places
     """
-
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"years": 0.0}
-    MOVES: ClassVar[bool] = False
 
     years: float
     rates: AgeingRates

@@ -4,9 +4,8 @@
 Cells no longer overlap with the map, while roads keep their order: a graph should withstand that, a raster cannot.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +36,6 @@ class LocalWarp:
     the field folds, and some ground is seen twice (`folded_share`): at 5 m nothing, at 10 m 0.005 of the view, at 15 m
     0.08.
     """
-
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"rms_m": 0.0}
-    MOVES: ClassVar[bool] = True
 
     rms_m: float
 

@@ -5,10 +5,10 @@ Errors are correlated in space, as a network's are; no cell is flipped independe
 score that the detector reaches on each class.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import ClassVar, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -54,9 +54,6 @@ class Perception:
     the rest. The tests hold the measured F1 to within 0.06 of the target, pooled over views of towns, for classes that
     cover a third of their `usual_share` or more. For rarer ones, `SEEN_ANYWHERE` makes it lower.
     """
-
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"error_factor": 0.0}
-    MOVES: ClassVar[bool] = False
 
     error_factor: float = 1.0
 

@@ -13,19 +13,9 @@ Metres = NDArray[np.floating]
 
 
 def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
-    """Fill each cell from the cell that holds a given place; UNKNOWN if the place is outside the view.
+    """Fill each cell from the place (`right_m`, `up_m`) metres from the middle; UNKNOWN if that is outside the view.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        The view.
-    right_m, up_m : ndarray of float, shape (rows, cols)
-        Place that each cell shows, metres from the middle.
-
-    Returns
-    -------
-    Evidence
-        A view of the same frame. Confidence moves with its cell and is 0 outside the view.
+    Both places broadcast to shape (rows, cols). Confidence moves with its cell and is 0 outside the view.
 
     Examples
     --------

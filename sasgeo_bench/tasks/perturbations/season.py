@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Seasons: changes of a view by leaves, snow, drought and harvest, class by class."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -49,9 +48,6 @@ class Season:
     >>> Season(kind="snow", strength=1.0)(view, np.random.default_rng(0)).cells[:, 0].tolist()
     [[0, 0, 0, 0], [2, 2, 2, 2]]
     """
-
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"strength": 0.0}
-    MOVES: ClassVar[bool] = False
 
     kind: Kind
     strength: float

@@ -139,14 +139,7 @@ class Variant:
 class Choice:
     """A selection of a suite's variants; an empty field selects all.
 
-    Parameters
-    ----------
-    views_cells : tuple of int
-        Sizes of views, of controls and falsifiers too.
-    kinds : tuple of str
-        Prefixes of kinds of stress; controls and falsifiers are always selected.
-    tracks : tuple of str
-        Tracks.
+    `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected.
 
     Examples
     --------
@@ -289,19 +282,16 @@ class Suite(ABC):
         """Return what the region lacks for this suite, or None."""
         return None if scene.map.drawn.any() else "no road, building or other thing to hold on to"
 
-    def usable(self, scene: Scene) -> tuple[Variant, ...]:
+    def usable(self, scene: Scene) -> tuple[Variant, ...]:  # noqa: ARG002
         """Return the variants that the scene allows."""
-        del scene
         return self.variants
 
-    def map_region(self, scene: Scene, variant: Variant) -> str:
+    def map_region(self, scene: Scene, variant: Variant) -> str:  # noqa: ARG002
         """Return the name of the map that a variant's queries search."""
-        del variant
         return scene.map.region
 
-    def tracks(self, variant: Variant) -> tuple[Track, ...]:
+    def tracks(self, variant: Variant) -> tuple[Track, ...]:  # noqa: ARG002
         """Return the tracks of a variant."""
-        del variant
         return self.card.tracks
 
     @property
@@ -310,23 +300,20 @@ class Suite(ABC):
         sides_m = [variant.side_m for variant in self.variants]
         return max(set(sides_m), key=lambda side_m: (sides_m.count(side_m), -side_m))
 
-    def spacing_m(self, scene: Scene) -> float:
+    def spacing_m(self, scene: Scene) -> float:  # noqa: ARG002
         """Return the least distance between two sites."""
-        del scene
         return self.main_side_m
 
     def clear_m(self, scene: Scene) -> float:
         """Return half the side of the square around a site that must be mapped: the reach of the largest view."""
         return scene.view_reach_m
 
-    def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
+    def anchors(self, scene: Scene) -> NDArray[np.float64] | None:  # noqa: ARG002
         """Return places (easting, northing) that sites must be near, shape (N, 2); None for anywhere."""
-        del scene
         return None
 
-    def edit(self, scene: Scene, sites: Sequence[Site], seeds: "Seeds") -> Edit | None:
+    def edit(self, scene: Scene, sites: Sequence[Site], seeds: "Seeds") -> Edit | None:  # noqa: ARG002
         """Return the changes of map and world that the sites need, or None."""
-        del scene, sites, seeds
         return None
 
     @abstractmethod
@@ -413,11 +400,7 @@ def changed_share(first: Evidence, second: Evidence) -> float:
 
 
 def ladder(
-    kind: str,
-    strengths: tuple[float, ...],
-    *,
-    small: tuple[float, ...] = (),
-    large: tuple[float, ...] = (),
+    kind: str, strengths: tuple[float, ...], *, small: tuple[float, ...] = (), large: tuple[float, ...] = ()
 ) -> tuple[Variant, ...]:
     """Return stress variants: strengths at the main view, and at the views half and twice as wide.
 
@@ -433,6 +416,15 @@ def ladder(
         Variant(role="stress", kind=kind, strength=strength, view_cells=cells)
         for cells, listed in ((MAIN_VIEW_CELLS, strengths), (min(VIEW_CELLS), small), (max(VIEW_CELLS), large))
         for strength in listed
+    )
+
+
+def pair(control: str, stress: str, falsifier: str) -> tuple[Variant, ...]:
+    """Return a control, a stress of strength 1 and a falsifier of these kinds."""
+    return (
+        Variant(role="control", kind=control),
+        Variant(role="stress", kind=stress, strength=1.0),
+        Variant(role="falsifier", kind=falsifier),
     )
 
 

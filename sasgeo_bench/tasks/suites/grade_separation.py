@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of
 from sasgeo_bench.tasks.twin import ROADS, level_crossings
 
@@ -48,11 +48,7 @@ SUITE: Final = GradeSeparation(
         group=TWIN_GROUP,
         min_density=0.02,
     ),
-    variants=(
-        Variant(role="control", kind="no vectors"),
-        Variant(role="stress", kind="G4", strength=1.0),
-        Variant(role="falsifier", kind="bridge withheld"),
-    ),
+    variants=pair("no vectors", "G4", "bridge withheld"),
     change_of=lambda scene, site, rng: level_crossings,  # noqa: ARG005 - the same at every site
     find=_overpasses,
     needs="no bridge that carries one road over another",

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, with_neighbours
 from sasgeo_bench.tasks.twin import split_long
 from sasgeo_bench.tasks.vectors import instances_of_mask
@@ -50,11 +50,7 @@ SUITE: Final = InstanceTwins(
         group=TWIN_GROUP,
         min_density=0.05,
     ),
-    variants=(
-        Variant(role="control", kind="no vectors"),
-        Variant(role="stress", kind="G3", strength=1.0),
-        Variant(role="falsifier", kind="instances of the mask"),
-    ),
+    variants=pair("no vectors", "G3", "instances of the mask"),
     change_of=lambda scene, site, rng: (  # noqa: ARG005 - the same at every site
         lambda piece: split_long(piece, piece_m=HOUSE_M, least_area_m2=LEAST_AREA_M2)
     ),

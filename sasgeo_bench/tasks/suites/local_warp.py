@@ -56,9 +56,5 @@ SUITE: Final = LocalWarpSuite(
         falsifier="A field of 0 m: scores as in the control.",
         strength_unit="m rms of the shift",
     ),
-    variants=(
-        *controls(),
-        *ladder("G1", RMS_M, small=RMS_M, large=(15.0,)),
-        Variant(role="falsifier", kind="no warp"),
-    ),
+    variants=(*controls(), *ladder("G1", RMS_M, small=RMS_M, large=(15.0,)), Variant(role="falsifier", kind="no warp")),
 )

@@ -50,22 +50,10 @@ class Windows:
 
 
 def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
-    """Describe every mapped place of a map for views of one size.
+    """Describe every mapped place of a map, on a lattice, for views of one side.
 
-    Parameters
-    ----------
-    state : State
-        The map.
-    side_m : float
-        Side of the view.
-    clear_m : float
-        Half the side of the square that must be mapped, as around a site: a place nearer to the rim of the map could
-        not be the true one.
-
-    Returns
-    -------
-    Windows
-        All such places on a lattice.
+    A square of half side `clear_m` around a place must be mapped, as around a site: a place nearer to the rim of the
+    map could not be the true one.
 
     Notes
     -----

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.suites.base import Scene, Shot, Site, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.base import Scene, Shot, Site, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of, with_neighbours
 from sasgeo_bench.tasks.twin import Change, open_gaps, stagger
 
@@ -86,11 +86,7 @@ SUITE: Final = TopologyTwins(
         group=TWIN_GROUP,
         min_density=0.05,
     ),
-    variants=(
-        Variant(role="control", kind="no vectors"),
-        Variant(role="stress", kind="G2", strength=1.0),
-        Variant(role="falsifier", kind="gaps closed"),
-    ),
+    variants=pair("no vectors", "G2", "gaps closed"),
     change_of=_change,
     find=_junctions,
     needs="no two junctions near each other",

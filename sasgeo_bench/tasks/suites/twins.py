@@ -32,25 +32,13 @@ ChangeOf = Callable[[Scene, Site, np.random.Generator], Change]
 class TwinSuite(Suite):
     """Base of suites whose sites have twins: copies elsewhere on the map that differ by one change.
 
-    At every second site the true place has the change and the twin does not, so that "take the plainer one" does not
-    help. The true place is drawn by lot from the original and its copies, so that "take the one whose roads continue"
-    does not help either. A view shows the true place; the twins are among its candidates.
+    At every second site (if `is_swapped`) the true place has the change and the twin does not, so that "take the
+    plainer one" does not help. The true place is drawn by lot from the original and its copies, so that "take the one
+    whose roads continue" does not help either. A view shows the true place; the twins are among its candidates.
 
-    Parameters
-    ----------
-    change_of : callable, optional
-        (scene, site, rng) -> change of the copy.
-    find : callable, optional
-        Scene -> easting and northing of the places that sites are near, shape (N, 2); anywhere unless given.
-    needs : str
-        What a region without such places lacks.
-    copies : int
-        Twins of a site.
-    is_swapped : bool
-        Whether every second site is changed in place.
-    falsifier_sees_change : bool
-        Whether the falsifier's vectors are those of the changed place, else of the plain one, at every site. So they do
-        not show which of the two is seen.
+    `change_of` returns the change of a site's copy. `find` returns the places that sites are near, shape (N, 2), and
+    `needs` names what a region without any lacks. The falsifier's vectors are those of the changed place if
+    `falsifier_sees_change`, else of the plain one, at every site; so they do not show which of the two is seen.
     """
 
     change_of: ChangeOf | None = None

@@ -25,14 +25,8 @@ _WAVELENGTHS_M: Final = (60.0, 150.0)
 class VectorNoise:
     """Errors of perceived vectors.
 
-    Parameters
-    ----------
-    missed_share : float
-        Fraction of objects that are missed.
-    gap_share, gap_m : float
-        Fraction of lines with a gap, and its length.
-    shift_m : float
-        Root mean square of a smooth shift of all coordinates, each axis; lines that meet still do.
+    Fractions of missed objects and of lines with a gap of `gap_m`; root mean square `shift_m` of a smooth shift of all
+    coordinates, each axis, which keeps junctions.
     """
 
     missed_share: float = 0.10

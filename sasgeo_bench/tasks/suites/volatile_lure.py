@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite
 from sasgeo_bench.tasks.twin import mirror
 
@@ -62,10 +62,6 @@ SUITE: Final = VolatileLure(
         group=TWIN_GROUP,
         min_density=0.04,
     ),
-    variants=(
-        Variant(role="control", kind="unchanged"),
-        Variant(role="stress", kind="S2", strength=1.0),
-        Variant(role="falsifier", kind="unchanged again"),
-    ),
+    variants=pair("unchanged", "S2", "unchanged again"),
     is_swapped=False,
 )

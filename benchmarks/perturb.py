@@ -20,7 +20,7 @@ from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import Perturbation, share_changed, share_hidden
 from sasgeo_bench.tasks.perturbations.border import Border
 from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
@@ -37,7 +37,7 @@ TOWNS = ("town-suburb", "town-riverside", "town-agricultural")
 VIEWS_PER_TOWN = 4
 SIZE_CELLS = 192
 
-RATES = AgeingRates.set_by_hand()
+RATES = rates_by_hand()
 MEASURED: dict[str, Perturbation] = {
     "perception, in domain": Perception(error_factor=1.0),
     "perception, across domains": Perception(error_factor=2.0),

@@ -88,9 +88,7 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
     They are unchanged, request and program version are the same, and a build would give the map they search.
     """
     sha256 = _request_sha256(request)
-    suite_folder = request.out / "truth" / request.suite
-    hidden = {path.name: task_files.read_hidden(path) for path in sorted(suite_folder.glob(f"{request.region.id}*"))}
-    drawn = {name: record for name, record in hidden.items() if record.get("request_sha256") == sha256}
+    drawn = {name: record for name, record in _records(request).items() if record.get("request_sha256") == sha256}
     if not drawn or any(record.get("maps") != len(drawn) for record in drawn.values()):
         return None
     folders = tuple(request.out / "tasks" / request.suite / name for name in drawn)
@@ -105,13 +103,7 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
 
 def why_to_draw(request: Request) -> str:
     """Return in a few words why a request has to be drawn."""
-    suite_folder = request.out / "truth" / request.suite
-    folders = (
-        path
-        for path in sorted(suite_folder.glob(f"{request.region.id}*"))
-        if is_of_region(path.name, request.region.id)
-    )
-    records = [record for record in map(task_files.read_hidden, folders) if record]
+    records = [record for record in _records(request).values() if record]
     if not records:
         return "not there yet"
     if any(record.get("request_sha256") == _request_sha256(request) for record in records):
@@ -122,6 +114,12 @@ def why_to_draw(request: Request) -> str:
     if not {request.count, None} & set(counts):
         return f"drawn with sites = {counts[0]}, now {request.count}"
     return "drawn by other settings or an older version"
+
+
+def _records(request: Request) -> dict[str, dict[str, Any]]:
+    """Return by map the contents of `truth.json` of a request's suite and region."""
+    folders = sorted((request.out / "truth" / request.suite).glob(f"{request.region.id}*"))
+    return {path.name: task_files.read_hidden(path) for path in folders if is_of_region(path.name, request.region.id)}
 
 
 def is_of_region(name: str, region: str) -> bool:
@@ -136,7 +134,6 @@ def is_of_region(name: str, region: str) -> bool:
 
 
 def _request_sha256(request: Request) -> str:
-    """Return the hash of all that decides the queries of a request."""
     elsewhere = None if request.elsewhere is None else request.elsewhere.model_dump(mode="json")
     content = {
         "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
@@ -295,7 +292,6 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
 
 
 def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
-    """Write one task for every searched map."""
     jobs = drawer.jobs(sites)
     why = {job.query_id: drawer.why_not(job) for job in jobs}
     left = [job for job in jobs if why[job.query_id] is None]

@@ -82,19 +82,7 @@ def _keys(numbers: NDArray[np.int64]) -> NDArray[np.uint64]:
 
 
 def find_duplicate(first: Constellations, second: Constellations) -> Duplicate | None:
-    """Return the largest patch whose buildings match up to a move and a rotation; None below `LEAST_ALIKE` buildings.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(1)
-    >>> at, size = rng.uniform(0, 400, (60, 2)), rng.uniform(7, 15, 60)
-    >>> def table(points):
-    ...     squares = [shapely.box(x, y, x + side, y + side) for (x, y), side in zip(points, size, strict=True)]
-    ...     return gpd.GeoDataFrame({"class": "building", "is_visible": True}, index=range(60), geometry=squares)
-    >>> maps = [constellations(table(at + move)) for move in (0.0, 5000.0)]
-    >>> find_duplicate(*maps).count > 50
-    True
-    """
+    """Return the largest patch whose buildings match up to a move and rotation; None below `LEAST_ALIKE` buildings."""
     one, two = _matches(first, second)
     if len(one) < LEAST_ALIKE:
         return None

@@ -128,6 +128,5 @@ def _drawn(evidence: Evidence) -> Evidence:
 
 
 def _only(evidence: Evidence, classes: Sequence[str]) -> Evidence:
-    """Return some classes of a view, in the order given."""
     cells = evidence.cells[[evidence.classes.index(name) for name in classes]]
     return Evidence(classes=tuple(classes), cells=cells, cell_size_m=evidence.cell_size_m)

@@ -65,13 +65,7 @@ Seed = int | PrivateSeed
 
 
 def seed_record(seed: Seed) -> dict[str, Any]:
-    """Return what files hold of a seed: a public one itself, of a private one the commitment and its bits.
-
-    Examples
-    --------
-    >>> seed_record(7)
-    {'seed': 7}
-    """
+    """Return what files hold of a seed: a public one itself, of a private one the commitment and its bits."""
     if isinstance(seed, int):
         return {"seed": seed}
     return {"private_seed": {"commitment": seed.commitment, "bits": seed.bits}}

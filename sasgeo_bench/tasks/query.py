@@ -3,6 +3,7 @@
 
 import datetime as dt
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Final, Literal, Self
 
 import geopandas as gpd
@@ -16,6 +17,7 @@ TASK_VERSION: Final = 2  # of queries.parquet and truth.parquet: raised when the
 TASK_VERSIONS: Final = (1, TASK_VERSION)  # readable versions: their files are alike
 
 Track = Literal["retrieval", "localization"]
+Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite
@@ -58,7 +60,7 @@ class PriorGroup:
     """
 
     radius_m: float | None
-    yaw: Literal["known", "weak", "unknown"]
+    yaw: Yaw
     scale_sigma: float
 
     @property
@@ -70,13 +72,8 @@ class PriorGroup:
     @classmethod
     def parse(cls, name: str) -> Self:
         """Return the group of a name; raise a ConfigError if there is none."""
-        groups = {
-            group.name: group
-            for radius_m in RADII_M
-            for yaw in ("known", "weak", "unknown")
-            for scale_sigma in SCALE_SIGMAS
-            for group in (cls(radius_m=radius_m, yaw=yaw, scale_sigma=scale_sigma),)
-        }
+        declared = product(RADII_M, YAWS, SCALE_SIGMAS)
+        groups = {group.name: group for group in (cls(radius_m=r, yaw=y, scale_sigma=s) for r, y, s in declared)}
         if name not in groups:
             message = (
                 f"{name!r} is no prior group: r100, r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
@@ -88,10 +85,23 @@ class PriorGroup:
 
 RADII_M: Final = (None, 100.0, 250.0, 500.0, 2000.0)
 SCALE_SIGMAS: Final = (0.03, 0.10, 0.15)
+YAWS: Final[tuple[Yaw, ...]] = ("known", "weak", "unknown")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Query:
+class _Question:
+    query_id: str
+    track: Track
+    suite: str
+    suite_version: int
+    part: str
+    region: str
+    prior_group: str
+    candidates: tuple[Pose, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Query(_Question):
     """One question to a matcher.
 
     Parameters
@@ -100,57 +110,35 @@ class Query:
         Reveals nothing about the answer.
     track : {"retrieval", "localization"}
         Whether to rank `candidates` or to find poses.
-    suite, suite_version : str, int
-        Its suite.
-    part : str
-        "train", "calibration", "test", or "crossfit".
+    suite, suite_version, part : str, int, str
+        Its suite, and "train", "calibration", "test", or "crossfit".
     region : str
         Folder name of the map to search.
     evidence : Evidence
         The view.
-    observed_on : date
-        Date of the view.
-    season : str
-        Season of the view: "leaf_on", "snow", "low_water", "harvest", or "" for unspecified.
-    prior : Prior
-        What is known before.
-    prior_group : str
-        Name of its group.
+    observed_on, season : date, str
+        Date and season of the view: "leaf_on", "snow", "low_water", "harvest", or "" for unspecified.
+    prior, prior_group : Prior, str
+        What is known before, and the name of its group.
     candidates : tuple of Pose
         For retrieval: the places to rank; empty for localization.
     vectors : geopandas.GeoDataFrame, optional
         Perceived vectors in the view's frame ((right, up) from its middle, metres): columns class, level, is_bridge.
     """
 
-    query_id: str
-    track: Track
-    suite: str
-    suite_version: int
-    part: str
-    region: str
     evidence: Evidence
     observed_on: dt.date
     season: str
     prior: Prior
-    prior_group: str
-    candidates: tuple[Pose, ...] = ()
     vectors: gpd.GeoDataFrame | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Head:
+class Head(_Question):
     """A query without its view: all that scoring needs of it. `view_cells` is the side of the view."""
 
-    query_id: str
-    track: Track
-    suite: str
-    suite_version: int
-    part: str
-    region: str
     view_cells: int
     cell_size_m: float
-    prior_group: str
-    candidates: tuple[Pose, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,18 +147,14 @@ class Truth:
 
     Parameters
     ----------
-    query_id : str
-        Of the query.
     is_present : bool
         Whether the place is on the searched map (for retrieval: among the candidates).
     pose : Pose, optional
         Where the view was taken; None if it was not taken in this map.
     candidate : int
         Index of the right candidate; -1 for localization or if it is absent.
-    pair_id : str
-        Shared by all queries of one site: a control and its stresses.
-    role : {"control", "stress", "falsifier"}
-        Role of the query within the site.
+    pair_id, role : str
+        Site, shared by a control and its stresses, and "control", "stress" or "falsifier".
     kind : str
         Kind within the suite, as in "U2 wedge".
     strength, strength_unit : float, str
@@ -180,10 +164,8 @@ class Truth:
         a road, building or other drawn feature on the map of the seen place.
     alias_index : float, optional
         Likeness of the most similar other place, 0..1; None if the view was not taken at the site.
-    block : str
-        Evaluation block of the centre; resampling is by block.
-    scene : str
-        Scene tags of the region.
+    block, scene : str
+        Evaluation block of the centre, the unit of resampling, and scene tags of the region.
     measured : mapping of str to float
         Manipulation check: measures of the applied change.
     """

@@ -13,7 +13,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
-from sasgeo_bench.tasks.split import Block, Split
+from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.suites.base import (
     DRAWN_CLASSES,
     EVERYTHING,
@@ -126,16 +126,13 @@ class Drawer:
             prior = away(prior, pose, away_m=draft.away_m, share_of=self._share_of_disc(state), rng=rng)
             draft = replace(draft, measured=draft.measured | {"away_m": round(_outside_m(prior, pose), 1)})
         decoys = self._mined(state, site, job.variant.side_m)
-        places: tuple[Pose, ...] = ()
-        right = -1
-        if job.track == "retrieval":
-            places, right = self._candidates(job, draft, state, prior)
+        places, right = self._candidates(job, draft, state, prior) if job.track == "retrieval" else ((), -1)
         query = Query(
             query_id=job.query_id,
             track=job.track,
             suite=self.suite.card.name,
             suite_version=self.suite.card.version,
-            part=self.split.part_in_task(self._block(site)),
+            part=self.split.part_in_task(next(block for block in self.scene.blocks if block.id == site.block)),
             region=state.region,
             evidence=draft.evidence,
             observed_on=self.scene.world.date,
@@ -148,7 +145,6 @@ class Drawer:
         return query, self._truth(job, draft, state, decoys, right)
 
     def _share_of_disc(self, state: State) -> Callable[[tuple[float, float], float], float]:
-        """Return a function that gives the mapped fraction of a disc."""
         turns = np.arange(_SAMPLES) * _GOLDEN
         spiral = np.sqrt((np.arange(_SAMPLES) + 0.5) / _SAMPLES)[:, None] * np.column_stack(
             (np.sin(turns), np.cos(turns))
@@ -161,9 +157,6 @@ class Drawer:
             return float(state.known[row[inside], col[inside]].sum()) / _SAMPLES
 
         return share
-
-    def _block(self, site: Site) -> Block:
-        return next(block for block in self.scene.blocks if block.id == site.block)
 
     def _truth(self, job: Job, draft: Draft, state: State, decoys: Decoys, right: int) -> Truth:
         site, variant = job.site, job.variant

@@ -49,7 +49,6 @@ def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None
 
 
 def _read(file: Path) -> str:
-    """Return the text of a seed file that only its owner can read."""
     if file.suffix != SUFFIX:
         message = f"{file} must be named <name>{SUFFIX}, by which runs know what to hide from matchers: rename it"
         raise StoreError(message)

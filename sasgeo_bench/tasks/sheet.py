@@ -90,9 +90,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     width, height = _TEXT_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
     figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
-    legend = (
-        "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"
-    )
+    legend = "view against map   pink: only seen   blue: only mapped   light grey: both   white: none   grey: unknown"
     figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=9.5, color="#444444")
     _draw_legend(figure, width, height)
     for at, panel in enumerate(panels):
@@ -104,8 +102,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
             left = _TEXT_INCHES + _CELL_INCHES * place
             box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
             chart = figure.add_axes(box)
-            chart.set_xticks([])
-            chart.set_yticks([])
+            chart.set(xticks=[], yticks=[])
             if picture is not None:
                 chart.imshow(picture, interpolation="nearest")
             elif name == "perceived vectors" and panel.query.vectors is not None:
@@ -119,7 +116,6 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
 
 
 def _draw_legend(figure: Figure, width: float, height: float) -> None:
-    """Draw the colours of the classes in one line below the title."""
     left = 0.15
     for item in load_taxonomy().classes:
         name = item.name.replace("_", " ")
@@ -150,9 +146,7 @@ def _draw_vectors(chart: Axes, query: Query) -> None:
             chart.plot(at[:, 0], at[:, 1], color=colours[name], linewidth=1.0, linestyle=":" if is_bridge else "-")
     rows, cols = query.evidence.shape
     half_m = query.evidence.cell_size_m / 2
-    chart.set_xlim(-cols * half_m, cols * half_m)
-    chart.set_ylim(-rows * half_m, rows * half_m)
-    chart.set_aspect("equal")
+    chart.set(xlim=(-cols * half_m, cols * half_m), ylim=(-rows * half_m, rows * half_m), aspect="equal")
 
 
 def strength_text(truth: Truth) -> str:

@@ -20,7 +20,6 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 Part = Literal["train", "calibration", "test"]
-PARTS: Final[tuple[Part, ...]] = ("train", "calibration", "test")
 Half = Literal["a", "b"]
 HALVES: Final[tuple[Half, ...]] = ("a", "b")
 
@@ -30,10 +29,7 @@ _GEOD: Final = pyproj.Geod(ellps="WGS84")
 
 
 class Place(Document):
-    """Regions, or single blocks of them, that always stay together.
-
-    A hold-out gives each place a `part`, a cross-fit a `half`.
-    """
+    """Regions or blocks that always stay together; a hold-out gives each a `part`, a cross-fit a `half`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     regions: list[str] = []
@@ -352,12 +348,6 @@ def find_split_file(id_or_path: str) -> Path:
 
 
 def find_split(id_or_path: str, *, folders: Sequence[Path] = ()) -> Split:
-    """Return the checked split of an id or file, laid out on all known regions; raise as `make_split` does.
-
-    Examples
-    --------
-    >>> find_split("crossfit").half_of["porto"]
-    'a'
-    """
+    """Return the checked split of an id or file, laid out on all known regions; raise as `make_split` does."""
     grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
     return make_split(read_split_file(find_split_file(id_or_path)), grids)

@@ -18,7 +18,6 @@ from sasgeo_bench.tasks.split import HALVES, Block, Split
 # Blue, orange and green of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS: Final = {"train": "#0072b2", "calibration": "#e69f00", "test": "#009e73", "a": "#0072b2", "b": "#e69f00"}
 _COLUMNS: Final = 6
-_M_PER_DEG: Final = 111_320.0
 
 
 def write_split_map(path: Path, split: Split) -> None:
@@ -39,16 +38,10 @@ def write_split_map(path: Path, split: Split) -> None:
             chart.add_patch(Polygon(outline, closed=True, facecolor=COLOURS[part], edgecolor="white", lw=0.5))
         west, south, east, north = shapely.total_bounds([shapely.Polygon(outline) for outline in outlines])
         half_m = max(east - west, north - south) / 2 * 1.12
-        chart.set_xlim((west + east) / 2 - half_m, (west + east) / 2 + half_m)
-        chart.set_ylim((south + north) / 2 - half_m, (south + north) / 2 + half_m)
-        chart.plot(
-            [(west + east) / 2 - half_m * 0.95 + at_m for at_m in (0, 1000)],
-            [(south + north) / 2 - half_m * 0.95] * 2,
-            color="black",
-            lw=2,
-        )
-        chart.set_xticks([])
-        chart.set_yticks([])
+        x_m, y_m = (west + east) / 2, (south + north) / 2
+        chart.set(xlim=(x_m - half_m, x_m + half_m), ylim=(y_m - half_m, y_m + half_m), xticks=[], yticks=[])
+        left_m, bottom_m = x_m - half_m * 0.95, y_m - half_m * 0.95
+        chart.plot([left_m, left_m + 1000], [bottom_m, bottom_m], color="black", lw=2)
         chart.set_title(f"{place} ({len(blocks)})", fontsize=8.5, pad=3)
     title = f"{split.spec.id}: {split.spec.title}"
     figure.text(0.01, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")

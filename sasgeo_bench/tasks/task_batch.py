@@ -21,14 +21,9 @@ class Drawn:
 
 
 def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
-    """Draw the tasks of requests with several processes; yield one result for each, in their order.
+    """Draw the tasks of requests with several processes, whose number changes no query; yield results in order.
 
-    Tasks that are up to date stay. The number of processes changes no query.
-
-    Raises
-    ------
-    StoreError
-        If a folder cannot be written or holds foreign files.
+    Tasks that are up to date stay. Raise a StoreError if a folder cannot be written or holds foreign files.
     """
     yield from spread(_carry_out, requests, jobs=jobs)
 

@@ -158,14 +158,7 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
 
 
 def aged_dates(spec: RegionFile) -> tuple[dt.date, ...]:
-    """Return the dates of older maps for real ageing: the nearest one for each age, oldest first.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-    >>> [str(date) for date in aged_dates(read_region_file(find_region_file("dreieich")))]
-    ['2013-07-19']
-    """
+    """Return the dates of older maps for real ageing: the nearest one for each age, oldest first."""
     newest = spec.pick(None).date
     older = sorted(extract.date for extract in spec.extract if extract.date < newest)
     if not older:

@@ -212,7 +212,6 @@ def asked_sha256(row: Mapping[str, Any], map_hashes: Mapping[str, str]) -> str:
 
 
 def _plain(value: bytes | dt.date) -> str:
-    """Return a value that JSON does not know as text."""
     return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
 
 

@@ -40,12 +40,10 @@ def library(shape: tuple[int, int], share: float) -> Mask:
 
 @lru_cache(maxsize=4)
 def _halved(shape: tuple[int, int], share: float) -> Field:
-    """Return the library at half its resolution, shape (32, cells)."""
     return np.stack([_half(mask.astype(np.float32)).ravel() for mask in library(shape, share)])
 
 
 def _half(values: Field) -> Field:
-    """Return means over two by two cells."""
     rows, cols = (max(1, count // 2) for count in values.shape)
     return np.asarray(cv2.resize(values, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
 

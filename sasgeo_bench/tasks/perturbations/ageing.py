@@ -7,7 +7,7 @@ may have been trained on them.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from scipy import ndimage
@@ -42,23 +42,12 @@ class Rates:
         check_ranges(self, vanish_per_year=(0, 5), appear_per_year=(0, 5))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AgeingRates:
-    """Rates by class, and the places where they were measured."""
-
-    classes: Mapping[str, Rates]
-    places: tuple[str, ...]
-
-    @classmethod
-    def set_by_hand(cls) -> Self:
-        """Return the rates of the taxonomy, which were set by hand and come from no place."""
-        classes = {
-            item.name: Rates(
-                vanish_per_year=item.persistence.vanish_per_year, appear_per_year=item.persistence.appear_per_year
-            )
-            for item in load_taxonomy().classes
-        }
-        return cls(classes=classes, places=())
+def rates_by_hand() -> dict[str, Rates]:
+    """Return the rates of the taxonomy by class, which were set by hand and come from no place."""
+    items = ((item.name, item.persistence) for item in load_taxonomy().classes)
+    return {
+        name: Rates(vanish_per_year=item.vanish_per_year, appear_per_year=item.appear_per_year) for name, item in items
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,10 +58,10 @@ class Ageing:
     ----------
     years : float
         Age of the map at the time of the view.
-    rates : AgeingRates
+    rates : mapping of str to Rates
         By class; a class without rates does not age.
-    place : str
-        Where the view is.
+    place, measured_in : str, tuple of str
+        Where the view is, and where the rates were measured.
     redrawn : float
         Fraction of the remaining objects that are shifted because they were redrawn; only if years pass.
     shift_m : float
@@ -93,21 +82,22 @@ class Ageing:
 
     Examples
     --------
-    >>> Ageing(years=5.0, rates=AgeingRates(classes={}, places=("vaduz",)), place="vaduz")
+    >>> Ageing(years=5.0, rates={}, place="vaduz", measured_in=("vaduz",))
     Traceback (most recent call last):
     sasgeo_bench.errors.PerturbError: Ageing: the rates come from 'vaduz' itself, take those of other places
     """
 
     years: float
-    rates: AgeingRates
+    rates: Mapping[str, Rates]
     place: str
+    measured_in: tuple[str, ...] = ()
     redrawn: float = 0.0
     shift_m: float = 2.0
 
     def __post_init__(self) -> None:
         """Check the ranges, and that the rates are not the place's own."""
         check_ranges(self, years=(0, 200), redrawn=(0, 1), shift_m=(0, 100))
-        if self.place in self.rates.places:
+        if self.place in self.measured_in:
             message = f"Ageing: the rates come from {self.place!r} itself, take those of other places"
             raise PerturbError(message)
 
@@ -123,7 +113,7 @@ class Ageing:
         objects = {
             name: _objects_of(name, mask, pool, evidence.cell_size_m, rng)
             for name, mask in layers.items()
-            if name in self.rates.classes and mask.any()
+            if name in self.rates and mask.any()
         }
         for name, found in objects.items():
             layers[name] = self._older(name, layers[name], found, evidence.cell_size_m, rng)
@@ -136,7 +126,7 @@ class Ageing:
     def _older(self, name: str, mask: Mask, found: Objects, cell_size_m: float, rng: np.random.Generator) -> Mask:
         """Return the class without the vanished objects, and with some of the others shifted."""
         count = len(found.areas_cells)
-        gone = rng.random(count) < 1 - np.exp(-self.rates.classes[name].vanish_per_year * self.years)
+        gone = rng.random(count) < 1 - np.exp(-self.rates[name].vanish_per_year * self.years)
         anew = ~gone & (rng.random(count) < self.redrawn)
         kept = mask & ~found.mask_of(gone | anew)
         group = rng.integers(0, _GROUPS, size=count)
@@ -150,7 +140,7 @@ class Ageing:
     ) -> None:
         """Add new objects in place, and clear the ground cover below them."""
         usable = np.flatnonzero(found.areas_cells <= _LARGEST_SHARE * found.labels.size)
-        mean = np.expm1(self.rates.classes[name].appear_per_year * self.years) * len(found.areas_cells)
+        mean = np.expm1(self.rates[name].appear_per_year * self.years) * len(found.areas_cells)
         count = min(int(rng.poisson(mean)), _MOST_NEW)
         if not count or not len(usable):
             return
@@ -201,7 +191,6 @@ def _taken(name: str, layers: Mapping[str, Mask]) -> Mask:
 
 
 def _turned(footprint: Mask, rng: np.random.Generator) -> Mask:
-    """Rotate by quarter turns and mirror at random."""
     quarters, mirrored = rng.integers(0, (4, 2)).tolist()
     return np.rot90(footprint[:, ::-1] if mirrored else footprint, quarters)
 

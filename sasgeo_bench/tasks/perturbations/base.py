@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of perturbations, the checks that each must pass, and code that they share."""
+"""The interface of perturbations, and code that they share."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,20 +12,11 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 
-Cells = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-
-
-class Perturbation(Protocol):
-    """A frozen dataclass that makes a view harder; all randomness comes from the generator it is given.
-
-    At strength 0 it changes no cell. Unknown cells stay unknown unless cells change their place; the confidence of a
-    cell moves with it.
-    """
-
-    def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
-        """Return a harder view without changing the given one."""
-        ...
+# A frozen dataclass that makes a view harder. It does not change the given view, at strength 0 it changes no cell, and
+# all randomness comes from the generator. Unknown cells stay unknown unless cells change their place; the confidence of
+# a cell moves with it.
+Perturbation = Callable[[Evidence, np.random.Generator], Evidence]
 
 
 def check_ranges(owner: object, **ranges: tuple[float, float]) -> None:
@@ -48,7 +40,7 @@ def share_hidden(before: Evidence, after: Evidence) -> float:
     return float((after.cells[known] == UNKNOWN).mean()) if known.any() else 0.0
 
 
-def with_cells(evidence: Evidence, cells: Cells) -> Evidence:
+def with_cells(evidence: Evidence, cells: NDArray[np.uint8]) -> Evidence:
     """Return the view with other cells and its own confidence; unknown cells stay unknown."""
     return evidence.replace(np.maximum(cells, evidence.cells & UNKNOWN), evidence.confidence)  # UNKNOWN is the largest
 

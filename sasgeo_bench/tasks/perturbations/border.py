@@ -23,13 +23,7 @@ class Border(Occlusion):
 
 
 def depth(shape: tuple[int, int]) -> Field:
-    """Return the distance of each cell from the nearest edge, 0 at the edge to 1 in the middle.
-
-    Examples
-    --------
-    >>> depth((4, 4))[0].tolist(), float(depth((4, 4))[1, 1])
-    ([0.25, 0.25, 0.25, 0.25], 0.75)
-    """
+    """Return the distance of each cell from the nearest edge, 0 at the edge to 1 in the middle."""
     at = centres(shape, 2.0)
     rows, cols = 1 - np.abs(at.up_m) / shape[0], 1 - np.abs(at.right_m) / shape[1]
     return np.minimum(rows, cols).astype(np.float32)

@@ -45,13 +45,7 @@ def shaded(evidence: Evidence, sun_deg: float) -> Mask:
 
 
 def shadow(building: Mask, sun_deg: float, length_cells: float) -> Mask:
-    """Extend buildings away from the sun.
-
-    Examples
-    --------
-    >>> shadow(np.array([[False, True, False, False]]), 270.0, 1.0).tolist()
-    [[False, True, True, False]]
-    """
+    """Extend buildings away from the sun."""
     reach = int(np.ceil(length_cells))
     right, up = rotation(sun_deg)[:, 1]
     # A cell is in shadow if a building stands between it and the sun, so the element points towards the sun.

@@ -60,13 +60,7 @@ class NoisePool:
 
 
 def top_share(field: Field, share: float) -> Mask:
-    """Return the cells with the highest values, exactly a fraction `share` of them if no two are equal.
-
-    Examples
-    --------
-    >>> top_share(np.array([[0.0, 1.0], [2.0, 3.0]], dtype=np.float32), 0.5).tolist()
-    [[False, False], [True, True]]
-    """
+    """Return the cells with the highest values, exactly a fraction `share` of them if no two are equal."""
     return field >= highest(field.ravel(), share * field.size)
 
 
@@ -112,13 +106,7 @@ def centres(shape: tuple[int, int], cell_size_m: float) -> Centres:
 
 @lru_cache(maxsize=64)
 def disc(radius_cells: float) -> NDArray[np.uint8]:
-    """Return the structuring element of a disc.
-
-    Examples
-    --------
-    >>> disc(1.0).tolist()
-    [[0, 1, 0], [1, 1, 1], [0, 1, 0]]
-    """
+    """Return the structuring element of a disc."""
     reach = int(radius_cells)
     rows, cols = np.ogrid[-reach : reach + 1, -reach : reach + 1]
     element = np.asarray(rows**2 + cols**2 <= radius_cells**2, dtype=np.uint8)

@@ -86,13 +86,6 @@ def moved(points_m: NDArray[np.float64], field_m: NDArray[np.float64], cell_size
 
     The cell at p shows the ground at p + d(p), so a point q is shown at the p with p + d(p) = q. The iteration p = q -
     d(p) finds it to within a cell; where the field folds there are several solutions, and it may not converge.
-
-    Examples
-    --------
-    >>> shift = np.zeros((2, 8, 8))
-    >>> shift[0] = 1.0
-    >>> moved(np.array([[0.0, 0.0]]), shift, 1.0).round(6).tolist()
-    [[-1.0, 0.0]]
     """
     rows, cols = field_m.shape[1:]
     shown = np.array(points_m, dtype=np.float64)

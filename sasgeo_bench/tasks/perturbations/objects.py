@@ -29,13 +29,7 @@ class Objects:
 
 
 def find_objects(mask: Mask) -> Objects:
-    """Label the objects of a layer; cells that touch at a corner belong together.
-
-    Examples
-    --------
-    >>> find_objects(np.array([[True, False, True], [True, False, False]])).areas_cells.tolist()
-    [2, 1]
-    """
+    """Label the objects of a layer; cells that touch at a corner belong together."""
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8, ltype=cv2.CV_32S)
     areas = np.bincount(labels[mask], minlength=count)
     return Objects(labels=np.asarray(labels, dtype=np.int32), areas_cells=areas[1:])

@@ -54,7 +54,6 @@ def shifted(layer: NDArray[Value], rows: int, cols: int, *, beyond: int) -> NDAr
 def _take(
     stack: NDArray[np.uint8], places: NDArray[np.intp], within: NDArray[np.bool_], beyond: int
 ) -> NDArray[np.uint8]:
-    """Return the values of every layer at flat places; `beyond` outside."""
     taken = np.take(stack.reshape(len(stack), -1), places.ravel(), axis=1).reshape(stack.shape)
     if not within.all():
         taken[:, ~within] = beyond

@@ -106,21 +106,18 @@ class Season:
 
 
 def _of(layers: Layers, name: str) -> Mask:
-    """Return where a class is present; nowhere if the view has no such class."""
     if name in layers:
         return np.asarray(layers[name] == PRESENT)
     return np.zeros(next(iter(layers.values())).shape, dtype=bool)
 
 
 def _clear(layers: Layers, names: tuple[str, ...], mask: Mask) -> None:
-    """Make classes absent in a mask."""
     for name in names:
         if name in layers:
             layers[name][mask] = ABSENT
 
 
 def _strongest(noise: Field, mask: Mask, share: float) -> Mask:
-    """Return the fraction of a mask where the noise is strongest."""
     return mask & (noise >= highest(noise[mask], share * np.count_nonzero(mask)))
 
 

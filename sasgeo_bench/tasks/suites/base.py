@@ -89,10 +89,9 @@ class State:
 class Scene:
     """The map to search, the world to see, and everything else that a suite draws from.
 
-    `view_reach_m` is the largest distance that a view shows from its centre: half a diagonal at the largest scale.
-    `others` are states of the same place at other dates, oldest first; `elsewhere` is another place, if one was given;
-    `scenes` are the tags of the region; `twins` are the places that look like each site; `ageing` has the rates of
-    other places.
+    `view_reach_m` is the largest distance that a view shows from its centre. `others` are states at other dates, oldest
+    first; `elsewhere` is another place; `scenes` are the tags of the region; `twins` are the places that look like each
+    site; `ageing` has the rates of other places.
     """
 
     map: State
@@ -326,12 +325,6 @@ class Seeds:
     """Random streams of one site; each depends on its purpose alone.
 
     `root` is the seed of the whole request; `names` are region, suite and site.
-
-    Examples
-    --------
-    >>> seeds = Seeds(root=1, names=("vaduz", "clean", "7"))
-    >>> bool(seeds.rng("yaw").integers(100) == seeds.rng("yaw").integers(100))
-    True
     """
 
     root: Seed

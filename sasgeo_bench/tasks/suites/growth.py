@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 from sasgeo_bench.tasks.suites.twins import nodes_of, places_of
 
@@ -39,7 +39,7 @@ class GrowthSuite(Suite):
 def growth(new_per_old: float) -> Ageing:
     """Return ageing in which so many buildings appear for each existing one, and nothing else happens."""
     building = Rates(vanish_per_year=0.0, appear_per_year=float(np.log1p(new_per_old)))
-    return Ageing(years=1.0, rates=AgeingRates(classes={"building": building}, places=()), place="-")
+    return Ageing(years=1.0, rates={"building": building}, place="-")
 
 
 def _new_per_old(before: Evidence, after: Evidence) -> float:

@@ -30,7 +30,6 @@ HIDERS: Final[dict[str, type[Occlusion]]] = {
 
 
 def _hide(variant: Variant, evidence: Evidence, rng: np.random.Generator) -> Evidence:
-    """Occlude a view by the kind of the variant."""
     if variant.kind == ALL_UNKNOWN:
         return evidence.replace(np.full_like(evidence.cells, UNKNOWN))
     return HIDERS[variant.kind](share=variant.strength)(evidence, rng)

@@ -29,7 +29,6 @@ class _Sums:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_]) -> "_Sums":
-        """Integrate a mask."""
         return cls(integral=np.asarray(cv2.integral(mask.view(np.uint8)), dtype=np.int32))
 
     def share(self, row: int, col: int, half: int) -> float:
@@ -123,7 +122,6 @@ class _Ground:
             yield Site(index=len(found), pose=self._pose(place), block=block.id, density=density)
 
     def _near(self, block: Block) -> NDArray[np.float64] | None:
-        """Return the anchors in a block."""
         if self.anchors is None:
             return None
         west, south, east, north = block.bounds_m
@@ -143,7 +141,6 @@ class _Ground:
         return all(math.dist(place, site.en_m) >= spacing_m for site in found)
 
     def _pose(self, place: tuple[float, float]) -> Pose:
-        """Draw heading and scale of the view at a place."""
         easting_m, northing_m = place
         rng = self.seeds.rng("site", round(easting_m * 1000), round(northing_m * 1000))
         scale = 1.0 + self.group.scale_sigma * float(np.clip(rng.standard_normal(), -_SCALE_CUT, _SCALE_CUT))
@@ -151,11 +148,5 @@ class _Ground:
 
 
 def largest_scale(group: PriorGroup) -> float:
-    """Return the largest scale of a view of a prior group.
-
-    Examples
-    --------
-    >>> largest_scale(PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15))
-    1.3
-    """
+    """Return the largest scale of a view of a prior group."""
     return 1.0 + _SCALE_CUT * group.scale_sigma

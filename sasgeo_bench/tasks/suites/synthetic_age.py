@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.ageing.ratebook import PooledRates
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
@@ -52,7 +52,8 @@ def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
     }
     return Ageing(
         years=0.0,
-        rates=AgeingRates(classes=classes, places=pooled.places),
+        rates=classes,
+        measured_in=pooled.places,
         place=place,
         redrawn=float(np.median(shares)) if shares else 0.0,
         shift_m=float(np.median(shifts_m)) / _MEDIAN_OF_SHIFT if shifts_m else 0.0,
@@ -68,10 +69,9 @@ def after(ageing: Ageing, years: float) -> Ageing:
     kept = (1 - ageing.redrawn) ** (years / REDRAWN_WITHIN_YEARS)
     most = float(np.log1p(_MOST_NEW_PER_OLD)) / years if years > 0 else np.inf
     classes = {
-        name: replace(rates, appear_per_year=min(rates.appear_per_year, most))
-        for name, rates in ageing.rates.classes.items()
+        name: replace(rates, appear_per_year=min(rates.appear_per_year, most)) for name, rates in ageing.rates.items()
     }
-    return replace(ageing, years=years, redrawn=1 - kept, rates=replace(ageing.rates, classes=classes))
+    return replace(ageing, years=years, redrawn=1 - kept, rates=classes)
 
 
 SUITE: Final = SyntheticAgeSuite(

@@ -22,7 +22,6 @@ _ONE_PATCH_CELLS: Final = 4  # differing cells within this distance belong to on
 
 
 def _junctions(scene: Scene) -> NDArray[np.float64]:
-    """Return junctions with another one nearby."""
     return with_neighbours(places_of(nodes_of(scene, ["intersection"], least_degree=3)), within_m=_PAIR_M)
 
 
@@ -56,15 +55,7 @@ class TopologyTwins(TwinSuite):
 
 
 def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence:
-    """Take each patch of differing cells from one of two views, by lot.
-
-    Examples
-    --------
-    >>> cells = np.repeat(np.array([0, 1], dtype=np.uint8), 9).reshape(2, 1, 1, 9)
-    >>> one, two = (Evidence(classes=("a",), cells=item, cell_size_m=1.0) for item in cells)
-    >>> sorted({int(either(one, two, np.random.default_rng(seed)).cells.sum()) for seed in range(20)})  # one patch
-    [0, 9]
-    """
+    """Take each patch of differing cells from one of two views, by lot."""
     differ = (own.cells != other.cells).any(axis=0)
     near = ndimage.binary_dilation(differ, structure=np.ones((3, 3), dtype=bool), iterations=_ONE_PATCH_CELLS // 2)
     patch, count = ndimage.label(near, structure=np.ones((3, 3)))

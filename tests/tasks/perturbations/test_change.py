@@ -8,16 +8,14 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to
 from sasgeo_bench.tasks.perturbations.resample import shifted
 from sasgeo_bench.tasks.perturbations.season import Season
 
 
-def rates(vanish=0.0, appear=0.0, places=("elsewhere",), names=("building",)):
-    return AgeingRates(
-        classes=dict.fromkeys(names, Rates(vanish_per_year=vanish, appear_per_year=appear)), places=places
-    )
+def rates(vanish=0.0, appear=0.0, names=("building",)):
+    return dict.fromkeys(names, Rates(vanish_per_year=vanish, appear_per_year=appear))
 
 
 def houses(per_side=8, size=192, **others):
@@ -111,7 +109,7 @@ def test_what_is_redrawn_stays_near_and_whole():
 
 def test_a_place_is_never_aged_by_its_own_rates():
     with pytest.raises(PerturbError, match="the rates come from 'vaduz' itself, take those of other places"):
-        Ageing(years=5, rates=rates(places=("triesen", "vaduz")), place="vaduz")
+        Ageing(years=5, rates=rates(), place="vaduz", measured_in=("triesen", "vaduz"))
 
 
 def test_rates_that_are_none_are_refused():
@@ -120,7 +118,7 @@ def test_rates_that_are_none_are_refused():
 
 
 def test_the_rates_set_by_hand_are_those_of_the_taxonomy():
-    assert AgeingRates.set_by_hand().classes["building"] == Rates(vanish_per_year=0.005, appear_per_year=0.02)
+    assert rates_by_hand()["building"] == Rates(vanish_per_year=0.005, appear_per_year=0.02)
 
 
 @given(rows=st.integers(-12, 12), cols=st.integers(-12, 12))

@@ -9,7 +9,7 @@ import pytest
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.perturbations.border import Border
 from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
@@ -22,7 +22,7 @@ from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.perturbations.season import Season
 from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
 
-RATES = AgeingRates.set_by_hand()
+RATES = rates_by_hand()
 ALL = (
     Perception(error_factor=1.0),
     Rectangles(share=0.3),

@@ -20,28 +20,24 @@ from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import Perturbation, share_changed, share_hidden
 from sasgeo_bench.tasks.perturbations.border import Border
 from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
 from sasgeo_bench.tasks.perturbations.crop import CentralCrop
 from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
 from sasgeo_bench.tasks.perturbations.glare import Glare
-from sasgeo_bench.tasks.perturbations.line_width import LayerOffset, LineWidth
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
 from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
 from sasgeo_bench.tasks.perturbations.perception import Perception
-from sasgeo_bench.tasks.perturbations.rotation import Rotation
-from sasgeo_bench.tasks.perturbations.scale import Scale
 from sasgeo_bench.tasks.perturbations.season import Season
-from sasgeo_bench.tasks.perturbations.tilt import Tilt
 from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
 
 TOWNS = ("town-suburb", "town-riverside", "town-agricultural")
 VIEWS_PER_TOWN = 4
 SIZE_CELLS = 192
 
-RATES = AgeingRates.set_by_hand()
+RATES = rates_by_hand()
 MEASURED: dict[str, Perturbation] = {
     "perception, in domain": Perception(error_factor=1.0),
     "perception, across domains": Perception(error_factor=2.0),
@@ -54,12 +50,7 @@ MEASURED: dict[str, Perturbation] = {
     "adversarial mask 0.3": AdversarialMask(share=0.3),
     "false unknown 0.2": FalseUnknown(share=0.2),
     "local warp 10 m": LocalWarp(rms_m=10.0),
-    "tilt 3 deg": Tilt(tilt_deg=3.0),
     "central crop 0.3": CentralCrop(share=0.3),
-    "rotation 5 deg": Rotation(angle_deg=5.0),
-    "scale 0.1": Scale(excess=0.1),
-    "lines wider by 1 m": LineWidth(grow_m=1.0),
-    "layers off by 5 m": LayerOffset(offset_m=5.0),
     "leaf on 0.5": Season(kind="leaf_on", strength=0.5),
     "snow 0.5": Season(kind="snow", strength=0.5),
     "low water 0.5": Season(kind="low_water", strength=0.5),

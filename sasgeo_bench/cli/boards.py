@@ -23,7 +23,7 @@ from sasgeo_bench.leaderboard.text import control_lines, warnings_of
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.submissions import submissions_for
 from sasgeo_bench.scoring.draws import DRAWS
-from sasgeo_bench.tasks.private_seed import seed_said
+from sasgeo_bench.tasks.private_seed import seed_record
 
 CONTROL_FAILED: Final = 3  # exit status
 CONTESTANT_FAILED: Final = 4
@@ -214,7 +214,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         return
     results, private = options.results, options.private
     if plan.private is not None and (results is not None or private is not None):
-        check_public(seed_said(plan.private), str(board_folder(plan)))
+        check_public(seed_record(plan.private), str(board_folder(plan)))
     if private is not None:
         read_private(private, plan.spec.said)
     with shown_progress() as progress:

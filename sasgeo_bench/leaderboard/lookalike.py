@@ -23,7 +23,7 @@ from sasgeo_bench.sasgeo.weight_plot import top_of
 from sasgeo_bench.search.find import rank
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.suites.base import State
-from sasgeo_bench.tasks.suites.mining import RINGS, Windows, describe, least_apart_m
+from sasgeo_bench.tasks.suites.mining import RINGS, Windows, describe, min_distance_m
 
 VARIED: Final = 0.1  # share of the places that are most varied, among which one is chosen
 LEAST_DRAWN: Final = 0.05  # of a place's ground: with less there is nothing to confuse
@@ -109,7 +109,7 @@ def find_pair(windows: Windows) -> Pair:
         rows = varied[start : start + _CHUNK]
         apart_m = np.hypot(*(points[rows, None, :] - points[None, :, :]).transpose(2, 0, 1))
         unlike = _distances(table[rows], table)
-        unlike[apart_m < least_apart_m(windows.radius_m)] = np.inf
+        unlike[apart_m < min_distance_m(windows.radius_m)] = np.inf
         at, other = np.unravel_index(int(np.argmin(unlike)), unlike.shape)
         apart = float(unlike[at, other])
         if math.isfinite(apart) and (best is None or apart < best.apart):

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Regions -> queries and their truths: splits, sampling, suites and perturbations."""
+"""Tasks: splits, suites, perturbations and sampling turn regions into queries and their truths."""

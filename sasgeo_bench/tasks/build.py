@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A request -> queries and truths on disk: the order of the steps, and whether they still belong together."""
+"""Queries and truths of a request on disk, and checks that tasks, truths and maps belong together."""
 
 import datetime as dt
 import hashlib
@@ -29,20 +29,20 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
-from sasgeo_bench.tasks.private_seed import seed_said
+from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, State, Suite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
-from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_apart, check_count, check_roots
+from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
 from sasgeo_bench.tasks.twin import paste
 
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """One task that was written: its folder, how many queries, and how many sites."""
+    """One written task: its folder, and the numbers of its queries and sites."""
 
     folder: Path
     queries: int
@@ -50,47 +50,31 @@ class Made:
 
 
 def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
-    """Draw the queries of one suite on one region and write them.
+    """Draw the queries of one suite on one region and write a task for each searched map.
 
-    Parameters
-    ----------
-    request : Request
-        What is asked for.
-    tell : callable
-        Gets one line for every step.
-
-    Returns
-    -------
-    tuple of Made
-        One for each map that is searched: the region itself, and for real ageing each older map.
+    There is one map, and for real ageing each older one. `tell` receives a line for every step.
 
     Raises
     ------
     ConfigError
-        If there is no such suite, the count is not positive, the region cannot carry the suite or does not hold so many
-        sites; nothing is written.
+        If there is no such suite, the count is not positive, or the region cannot carry the suite or so many sites;
+        nothing is written.
     """
     with _locked(request, tell):
         return _make_tasks(request, tell)
 
 
 def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
-    """Hold a request all the way: a second run of it would change the map that this one draws from."""
+    """Lock a request from start to end, since a second run of it would change the map that this one uses."""
     suite = find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
-    # Where maps are built, so that a request that is refused leaves nothing where tasks are.
+    # The lock is where maps are built, so that a refused request leaves nothing among tasks.
     return locked(request.out / "regions" / f"{request.region.id}+{suite.card.name}.request", tell=tell)
 
 
 def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
-    """Task folders of a request, drawn unless it has made them before; another run that draws them is waited for.
-
-    Raises
-    ------
-    ConfigError
-        As `make_tasks` does.
-    """
+    """Return the task folders of a request; draw them unless they are up to date. Raise as `make_tasks` does."""
     made = made_tasks(request)
     if made is None:
         with _locked(request, tell):
@@ -99,18 +83,15 @@ def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
 
 
 def made_tasks(request: Request) -> tuple[Path, ...] | None:
-    """Task folders that this very request has made, or None if it has to be carried out.
+    """Return the task folders that this very request has made, or None if it has to be drawn.
 
-    They are as they were written, nothing of the request or of this version of the program has changed since, and the
-    map they search is the one that a build would give.
+    They are unchanged, request and program version are the same, and a build would give the map they search.
     """
     sha256 = _request_sha256(request)
-    suite_folder = request.out / "truth" / request.suite
-    hidden = {path.name: task_files.read_hidden(path) for path in sorted(suite_folder.glob(f"{request.region.id}*"))}
-    mine = {name: said for name, said in hidden.items() if said.get("request_sha256") == sha256}
-    if not mine or any(said.get("maps") != len(mine) for said in mine.values()):
+    drawn = {name: record for name, record in _records(request).items() if record.get("request_sha256") == sha256}
+    if not drawn or any(record.get("maps") != len(drawn) for record in drawn.values()):
         return None
-    folders = tuple(request.out / "tasks" / request.suite / name for name in mine)
+    folders = tuple(request.out / "tasks" / request.suite / name for name in drawn)
     try:
         if any(check_task(folder, out=request.out) or not has_truths(folder, out=request.out) for folder in folders):
             return None
@@ -121,28 +102,28 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
 
 
 def why_to_draw(request: Request) -> str:
-    """In a few words, why a request has to be carried out, where `made_tasks` finds that it has."""
-    suite_folder = request.out / "truth" / request.suite
-    folders = (
-        path
-        for path in sorted(suite_folder.glob(f"{request.region.id}*"))
-        if is_of_region(path.name, request.region.id)
-    )
-    there = [said for said in map(task_files.read_hidden, folders) if said]
-    if not there:
+    """Return in a few words why a request has to be drawn."""
+    records = [record for record in _records(request).values() if record]
+    if not records:
         return "not there yet"
-    if any(said.get("request_sha256") == _request_sha256(request) for said in there):
+    if any(record.get("request_sha256") == _request_sha256(request) for record in records):
         return "task, truths or map changed since"
-    if all(said | seed_said(request.seed) != said for said in there):
+    if all(record | seed_record(request.seed) != record for record in records):
         return "drawn with another seed"
-    counts = [said.get("count") for said in there]
+    counts = [record.get("count") for record in records]
     if not {request.count, None} & set(counts):
         return f"drawn with sites = {counts[0]}, now {request.count}"
     return "drawn by other settings or an older version"
 
 
+def _records(request: Request) -> dict[str, dict[str, Any]]:
+    """Return by map the contents of `truth.json` of a request's suite and region."""
+    folders = sorted((request.out / "truth" / request.suite).glob(f"{request.region.id}*"))
+    return {path.name: task_files.read_hidden(path) for path in folders if is_of_region(path.name, request.region.id)}
+
+
 def is_of_region(name: str, region: str) -> bool:
-    """Whether a map is that of a region, or of an older date or an edit of it.
+    """Return whether a map is that of a region, or an older date or an edit of it.
 
     Examples
     --------
@@ -153,22 +134,21 @@ def is_of_region(name: str, region: str) -> bool:
 
 
 def _request_sha256(request: Request) -> str:
-    """Hash of all that decides which queries come of a request."""
     elsewhere = None if request.elsewhere is None else request.elsewhere.model_dump(mode="json")
-    said = {
+    content = {
         "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
         "region": request.region.model_dump(mode="json"),
         "elsewhere": elsewhere,
-        # No query hangs on where others learn: a half that changes its places draws nothing anew.
+        # Halves decide only where methods train, so changing them redraws nothing.
         "split": request.split.spec.model_dump(mode="json", exclude={"place": {"__all__": {"half"}}}),
         "count": [request.count, request.may_be_fewer],
         "seed": request.seed if isinstance(request.seed, int) else request.seed.commitment,
         "group": None if request.group is None else request.group.name,
         "made_by": version("sasgeo-bench"),
     }
-    if request.choice != EVERYTHING:  # what was drawn before there was a choice is as it was
-        said["choice"] = asdict(request.choice)
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    if request.choice != EVERYTHING:  # tasks that are older than this field stay valid
+        content["choice"] = asdict(request.choice)
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
@@ -187,13 +167,13 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
     suite = replace(suite, variants=suite.usable(scene))
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
-    scene, sites = _edited(request, suite, scene, base, sites, seeds)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
+    drawer, sites = _edited(request, drawer, base, sites)
     return tuple(_write(request, drawer, sites, tell))
 
 
 def _view_reach_m(request: Request, suite: Suite) -> float:
-    """How far from its centre a view may show anything; refused where the split does not allow for it."""
+    """Return the reach of views from their centre; refuse one that the split does not allow for."""
     largest_m = max(variant.side_m for variant in suite.variants)
     reach_m = largest_m / 2 * float(np.sqrt(2)) * largest_scale(request.group or suite.card.group)
     allowed_m = request.split.spec.reach_m
@@ -207,7 +187,7 @@ def _view_reach_m(request: Request, suite: Suite) -> float:
 
 
 def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
-    """Build what is missing and read what the suite draws from."""
+    """Build missing regions and read what the suite draws from."""
     base = _built(request, request.region, None, tell)
     blocks = request.split.blocks_in(request.region.id)
     if not blocks:
@@ -238,31 +218,30 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
 
 
 def _ageing(spec: RegionFile) -> Ageing:
-    """Ageing by the rates measured in all places but the region's own."""
+    """Return ageing by the rates measured in all places but the region's own."""
     book = load_ratebook()
     place = book.place_of(spec.pick(None).file)
     return ageing_of(pool_rates(book, exclude=[place] if place else []), place=place or spec.id)
 
 
 def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell) -> Region:
-    """Read a region, built first where it is not there or its inputs have changed."""
+    """Read a region; build it first if it is missing or its inputs have changed."""
     plan = plan_build(spec, out=request.out, date=date, extract_folders=request.extract_folders)
     if not plan.is_current:
         build_region(plan, tell=tell)
     return region_files.read_region(plan.folder)
 
 
-def _edited(
-    request: Request, suite: Suite, scene: Scene, base: Region, sites: tuple[Site, ...], seeds: Seeds
-) -> tuple[Scene, tuple[Site, ...]]:
-    """Carry out what the suite does to the map and the world; sites it found no twin for are left out."""
+def _edited(request: Request, drawer: Drawer, base: Region, sites: tuple[Site, ...]) -> tuple[Drawer, tuple[Site, ...]]:
+    """Apply the suite's edit to map and world; drop sites without a twin."""
+    suite, scene, seeds = drawer.suite, drawer.scene, drawer.seeds
     edit = suite.edit(scene, sites, seeds)
-    # Many sites leave no room for the copies of any.
+    # With many sites there may be no room for the copies of any.
     while request.may_be_fewer and edit is not None and not edit.sites and len(sites) > 1:
         sites = sites[: len(sites) // 2]
         edit = suite.edit(scene, sites, seeds)
     if edit is None:
-        return scene, sites
+        return drawer, sites
     if not edit.sites:
         message = f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs"
         raise ConfigError(message)
@@ -272,16 +251,8 @@ def _edited(
             f"{suite.card.name!r}: lower --n or pass --up-to"
         )
         raise ConfigError(message)
-    # Counted on the map as it is: the edited one is not written where there would be nothing to ask on it.
-    group = request.group or suite.card.group
-    trial = Drawer(
-        suite=suite,
-        scene=replace(scene, twins=edit.twins),
-        seeds=seeds,
-        group=group,
-        split=request.split,
-        choice=request.choice,
-    )
+    # Tried on the unedited map, so that no edited map is written without a query to ask on it.
+    trial = replace(drawer, scene=replace(scene, twins=edit.twins))
     reasons = Counter(map(trial.why_not, trial.jobs(edit.sites)))
     if None not in reasons:
         raise _nothing_to_ask(request, suite, reasons)
@@ -290,23 +261,23 @@ def _edited(
     if edit.world_pastes is not None:
         world = _state_of(base, paste(base.features, edit.world_pastes))
     if not edit.map_pastes:
-        return replace(scene, twins=edit.twins), edit.sites
+        return trial, edit.sites
     features = paste(base.features, edit.map_pastes)
     note = f"edited: {len(edit.map_pastes)} parts pasted for suite {suite.card.name}"
     folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
     edited = State.of(region_files.read_region(folder))
     world = edited if edit.world_pastes is None else world
-    return replace(scene, map=edited, world=world, twins=edit.twins), edit.sites
+    return replace(drawer, scene=replace(scene, map=edited, world=world, twins=edit.twins)), edit.sites
 
 
 def _nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]) -> ConfigError:
-    """An error that says why no query of a suite is asked of a region: mostly, for there may be several reasons."""
+    """Return an error that gives the most frequent reason why no query can be asked."""
     reason = reasons.most_common(1)[0][0]
     return ConfigError(f"{request.region.id} is too small or too empty for suite {suite.card.name!r}: {reason}")
 
 
 def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
-    """A state that is seen and never searched: layers burnt in memory, no graph."""
+    """Return a state that is seen and never searched: layers in memory, no graph."""
     paint = make_paint(features, base.classes, base.coverage)
     empty = build_graph(features.iloc[:0])
     return State(
@@ -321,22 +292,21 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
 
 
 def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
-    """Write one task for every map that is searched."""
     jobs = drawer.jobs(sites)
     why = {job.query_id: drawer.why_not(job) for job in jobs}
     left = [job for job in jobs if why[job.query_id] is None]
     reasons = Counter(why.values())
     for reason in sorted(filter(None, reasons)):
-        said = f"{drawer.suite.card.name} on {request.region.id}"
-        tell(f"{said}: {counted(reasons[reason], 'query', 'queries')} left out, {reason}")
+        where = f"{drawer.suite.card.name} on {request.region.id}"
+        tell(f"{where}: {counted(reasons[reason], 'query', 'queries')} left out, {reason}")
     by_map: dict[str, list[Job]] = {}
     if not left:
         raise _nothing_to_ask(request, drawer.suite, reasons)
     for job in left:
         by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
     name = drawer.suite.card.name
-    # With the seed anyone could draw the truths again, so it is kept with them.
-    hidden: dict[str, Any] = {**seed_said(request.seed), "count": request.count, "maps": len(by_map)}
+    # With the seed anyone could draw the truths again, so it stays with them.
+    hidden: dict[str, Any] = {**seed_record(request.seed), "count": request.count, "maps": len(by_map)}
     hidden["request_sha256"] = _request_sha256(request)
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
@@ -350,29 +320,19 @@ def put_task(
 ) -> Made:
     """Write queries below `out/tasks` and their truths below `out/truth`, each folder whole or not at all.
 
-    Parameters
-    ----------
-    pairs : iterable of (Query, Truth)
-        In the order of the query ids.
-    about : dict
-        What `task.json` says; `suite` and `region` name the folders, `sites` counts the sites.
-    hidden : dict
-        What `truth.json` says; `task.json` says of a private seed the same.
-    out : Path
-        Root.
-    tell : callable
-        Gets a line where another run has to be waited for.
+    `pairs` are in the order of the query ids. `about` becomes `task.json`; its `suite` and `region` name the folders.
+    `hidden` becomes `truth.json`; `task.json` repeats the commitment of a private seed.
 
     Raises
     ------
     StoreError
-        If a folder holds something that is not ours, or cannot be written; or one of the queries there and these is of
-        a private seed, and the other is not.
+        If a folder holds foreign files or cannot be written, or if only one of its queries and these has a private
+        seed.
     """
     task_folder = out / "tasks" / about["suite"] / about["region"]
     truth_folder = out / "truth" / about["suite"] / about["region"]
-    check_apart(out / "tasks", truth_folder)
-    check_apart(task_folder, out / "truth")
+    check_separate(out / "tasks", truth_folder)
+    check_separate(task_folder, out / "truth")
     task_files.check_ours(task_folder, (task_files.QUERIES, task_files.TASK))
     task_files.check_ours(truth_folder, (task_files.TRUTH, task_files.TRUTH_OF))
     _check_unmixed(truth_folder, hidden)
@@ -394,7 +354,7 @@ def put_task(
 
 
 def _check_unmixed(truth_folder: Path, hidden: Mapping[str, Any]) -> None:
-    """Refuse to draw by a public seed where a private one has drawn, and the other way round."""
+    """Refuse to draw with a public seed over queries of a private one, and the other way round."""
     before = task_files.read_hidden(truth_folder)
     if before and (task_files.PRIVATE in before) != (task_files.PRIVATE in hidden):
         kinds = ("public", "private") if task_files.PRIVATE in hidden else ("private", "public")
@@ -403,7 +363,7 @@ def _check_unmixed(truth_folder: Path, hidden: Mapping[str, Any]) -> None:
 
 
 def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]) -> dict[str, Any]:
-    """What `task.json` says of how the queries came to be; nothing of where they lie."""
+    """Return the contents of `task.json`: how the queries were drawn, but not where they lie."""
     card = drawer.suite.card
     state = drawer.scene.state(region)
     manifest = region_files.read_manifest(request.out / "regions" / region)
@@ -429,7 +389,7 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
 
 
 def check_task(task_folder: Path, *, out: Path) -> list[str]:
-    """Hold a task against its hashes, its truths and the map it is to be searched in; a line for each fault."""
+    """Check a task against its hashes, its truths and its map; return a line for each fault."""
     about = task_files.read_task(task_folder)
     faults = task_files.task_faults(task_folder, out / "truth" / about["suite"] / about["region"])
     manifest = region_files.read_manifest(out / "regions" / about["region"])
@@ -439,12 +399,12 @@ def check_task(task_folder: Path, *, out: Path) -> list[str]:
 
 
 def has_truths(task_folder: Path, *, out: Path) -> bool:
-    """Whether the truths of a task are there too."""
+    """Return whether the truths of a task exist."""
     about = task_files.read_task(task_folder)
     path: Path = out / "truth" / about["suite"] / about["region"] / task_files.TRUTH
     return path.is_file()
 
 
 def built_anew(region: str) -> str:
-    """Say that a map is another than the one its queries were drawn on."""
+    """Return the message that a map is no longer the one its queries were drawn on."""
     return f"{region} was built anew since: make the queries again"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same ground twice: patches of one map that lie, turned and moved, in another one.
+"""Duplicated ground: patches of one map that lie, rotated and moved, in another one.
 
-Parts of a split keep their distance on the globe. That does not help where one file holds a place under another name,
-another date or other coordinates; then the same buildings stand in the same order, and that is what is looked for.
+Parts of a split keep their distance on the globe. That does not help if a file holds a place under another name, date
+or coordinates. Then the same buildings have the same arrangement, which this search finds.
 """
 
 from collections.abc import Mapping
@@ -19,23 +19,23 @@ from scipy.spatial import KDTree
 from sasgeo_bench.tasks.split import Split
 
 NEIGHBOURS: Final = 4
-LEAST_ALIKE: Final = 8  # buildings that must lie alike for a patch to count
+LEAST_ALIKE: Final = 8  # matching buildings that make a patch
 LEAST_AREA_M2: Final = 40.0
 
-_STEP_M: Final = 1.0  # distances within this are the same
-_STEP_AREA: Final = 0.1  # of the area's logarithm
-_REACH_M: Final = 250.0  # neighbours farther off are no constellation
-_MOST_ALIKE: Final = 3  # a constellation that stands more often in one map is a row of equal houses
-_WITHIN_M: Final = 2.0  # of where the other map says it is
+_STEP_M: Final = 1.0  # resolution of distances
+_STEP_AREA: Final = 0.1  # resolution of the area's logarithm
+_REACH_M: Final = 250.0  # largest distance of neighbours
+_MOST_ALIKE: Final = 3  # a key that is more frequent in one map belongs to rows of equal houses
+_WITHIN_M: Final = 2.0  # tolerance of a match
 _TRIES: Final = 300
-_FEWEST_APART_M: Final = 20.0  # between the two buildings that a placement is made from
+_LEAST_BASE_M: Final = 20.0  # least distance of the two buildings that define a placement
 
 Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Constellations:
-    """Buildings of one map and a key of each that is the same wherever the map lies and however it is turned.
+    """Buildings of one map, and a key of each that does not depend on position and rotation.
 
     `en_m` has shape (N, 2), easting and northing; `keys` has shape (N,), uint64.
     """
@@ -46,7 +46,7 @@ class Constellations:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Duplicate:
-    """The largest patch two maps share: how many buildings lie alike, and the middle of them in either map."""
+    """The largest patch that two maps share: the number of matching buildings, and its middle in either map."""
 
     count: int
     first_m: tuple[float, float]
@@ -54,18 +54,10 @@ class Duplicate:
 
 
 def constellations(features: gpd.GeoDataFrame) -> Constellations:
-    """Describe each building by its area, and by the distances and areas of the four nearest ones.
+    """Describe each building of a region by its area, and by the distances and areas of the four nearest ones.
 
-    Parameters
-    ----------
-    features : geopandas.GeoDataFrame
-        A region's features.
-
-    Returns
-    -------
-    Constellations
-        Of the buildings of at least 40 m2 that have four others within 250 m; distances count by the metre, areas by
-        tenths of their size, so that another projection of the same ground gives nearly the same keys.
+    Only buildings of at least 40 m2 with four others within 250 m count. Distances are rounded to metres and areas to
+    tenths of their size, so that another projection of the same ground gives nearly the same keys.
     """
     is_building = (features["class"] == "building").to_numpy() & features["is_visible"].to_numpy()
     shapes = features.geometry.to_numpy()[is_building]
@@ -73,15 +65,15 @@ def constellations(features: gpd.GeoDataFrame) -> Constellations:
     en_m = shapely.get_coordinates(shapely.centroid(shapes)).reshape(-1, 2)
     if len(en_m) <= NEIGHBOURS:
         return Constellations(en_m=np.zeros((0, 2)), keys=np.zeros(0, dtype=np.uint64))
-    apart_m, nearest = (np.asarray(found) for found in KDTree(en_m).query(en_m, k=NEIGHBOURS + 1))
+    distances_m, nearest = (np.asarray(found) for found in KDTree(en_m).query(en_m, k=NEIGHBOURS + 1))
     areas = np.log(shapely.area(shapes)) / _STEP_AREA
-    described = np.column_stack((areas, apart_m[:, 1:] / _STEP_M, areas[nearest[:, 1:]]))
-    is_near = apart_m[:, -1] < _REACH_M
+    described = np.column_stack((areas, distances_m[:, 1:] / _STEP_M, areas[nearest[:, 1:]]))
+    is_near = distances_m[:, -1] < _REACH_M
     return Constellations(en_m=en_m[is_near], keys=_keys(np.floor(described[is_near]).astype(np.int64)))
 
 
 def _keys(numbers: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """One number for each row: a multiplicative hash that is the same on any machine."""
+    """Return one number for each row: a multiplicative hash that is the same on any machine."""
     keys = np.zeros(len(numbers), dtype=np.uint64)
     for column in numbers.T.astype(np.uint64):
         keys = (keys ^ column) * np.uint64(0x9E3779B97F4A7C15)
@@ -90,30 +82,7 @@ def _keys(numbers: NDArray[np.int64]) -> NDArray[np.uint64]:
 
 
 def find_duplicate(first: Constellations, second: Constellations) -> Duplicate | None:
-    """Find ground that two maps share.
-
-    Parameters
-    ----------
-    first, second : Constellations
-        Of two maps.
-
-    Returns
-    -------
-    Duplicate or None
-        The largest patch found whose buildings lie alike up to a move and a turn; None if there are fewer than
-        `LEAST_ALIKE` such buildings.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(1)
-    >>> at, size = rng.uniform(0, 400, (60, 2)), rng.uniform(7, 15, 60)
-    >>> def table(points):
-    ...     squares = [shapely.box(x, y, x + side, y + side) for (x, y), side in zip(points, size, strict=True)]
-    ...     return gpd.GeoDataFrame({"class": "building", "is_visible": True}, index=range(60), geometry=squares)
-    >>> maps = [constellations(table(at + move)) for move in (0.0, 5000.0)]
-    >>> find_duplicate(*maps).count > 50
-    True
-    """
+    """Return the largest patch whose buildings match up to a move and rotation; None below `LEAST_ALIKE` buildings."""
     one, two = _matches(first, second)
     if len(one) < LEAST_ALIKE:
         return None
@@ -133,7 +102,7 @@ def find_duplicate(first: Constellations, second: Constellations) -> Duplicate |
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SharedGround:
-    """Two blocks of different parts that hold the same ground, and how many buildings say so."""
+    """Two blocks of different parts that hold the same ground, and the number of matching buildings."""
 
     first: str
     second: str
@@ -141,20 +110,7 @@ class SharedGround:
 
 
 def search_split(split: Split, maps: Mapping[str, Constellations]) -> tuple[SharedGround, ...]:
-    """Search every two regions of different parts for ground they share.
-
-    Parameters
-    ----------
-    split : Split
-        Says which parts must not meet.
-    maps : mapping of str to Constellations
-        By region; a region of the split that is not among them is not searched.
-
-    Returns
-    -------
-    tuple of SharedGround
-        One for each two regions that share some, in the order of the split.
-    """
+    """Search every two regions of different parts for shared ground; `maps` is by region, missing ones are skipped."""
     part_of = {block.region: split.part_of(place) for place, blocks in split.blocks.items() for block in blocks}
     listed = [region for region in part_of if region in maps]
     found = []
@@ -173,7 +129,7 @@ def _block_at(split: Split, region: str, en_m: tuple[float, float]) -> str:
 
 
 def _matches(first: Constellations, second: Constellations) -> tuple[Points, Points]:
-    """Buildings of two maps with the same key, as long as it is a rare one; each pair once, two arrays (M, 2)."""
+    """Match buildings of two maps by rare keys; return two arrays of shape (M, 2)."""
     rare = [_rare(item.keys) for item in (first, second)]
     left, right = first.keys[rare[0]], second.keys[rare[1]]
     order = np.argsort(right, kind="stable")
@@ -189,12 +145,12 @@ def _rare(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 
 def _alike(one: Points, two: Points, at: int, other: int) -> NDArray[np.int64]:
-    """Matches that agree with the move and turn that two of them give."""
+    """Return the matches that agree with the move and rotation given by two of them."""
     a, b = (complex(*(side[other] - side[at])) for side in (one, two))
-    if abs(a) < _FEWEST_APART_M or abs(abs(a) - abs(b)) > _WITHIN_M:
+    if abs(a) < _LEAST_BASE_M or abs(abs(a) - abs(b)) > _WITHIN_M:
         return np.zeros(0, dtype=np.int64)
     turn = b / a / abs(b / a)
     shifted = (one - one[at]) @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]]) + two[at]
-    # Farther from the two, a small error of the turn moves more.
+    # Farther away, a small error of the rotation moves a building more.
     reach_m = np.hypot(*(one - one[at]).T)
     return np.flatnonzero(np.hypot(*(shifted - two).T) <= _WITHIN_M * (1 + reach_m / abs(a)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries of a task as panels of a contact sheet: the view, what the map shows at the truth, and at its rival."""
+"""Panels of a contact sheet: a query's view, the map at the truth, and the map at its rival."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -28,25 +28,15 @@ def panels(
     query_id: str | None = None,
     choose: Callable[[Sequence[Truth]], Sequence[Truth]] | None = None,
 ) -> tuple[Panel, ...]:
-    """Choose queries of a task for a contact sheet: each kind and strength of a site, site by site.
+    """Choose up to `count` queries of a task for a contact sheet: each kind and strength of a site, site by site.
 
-    Parameters
-    ----------
-    task_folder, truth_folder : Path
-        A task and its truths.
-    out : Path
-        Root with the regions the task searches.
-    count : int
-        At most so many.
-    query_id : str, optional
-        This query alone.
-    choose : callable, optional
-        Picks those that are shown, in their order, instead.
+    `out` is the root of the regions. With `query_id` only the query whose id begins so is shown; `choose` selects and
+    orders the truths instead.
 
     Raises
     ------
     StoreError
-        If a file is missing, the truths are those of other queries, or the map was built anew since.
+        If a file is missing, the truths are those of other queries, or the map has been rebuilt since.
     ConfigError
         If there is no such query.
     """
@@ -81,7 +71,7 @@ def panels(
 
 
 def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
-    """Queries of as few sites as needed to show every variant, then more; controls first."""
+    """Return queries of as few sites as needed to show every variant, then more; controls first."""
     first = {truth.pair_id: truth.block for truth in sorted(truths, key=lambda item: item.pair_id)}
     rank = {"control": 0, "falsifier": 1, "stress": 2}
     order = sorted(
@@ -103,16 +93,16 @@ def _others(query: Query, truth: Truth) -> tuple[Pose, ...]:
 
 
 def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple[Pose, ...]]) -> Panel:
-    """What the map shows at the truth, and at its twin; without a twin, at the candidate that overlaps most with it.
+    """Return a panel with the map at the truth and at its twin; without a twin, at the most similar candidate.
 
-    A query without candidates takes those of another one at the same place, or what is mined where there is none.
+    A query without candidates takes those of another one at the same place, or mined ones.
     """
     if truth.pose is None:
         return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
     size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
 
     def view(pose: Pose) -> Evidence:
-        """What the map shows there, of the classes that were looked for."""
+        """Return the map at a pose, for the classes that were looked for."""
         return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
 
     at_truth = view(truth.pose)
@@ -133,11 +123,10 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
 
 
 def _drawn(evidence: Evidence) -> Evidence:
-    """What a person looks at: roads, buildings and water, not the ground cover that fills most of a view."""
+    """Return roads, buildings and water without the ground cover that fills most of a view."""
     return _only(evidence, [name for name in evidence.classes if name in (*DRAWN_CLASSES, "water", "bridge")])
 
 
 def _only(evidence: Evidence, classes: Sequence[str]) -> Evidence:
-    """Some of the classes of a view, in the order given."""
     cells = evidence.cells[[evidence.classes.index(name) for name in classes]]
     return Evidence(classes=tuple(classes), cells=cells, cell_size_m=evidence.cell_size_m)

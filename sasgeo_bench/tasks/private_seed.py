@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A private seed: text that only its owner knows, and all that may be said of it in files."""
+"""A private seed: text that only its owner knows, and the facts about it that files may hold."""
 
 import hashlib
 import math
@@ -10,26 +10,17 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError
 
-LEAST_BITS: Final = 64  # with fewer it can be found: a query's id lets anybody check a guess, some 10^6 a second
-REPRODUCING_BITS: Final = 128  # asked of a seed that is to vouch for a row
+LEAST_BITS: Final = 64  # fewer can be guessed: a query's id verifies a guess, some 10^6 a second
+REPRODUCING_BITS: Final = 128  # least for a seed that certifies a row
 _DIGITS: Final = re.compile(r"[0-9a-f]{1,1024}")
 
 
 @dataclass(frozen=True, slots=True)
 class PrivateSeed:
-    """A seed that is never written: files hold its commitment, texts and `repr` nothing.
+    """A seed that is never written: files hold its commitment, messages and `repr` nothing.
 
-    Parameters
-    ----------
-    text : str
-        Random digits, decimal or hexadecimal, as of `secrets.token_hex(16)`.
-    file : Path, optional
-        Where it was read from; matchers must not see it.
-
-    Raises
-    ------
-    ConfigError
-        If the text holds anything but digits; the message does not quote it.
+    `text` holds random digits, decimal or hexadecimal, as of `secrets.token_hex(16)`; anything else raises a
+    ConfigError that does not quote it. Matchers must not see `file`.
 
     Examples
     --------
@@ -52,37 +43,29 @@ class PrivateSeed:
 
     @property
     def bits(self) -> int:
-        """Bits that so many digits can hold at most; whether they are random, nobody can see."""
+        """Return the most bits that so many digits can hold; whether they are random cannot be checked."""
         return math.floor(len(self.text) * math.log2(10 if self.text.isdecimal() else 16) + 1e-9)
 
     @property
     def commitment(self) -> str:
-        """SHA-256 of the seed in a context of its own: two files of one seed agree, and neither gives it away.
+        """Return the SHA-256 of the seed in its own context: equal for all files of one seed, and revealing for none.
 
-        Of 128 random bits nobody finds what was hashed: 10^12 guesses a second take 10^19 years. Of few bits a guess
-        would find it, as it would by the id of a query.
+        Nobody finds 128 random bits: 10^12 guesses a second take 10^19 years. Guessing finds a few bits, here and by
+        the id of a query.
         """
         return hashlib.sha256(f"sasgeo-bench private seed {self.text}".encode()).hexdigest()
 
     @property
     def root(self) -> str:
-        """Root of all chance that comes of it; no number that is a public seed has the same."""
+        """Return the text that replaces the number of a public seed; no number has the same text."""
         return f"private {self.text}"
 
 
 Seed = int | PrivateSeed
 
 
-def seed_said(seed: Seed) -> dict[str, Any]:
-    """What files hold of a seed: a public one itself, of a private one the commitment and its bits.
-
-    Examples
-    --------
-    >>> seed_said(7)
-    {'seed': 7}
-    >>> seed_said(PrivateSeed("3f" * 16))["private_seed"]["bits"]
-    128
-    """
+def seed_record(seed: Seed) -> dict[str, Any]:
+    """Return what files hold of a seed: a public one itself, of a private one the commitment and its bits."""
     if isinstance(seed, int):
         return {"seed": seed}
     return {"private_seed": {"commitment": seed.commitment, "bits": seed.bits}}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Private seeds as a user hands them over: a file that nobody else can read, or an environment variable."""
+"""Private seeds as users pass them: a file that only its owner can read, or an environment variable."""
 
 import ctypes
 import os
@@ -13,30 +13,23 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 
 VARIABLE: Final = "SASGEO_SEED"
-SUFFIX: Final = ".seed"  # by which every run knows the file, and hides it from matchers
+SUFFIX: Final = ".seed"  # by which every run recognizes the file and hides it from matchers
 _MOST_BYTES: Final = 4096  # more digits are refused
 _PR_SET_DUMPABLE: Final = 4
 
 
 def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None) -> PrivateSeed | None:
-    """Take the private seed that a user has handed over; None without any.
+    """Take the private seed of a file `<name>.seed`, or of the environment; None without any.
 
-    The variable is removed from the environment, and from here on other processes of the user can look neither into the
-    memory nor into the first environment of this one (Linux).
-
-    Parameters
-    ----------
-    file : Path, optional
-        A file `<name>.seed`, readable by its owner alone.
-    environ : mutable mapping, optional
-        The process's environment unless given.
+    The variable is removed from the environment. From then on other processes of the user can read neither the memory
+    nor the initial environment of this one (Linux).
 
     Raises
     ------
     ConfigError
-        If both are given, or the text is no seed.
+        If both are given, or the text is not a seed.
     StoreError
-        If the file cannot be read, others can read it, or it is named otherwise.
+        If the file cannot be read, others can read it, or it has another suffix.
 
     Examples
     --------
@@ -44,19 +37,18 @@ def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None
     >>> take_seed(None, environ).bits, environ
     (128, {})
     """
-    said = (os.environ if environ is None else environ).pop(VARIABLE, None)
-    if file is not None and said is not None:
+    text = (os.environ if environ is None else environ).pop(VARIABLE, None)
+    if file is not None and text is not None:
         message = f"--seed-file and {VARIABLE} both give a private seed: leave one of them out"
         raise ConfigError(message)
-    if file is None and said is None:
+    if file is None and text is None:
         return None
     if environ is None:
         _close_memory()
-    return PrivateSeed((said or "").strip()) if file is None else PrivateSeed(_read(file), file=file.resolve())
+    return PrivateSeed((text or "").strip()) if file is None else PrivateSeed(_read(file), file=file.resolve())
 
 
 def _read(file: Path) -> str:
-    """Text of a seed file that its owner alone can read."""
     if file.suffix != SUFFIX:
         message = f"{file} must be named <name>{SUFFIX}, by which runs know what to hide from matchers: rename it"
         raise StoreError(message)
@@ -72,6 +64,6 @@ def _read(file: Path) -> str:
 
 
 def _close_memory() -> None:
-    """Let no other process of the user read this one's memory or environment (/proc/<pid>/mem, environ, ptrace)."""
+    """Keep other processes of the user from reading this one's memory or environment (/proc/<pid>, ptrace)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contact sheets: of some queries the view, the map at the true place, what differs, and its twin or likest decoy."""
+"""Contact sheets: the views of queries, the map at the true place, the difference, and the map at a twin or decoy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,16 +31,16 @@ TWIN: Final = "map at the twin"
 DECOY: Final = "map at the hardest decoy"
 _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
-_WORDS_INCHES: Final = 3.0  # the column of words, in letters that stay readable where the sheet is shown smaller
-_LETTERS: Final = 36  # in a line of it
+_TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
+_LETTERS: Final = 36  # per line of text
 _DPI: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """One row of a sheet: a query, its truth, and what the map shows there and at a rival; None for no such place.
+    """One row of a sheet: a query, its truth, and the map at the true place and at a rival; None without such a place.
 
-    `rival` names what that other place is: the twin that a suite made of the true place, or a decoy that is like it.
+    `rival` names the other place: the twin that a suite made of the true place, or a similar decoy.
     """
 
     query: Query
@@ -51,7 +51,7 @@ class Panel:
 
 
 def paint(evidence: Evidence) -> NDArray[np.float64]:
-    """Colours of a view, shape (rows, cols, 3), 0..1; grey where at least half of the classes are unknown."""
+    """Return colours of a view, shape (rows, cols, 3), 0..1; grey in proportion to the unknown classes."""
     picture = np.empty((*evidence.shape, 3))
     picture[:] = to_rgb(GROUND)
     colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
@@ -63,7 +63,7 @@ def paint(evidence: Evidence) -> NDArray[np.float64]:
 
 
 def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
-    """Where view and map agree, where only the view has something, where only the map has."""
+    """Return colours for cells that view and map share, that only the view has, and that only the map has."""
     known = (seen.cells != UNKNOWN) & (mapped.cells != UNKNOWN)
     one, two = (known & (item.cells == PRESENT) for item in (seen, mapped))
     picture = np.empty((*seen.shape, 3))
@@ -76,46 +76,33 @@ def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
 
 
 def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
-    """Draw a contact sheet.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG to write.
-    title : str
-        What the sheet shows.
-    panels : sequence of Panel
-        Its rows.
-    """
+    """Write a contact sheet as PNG."""
     figure = sheet_figure(title, panels)
     FigureCanvasAgg(figure)
     figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
 
 
 def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Figure:
-    """A contact sheet as a figure; see `write_sheet`."""
+    """Draw a contact sheet as a figure."""
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     rivals = list(dict.fromkeys(panel.rival for panel in panels)) or [DECOY]
     columns = (*_COLUMNS, " / ".join(rivals), *(("perceived vectors",) if has_vectors else ()))
-    width, height = _WORDS_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
+    width, height = _TEXT_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
     figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
-    legend = (
-        "view against map   pink: only seen   blue: only mapped   light grey: both   white: neither   grey: unknown"
-    )
+    legend = "view against map   pink: only seen   blue: only mapped   light grey: both   white: none   grey: unknown"
     figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=9.5, color="#444444")
     _draw_legend(figure, width, height)
     for at, panel in enumerate(panels):
         bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
-        text = "\n".join(line for part in _words(panel) for line in wrap(part, _LETTERS))
+        text = "\n".join(line for part in _text(panel) for line in wrap(part, _LETTERS))
         figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=10)
         pictures = (*_pictures(panel), None)[: len(columns)]
         for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):
-            left = _WORDS_INCHES + _CELL_INCHES * place
+            left = _TEXT_INCHES + _CELL_INCHES * place
             box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
             chart = figure.add_axes(box)
-            chart.set_xticks([])
-            chart.set_yticks([])
+            chart.set(xticks=[], yticks=[])
             if picture is not None:
                 chart.imshow(picture, interpolation="nearest")
             elif name == "perceived vectors" and panel.query.vectors is not None:
@@ -129,7 +116,6 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
 
 
 def _draw_legend(figure: Figure, width: float, height: float) -> None:
-    """The colours of the classes, in one line below the title's."""
     left = 0.15
     for item in load_taxonomy().classes:
         name = item.name.replace("_", " ")
@@ -149,7 +135,7 @@ def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:
 
 
 def _draw_vectors(chart: Axes, query: Query) -> None:
-    """Lines and outlines in the colours of their classes; what passes over something is dashed."""
+    """Draw lines and outlines in the colours of their classes; bridges are dotted."""
     colours = {item.name: item.colour for item in load_taxonomy().classes}
     vectors = query.vectors
     if vectors is None:
@@ -160,13 +146,11 @@ def _draw_vectors(chart: Axes, query: Query) -> None:
             chart.plot(at[:, 0], at[:, 1], color=colours[name], linewidth=1.0, linestyle=":" if is_bridge else "-")
     rows, cols = query.evidence.shape
     half_m = query.evidence.cell_size_m / 2
-    chart.set_xlim(-cols * half_m, cols * half_m)
-    chart.set_ylim(-rows * half_m, rows * half_m)
-    chart.set_aspect("equal")
+    chart.set(xlim=(-cols * half_m, cols * half_m), ylim=(-rows * half_m, rows * half_m), aspect="equal")
 
 
 def strength_text(truth: Truth) -> str:
-    """The step of a query; of an older map the age that it has, for its date is only the nearest there is to the step.
+    """Return the strength of a query; for an older map its true age, since its date is only the nearest to the step.
 
     Examples
     --------
@@ -180,7 +164,7 @@ def strength_text(truth: Truth) -> str:
     return f"map {age_years:.1f} years old (step {truth.strength:g})"
 
 
-def _words(panel: Panel) -> tuple[str, ...]:
+def _text(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
     alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"

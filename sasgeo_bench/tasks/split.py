@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which blocks are train, calibration and test; parts that come too near each other are refused, in metres."""
+"""Splits of blocks into train, calibration and test; parts that come too near each other are refused."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,7 +20,6 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 Part = Literal["train", "calibration", "test"]
-PARTS: Final[tuple[Part, ...]] = ("train", "calibration", "test")
 Half = Literal["a", "b"]
 HALVES: Final[tuple[Half, ...]] = ("a", "b")
 
@@ -30,10 +29,7 @@ _GEOD: Final = pyproj.Geod(ellps="WGS84")
 
 
 class Place(Document):
-    """Regions, or single blocks of them, that always stay together.
-
-    A hold-out split says the `part` of each, a cross-fit the `half`; neither says the other's.
-    """
+    """Regions or blocks that always stay together; a hold-out gives each a `part`, a cross-fit a `half`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     regions: list[str] = []
@@ -50,16 +46,7 @@ class Place(Document):
 
 
 class SplitFile(NamedDocument):
-    """What a file in `splits/` says.
-
-    Examples
-    --------
-    >>> halves = {"vaduz": "a", "eschen": "a", "monaco": "b", "porto": "b"}
-    >>> places = [{"name": name, "regions": [name], "half": half} for name, half in halves.items()]
-    >>> spec = {"id": "mine", "title": "Mine", "kind": "crossfit", "buffer_m": 0.0, "place": places}
-    >>> SplitFile.model_validate(spec).block_m
-    1000.0
-    """
+    """Contents of a file in `splits/`."""
 
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     title: Line
@@ -78,30 +65,23 @@ class SplitFile(NamedDocument):
             if twice:
                 message = f"{what} {twice[0]!r} is listed twice"
                 raise ValueError(message)
-        needs_part = self.kind == "holdout"
-        wrong = next((place.name for place in self.place if (place.part is not None) != needs_part), None)
-        if wrong is not None:
-            message = f"place {wrong!r} " + ("needs a part" if needs_part else "must not say a part in a cross-fit")
-            raise ValueError(message)
-        self._check_halves()
-        return self
-
-    def _check_halves(self) -> None:
-        """Refuse a cross-fit that does not say where to learn and to calibrate, and a hold-out that does."""
-        is_cut = self.kind == "crossfit"
-        wrong = next((place.name for place in self.place if (place.half is not None) != is_cut), None)
-        if wrong is not None:
-            fault = 'needs a half, "a" or "b"' if is_cut else "must not say a half in a hold-out"
-            message = f"place {wrong!r} {fault}"
-            raise ValueError(message)
-        for half in HALVES if is_cut else ():
+        for name, kind in (("part", "holdout"), ("half", "crossfit")):
+            is_needed = self.kind == kind
+            wrong = next((place.name for place in self.place if (getattr(place, name) is not None) != is_needed), None)
+            if wrong is not None:
+                kinds = {"part": "a cross-fit", "half": "a hold-out"}
+                fault = f"needs a {name}" if is_needed else f"must not have a {name} in {kinds[name]}"
+                message = f"place {wrong!r} {fault}"
+                raise ValueError(message)
+        for half in HALVES if self.kind == "crossfit" else ():
             if sum(place.half == half for place in self.place) < _LEAST_PLACES:
                 message = f"half {half!r} needs two places at least: one is tested, and another one calibrates"
                 raise ValueError(message)
+        return self
 
     @property
     def region_ids(self) -> tuple[str, ...]:
-        """Every region the split speaks of, in the order of the file."""
+        """Return every region of the split, in the order of the file."""
         named = (
             region
             for place in self.place
@@ -122,21 +102,21 @@ class Block:
 
     @property
     def id(self) -> str:
-        """Region, row and column, as in "vaduz/0-3"."""
+        """Return region, row and column, as in "vaduz/0-3"."""
         return f"{self.region}/{self.row}-{self.col}"
 
     def holds(self, en_m: tuple[float, float]) -> bool:
-        """Whether a place lies in it; of two blocks that touch, its south-western edges belong to it."""
+        """Return whether a place is inside; a shared edge belongs to the block north or east of it."""
         west, south, east, north = self.bounds_m
         return west <= en_m[0] < east and south <= en_m[1] < north
 
     def polygon(self) -> shapely.Polygon:
-        """The rectangle in the region's CRS."""
+        """Return the rectangle in the region's CRS."""
         return shapely.box(*self.bounds_m)
 
 
 def blocks_of(region: str, grid: Grid, *, block_m: float = 1000.0) -> tuple[Block, ...]:
-    """Tile a region by blocks of equal size, as near to `block_m` as whole numbers allow; from the north-west.
+    """Tile a region, from the north-west, by equal blocks with sides as near to `block_m` as possible.
 
     Examples
     --------
@@ -163,10 +143,10 @@ def blocks_of(region: str, grid: Grid, *, block_m: float = 1000.0) -> tuple[Bloc
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """One way to use a split: every place in one part.
+    """One use of a split: every place in one part.
 
-    `held_out` names the test place of a cross-fit fold. The rest of its half calibrates and the other half trains, so
-    that what is learnt for a place is learnt once for its half, from places that neither test it nor calibrate it.
+    `held_out` is the test place of a cross-fit fold. The rest of its half calibrates and the other half trains, so that
+    one training serves a whole half, on places that neither test nor calibrate it.
     """
 
     held_out: str | None
@@ -182,40 +162,40 @@ class Split:
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:
-        """One fold of a hold-out; one for each place of a cross-fit."""
+        """Return one fold of a hold-out; one for each place of a cross-fit."""
         if self.spec.kind == "holdout":
             return (Fold(held_out=None, part_of={place.name: place.part or "test" for place in self.spec.place}),)
         return tuple(_fold(self.spec, place.name) for place in self.spec.place)
 
     @cached_property
     def place_of(self) -> Mapping[str, str]:
-        """Block id -> place."""
+        """Return block id -> place."""
         return {block.id: place for place, blocks in self.blocks.items() for block in blocks}
 
     @cached_property
     def half_of(self) -> Mapping[str, Half]:
-        """Place -> half, of a cross-fit; a hold-out has none."""
+        """Return place -> half of a cross-fit; empty for a hold-out."""
         return {place.name: place.half for place in self.spec.place if place.half is not None}
 
     def places_in(self, region: str) -> tuple[str, ...]:
-        """Places that hold blocks of a region; none where the split does not speak of it."""
+        """Return the places that hold blocks of a region."""
         return tuple(place for place, blocks in self.blocks.items() if any(block.region == region for block in blocks))
 
     def blocks_in(self, region: str) -> tuple[Block, ...]:
-        """Blocks of one region, in the order of their rows."""
+        """Return the blocks of one region, by rows."""
         found = [block for blocks in self.blocks.values() for block in blocks if block.region == region]
         return tuple(sorted(found, key=lambda block: (block.row, block.col)))
 
     def part_of(self, place: str) -> str:
-        """What must not meet another such: the part in a hold-out, each place by itself in a cross-fit."""
+        """Return the group that must keep away from others: the part in a hold-out, the place in a cross-fit."""
         return place if self.spec.kind == "crossfit" else self.folds[0].part_of[place]
 
     def part_in_task(self, block: Block) -> str:
-        """What a query in a block is for: a part of a hold-out; "crossfit" where every place is test in its fold."""
+        """Return the part of a block's queries; "crossfit" if every place is tested in its fold."""
         return "crossfit" if self.spec.kind == "crossfit" else self.folds[0].part_of[self.place_of[block.id]]
 
     def to_text(self) -> str:
-        """A line for each place and its part, and how near parts come to each other."""
+        """Return a line for each place and its part, and the nearest distance between parts."""
         lines = [
             f"{self.spec.id}: {self.spec.title} ({self.spec.kind}, at least {self.spec.buffer_m:g} m between parts)"
         ]
@@ -235,32 +215,20 @@ class Split:
 
 
 def _fold(spec: SplitFile, held_out: str) -> Fold:
-    """Hold one place out: the rest of its half is for calibration, the other half for training."""
+    """Hold one place out: the rest of its half calibrates, the other half trains."""
     own = next(place.half for place in spec.place if place.name == held_out)
     parts: dict[str, Part] = {place.name: "calibration" if place.half == own else "train" for place in spec.place}
     return Fold(held_out=held_out, part_of=parts | {held_out: "test"})
 
 
 def make_split(spec: SplitFile, grids: Mapping[str, Grid]) -> Split:
-    """Lay out the blocks of a split and check that no two parts meet.
-
-    Parameters
-    ----------
-    spec : SplitFile
-        The file.
-    grids : mapping of str to Grid
-        Lattice of every region that exists.
-
-    Returns
-    -------
-    Split
-        Checked.
+    """Lay out the blocks of a split on the grids of all regions, and check that no two parts meet.
 
     Raises
     ------
     ConfigError
-        If a region or block is unknown, a block stands in two places, or blocks of two parts, with the reach of the
-        queries' footprints, overlap or come nearer than the buffer; the pair is named.
+        If a region or block is unknown, a block is in two places, or blocks of two parts are nearer than the buffer and
+        the reach of the queries' footprints allow.
     """
     unknown = [region for region in spec.region_ids if region not in grids]
     if unknown:
@@ -306,11 +274,7 @@ class Pair:
 
 
 def nearest_pair(split: Split, *, within_m: float = math.inf) -> Pair | None:
-    """Find the two blocks of different parts that are nearest to each other, or None if all are farther apart.
-
-    In a cross-fit every place is a part of its own. Distances are taken on the real outlines: on the ellipsoid between
-    far regions, in the CRS of the first where they are near.
-    """
+    """Return the nearest two blocks of different parts (places in a cross-fit), or None if all are farther apart."""
     parts: dict[str, list[Block]] = {}
     for place, blocks in split.blocks.items():
         parts.setdefault(split.part_of(place), []).extend(blocks)
@@ -318,7 +282,10 @@ def nearest_pair(split: Split, *, within_m: float = math.inf) -> Pair | None:
 
 
 def nearest_blocks(parts: Mapping[str, Sequence[Block]], *, within_m: float = math.inf) -> Pair | None:
-    """Find the two blocks of different groups that are nearest to each other; as `nearest_pair` measures it."""
+    """Return the nearest two blocks of different groups, or None if all are farther apart.
+
+    Distances are between the outlines: in the CRS of the first block, after a lower bound on the ellipsoid.
+    """
     groups: dict[tuple[str, str], list[Block]] = {}
     for part, blocks in parts.items():
         for block in blocks:
@@ -334,21 +301,19 @@ def nearest_blocks(parts: Mapping[str, Sequence[Block]], *, within_m: float = ma
     return best
 
 
-def _group_pairs(
-    groups: Mapping[tuple[str, str], list[Block]],
-) -> Iterator[tuple[float, list[Block], list[Block]]]:
-    """Pairs of groups of different parts with a lower bound of their distance, metres."""
+def _group_pairs(groups: Mapping[tuple[str, str], list[Block]]) -> Iterator[tuple[float, list[Block], list[Block]]]:
+    """Yield pairs of groups of different parts with a lower bound of their distance, metres."""
     centres = {key: _disc(blocks) for key, blocks in groups.items()}
     for first, second in combinations(groups, 2):
         if first[0] == second[0]:
             continue
         (lon_a, lat_a, radius_a), (lon_b, lat_b, radius_b) = centres[first], centres[second]
-        apart_m = _GEOD.inv(lon_a, lat_a, lon_b, lat_b)[2]
-        yield max(0.0, apart_m - 1.01 * (radius_a + radius_b)), groups[first], groups[second]
+        distance_m = _GEOD.inv(lon_a, lat_a, lon_b, lat_b)[2]
+        yield max(0.0, distance_m - 1.01 * (radius_a + radius_b)), groups[first], groups[second]
 
 
 def _disc(blocks: list[Block]) -> tuple[float, float, float]:
-    """Longitude and latitude of a centre, and a radius in metres that holds all blocks of one region."""
+    """Return longitude and latitude of a centre, and a radius in metres that holds all blocks of one region."""
     west, south, east, north = shapely.total_bounds([block.polygon() for block in blocks])
     to_lonlat = pyproj.Transformer.from_crs(blocks[0].epsg, _WGS84, always_xy=True)
     lon_deg, lat_deg = to_lonlat.transform((west + east) / 2, (south + north) / 2)
@@ -356,7 +321,7 @@ def _disc(blocks: list[Block]) -> tuple[float, float, float]:
 
 
 def _gaps(first: Iterable[Block], second: Iterable[Block]) -> Iterator[Pair]:
-    """Distance of every pair, with the second group brought into the CRS of the first."""
+    """Yield the distance of every pair, with the second group in the CRS of the first."""
     for a in first:
         for b in second:
             outline = b.polygon()
@@ -368,33 +333,21 @@ def _gaps(first: Iterable[Block], second: Iterable[Block]) -> Iterator[Pair]:
 
 
 def read_split_file(path: Path) -> SplitFile:
-    """Read one split file; raises as `read_document` does."""
+    """Read one split file; raise as `read_document` does."""
     return read_document(path, SplitFile, "splits")
 
 
 def list_split_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
-    """Split id -> file, of the given folders and those shipped; raises as `list_documents` does.
-
-    Examples
-    --------
-    >>> sorted(list_split_files())
-    ['crossfit', 'holdout']
-    """
+    """Return split id -> file, of the given and the shipped folders."""
     return list_documents("splits", SplitFile, folders)
 
 
-def find_split_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
-    """Find a split file by its id, or take the path of one; raises as `find_document` does."""
-    return find_document(id_or_path, "split", "or name a .toml file", lambda: list_split_files(folders=folders))
+def find_split_file(id_or_path: str) -> Path:
+    """Find a split file by its id or path; raise as `find_document` does."""
+    return find_document(id_or_path, "split", "or name a .toml file", list_split_files)
 
 
 def find_split(id_or_path: str, *, folders: Sequence[Path] = ()) -> Split:
-    """The checked split of an id or file, laid out on all regions that are known; raises as `make_split` does.
-
-    Examples
-    --------
-    >>> find_split("crossfit").half_of["porto"]
-    'a'
-    """
+    """Return the checked split of an id or file, laid out on all known regions; raise as `make_split` does."""
     grids = {item: read_region_file(path).grid() for item, path in list_region_files(folders=folders).items()}
     return make_split(read_split_file(find_split_file(id_or_path)), grids)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map of a split: every place with its blocks, coloured by part."""
+"""Map of a split: every place with its blocks, coloured by part."""
 
 from pathlib import Path
 from typing import Final
@@ -15,22 +15,13 @@ from sasgeo_bench.canvas import PlainFigure
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks.split import HALVES, Block, Split
 
-# Blue, orange and green of Okabe and Ito, told apart by colour-blind readers.
+# Blue, orange and green of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS: Final = {"train": "#0072b2", "calibration": "#e69f00", "test": "#009e73", "a": "#0072b2", "b": "#e69f00"}
 _COLUMNS: Final = 6
-_M_PER_DEG: Final = 111_320.0
 
 
 def write_split_map(path: Path, split: Split) -> None:
-    """Draw one panel for each place, all blocks in their true shape and distance, with a bar of one kilometre.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG to write.
-    split : Split
-        What to draw.
-    """
+    """Write a PNG with a panel for each place: its blocks in true shape, and a scale bar of one kilometre."""
     places = list(split.blocks)
     rows = -(-len(places) // _COLUMNS)
     width, height = 2.3 * _COLUMNS, 2.4 * rows + 1.1
@@ -47,16 +38,10 @@ def write_split_map(path: Path, split: Split) -> None:
             chart.add_patch(Polygon(outline, closed=True, facecolor=COLOURS[part], edgecolor="white", lw=0.5))
         west, south, east, north = shapely.total_bounds([shapely.Polygon(outline) for outline in outlines])
         half_m = max(east - west, north - south) / 2 * 1.12
-        chart.set_xlim((west + east) / 2 - half_m, (west + east) / 2 + half_m)
-        chart.set_ylim((south + north) / 2 - half_m, (south + north) / 2 + half_m)
-        chart.plot(
-            [(west + east) / 2 - half_m * 0.95 + at_m for at_m in (0, 1000)],
-            [(south + north) / 2 - half_m * 0.95] * 2,
-            color="black",
-            lw=2,
-        )
-        chart.set_xticks([])
-        chart.set_yticks([])
+        x_m, y_m = (west + east) / 2, (south + north) / 2
+        chart.set(xlim=(x_m - half_m, x_m + half_m), ylim=(y_m - half_m, y_m + half_m), xticks=[], yticks=[])
+        left_m, bottom_m = x_m - half_m * 0.95, y_m - half_m * 0.95
+        chart.plot([left_m, left_m + 1000], [bottom_m, bottom_m], color="black", lw=2)
         chart.set_title(f"{place} ({len(blocks)})", fontsize=8.5, pad=3)
     title = f"{split.spec.id}: {split.spec.title}"
     figure.text(0.01, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
@@ -71,12 +56,12 @@ def write_split_map(path: Path, split: Split) -> None:
 
 
 def colour_of(split: Split, place: str) -> str:
-    """What a place is coloured by: its part in a hold-out, its half in a cross-fit."""
+    """Return the key of a place's colour: its half in a cross-fit, else its part."""
     return split.half_of.get(place) or split.part_of(place)
 
 
 def _outline_m(block: Block, origin: Block) -> NDArray[np.float64]:
-    """Corners of a block in metres around the first block of the place, near enough for a picture."""
+    """Return the corners of a block in metres around the first block of the place, accurate enough for a picture."""
     corners = np.array(block.polygon().exterior.coords)[:-1]
     if block.epsg == origin.epsg:
         return corners

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many requests -> tasks on disk, by several processes."""
+"""Tasks of many requests, drawn by several processes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from sasgeo_bench.tasks.task_plan import Request
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn:
-    """What came of a request: its folders, or what the region lacks for it; and what was told on the way."""
+    """Result of a request: its folders, or what the region lacks for it, and the lines of progress."""
 
     lines: tuple[str, ...]
     folders: tuple[Path, ...] = ()
@@ -21,29 +21,9 @@ class Drawn:
 
 
 def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
-    """Carry requests out, by several processes if there are several jobs; no query hangs on how many there are.
+    """Draw the tasks of requests with several processes, whose number changes no query; yield results in order.
 
-    Parameters
-    ----------
-    requests : sequence of Request
-        What was done before is left as it is.
-    jobs : int
-        Processes.
-
-    Yields
-    ------
-    Drawn
-        One for each request, in their order.
-
-    Raises
-    ------
-    StoreError
-        If a folder cannot be written or holds something that is not ours.
-
-    Examples
-    --------
-    >>> list(carry_out([], jobs=2))
-    []
+    Tasks that are up to date stay. Raise a StoreError if a folder cannot be written or holds foreign files.
     """
     yield from spread(_carry_out, requests, jobs=jobs)
 

@@ -44,7 +44,7 @@ from sasgeo_bench.texts import FOLDER, json_text
 Row = TypeVar("Row")
 Made = TypeVar("Made")
 Count = Annotated[int, Field(ge=0)]
-Folder = Annotated[str, Field(pattern=FOLDER)]  # never a way out
+Folder = Annotated[str, Field(pattern=FOLDER)]  # never a path that leaves its root
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
@@ -53,9 +53,9 @@ TRUTH_OF: Final = "truth.json"
 PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
-_ROWS: Final = 128  # a row group; what is held in memory at once
-_MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # what `task.json` says of the map it is searched in
-_READ: Final = " and ".join(map(str, TASK_VERSIONS))  # versions of tasks that are read
+_ROWS: Final = 128  # of a row group, which is in memory at once
+_MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # hashes of the searched map in `task.json`
+_READ: Final = " and ".join(map(str, TASK_VERSIONS))  # readable versions of tasks
 
 
 class TaskFile(Document):
@@ -71,14 +71,8 @@ class TaskFiles(Document):
     queries: Annotated[TaskFile, Field(alias=QUERIES)]
 
 
-class TaskSaid(Document):
-    """What `task.json` says; an unknown key is an error, for a later schema says so by its version.
-
-    Examples
-    --------
-    >>> TaskSaid.model_fields["suite"].is_required()
-    True
-    """
+class TaskManifest(Document):
+    """Contents of `task.json`; an unknown key is an error, since a later schema has another version."""
 
     schema_version: int
     task_version: int
@@ -115,23 +109,10 @@ def write_task(
     about: dict[str, Any],
     hidden: dict[str, Any] | None = None,
 ) -> int:
-    """Write queries and truths, a row group at a time, then `task.json`, which makes the folder a task.
+    """Write queries and truths into two empty folders, by row groups, then `task.json`, which completes the task.
 
-    Parameters
-    ----------
-    task_folder, truth_folder : Path
-        Two folders that are there, empty.
-    pairs : iterable of (Query, Truth)
-        In the order of the query ids, which says nothing about the answers.
-    about : dict
-        What `task.json` says besides the counts and hashes.
-    hidden : dict, optional
-        What `truth.json` says besides which queries the truths belong to.
-
-    Returns
-    -------
-    int
-        How many were written.
+    `pairs` are in the order of the query ids, which reveals nothing about the answers. `about` and `hidden` are the
+    contents of `task.json` and `truth.json` besides counts and hashes. Return the number of queries.
     """
     counts: dict[str, int] = {}
     groups: set[str] = set()
@@ -144,7 +125,7 @@ def write_task(
         )
         for part in _batches(pairs):
             rows = pa.Table.from_pylist([query_row(query) for query, _ in part], schema=QUERY_SCHEMA)
-            asked = [asked_sha256(row, _map_said(about)) for row in rows.to_pylist()]
+            asked = [asked_sha256(row, _map_hashes(about)) for row in rows.to_pylist()]
             queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
             for query, _ in part:
@@ -174,7 +155,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def _candidate_bytes(query: Query) -> bytes:
-    """Poses of the candidates in their order, four little-endian doubles each: what the task's hash of them is of."""
+    """Return the poses of the candidates as four little-endian doubles each, for the task's hash."""
     rows = [(pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale) for pose in query.candidates]
     return np.array(rows, dtype="<f8").tobytes()
 
@@ -191,12 +172,7 @@ def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Qu
 
 
 def read_task(folder: Path) -> dict[str, Any]:
-    """Read `task.json`.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds no task, or one of another schema.
+    """Read `task.json`; raise a StoreError if it is missing, damaged or of another version.
 
     Examples
     --------
@@ -210,43 +186,34 @@ def read_task(folder: Path) -> dict[str, Any]:
         message = f"{folder} holds no {TASK}: make the queries first"
         raise StoreError(message)
     content = read_json(path, mend=_MEND)
-    said = content if isinstance(content, dict) else {}
+    about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):
-        if name in said and said[name] not in known:
+        if name in about and about[name] not in known:
             noun, versions = name.replace("_", " "), " and ".join(map(str, known))
-            message = f"{path} has {noun} {said[name]!r}, this version reads {versions}: {_MEND}"
+            message = f"{path} has {noun} {about[name]!r}, this version reads {versions}: {_MEND}"
             raise StoreError(message)
     try:
-        check_document(content, TaskSaid, source=TASK)
+        check_document(content, TaskManifest, source=TASK)
     except ConfigError as error:
-        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
-        raise StoreError(message) from error
-    return said
+        raise _damaged(path, error) from error
+    return about
+
+
+def _damaged(path: Path, fault: object) -> StoreError:
+    return StoreError(f"{path} is damaged ({str(fault)[:200]}): {_MEND}")
 
 
 def check_queries(folder: Path) -> None:
-    """Refuse queries that are not those `task.json` speaks of.
-
-    Raises
-    ------
-    StoreError
-        If the file is missing or has another hash.
-    """
-    said = read_task(folder)["files"][QUERIES]["sha256"]
+    """Raise a StoreError if the queries are missing or not those of `task.json`."""
+    recorded = read_task(folder)["files"][QUERIES]["sha256"]
     path = folder / QUERIES
-    if not path.is_file() or sha256_of(path) != said:
+    if not path.is_file() or sha256_of(path) != recorded:
         message = f"{path} is not what {TASK} says: make the queries again"
         raise StoreError(message)
 
 
 def check_ours(folder: Path, names: Sequence[str]) -> None:
-    """Refuse to put a folder in place of one that holds something which is not ours.
-
-    Raises
-    ------
-    StoreError
-        Naming it.
-    """
+    """Raise a StoreError if a folder to replace holds foreign files."""
     if folder.exists() and not folder.is_dir():
         message = f"{folder} is a file: move it away, a task goes there"
         raise StoreError(message)
@@ -257,12 +224,7 @@ def check_ours(folder: Path, names: Sequence[str]) -> None:
 
 
 def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
-    """Hold a task against its `task.json` and its truths; a line for each fault.
-
-    Parameters
-    ----------
-    task_folder, truth_folder : Path
-        A task, and where its truths are; without truths only the task itself is looked at.
+    """Check a task against its `task.json` and its truths, if there are any; return a line for each fault.
 
     Raises
     ------
@@ -271,14 +233,14 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     """
     about = read_task(task_folder)
     faults = []
-    path, said = task_folder / QUERIES, about["files"][QUERIES]
+    path, recorded = task_folder / QUERIES, about["files"][QUERIES]
     if not path.is_file():
         return [f"{QUERIES}: missing"]
     known = {task_folder / TASK, path}
     faults += [f"{other.name}: not part of a task" for other in sorted(task_folder.rglob("*")) if other not in known]
     found = file_record(path)
-    if found.model_dump() != said:  # what is in it is not worth a look
-        was = f"{said['bytes']} bytes, {said['sha256']}"
+    if found.model_dump() != recorded:  # its contents need no check
+        was = f"{recorded['bytes']} bytes, {recorded['sha256']}"
         return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}", *faults]
     counts: dict[str, int] = {}
     names = []
@@ -298,18 +260,12 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
 
 
 def _belongs_to(truth_folder: Path) -> str:
-    """SHA-256 of the queries that the truths of a folder are of; "unknown" where it does not say."""
+    """Return the SHA-256 of the queries that the truths of a folder belong to; "unknown" if it is not recorded."""
     return str(read_hidden(truth_folder).get("queries_sha256", "unknown"))
 
 
 def check_truths(task_folder: Path, truth_folder: Path) -> None:
-    """Refuse truths that are not there, are those of other queries, or of another task version.
-
-    Raises
-    ------
-    StoreError
-        Naming both folders, or the file that cannot be read.
-    """
+    """Raise a StoreError if truths are missing, belong to other queries, or have another task version."""
     if not (truth_folder / TRUTH).is_file():
         message = (
             f"{truth_folder} holds no truths of {task_folder}: "
@@ -317,7 +273,7 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
         )
         raise StoreError(message)
     if (truth_folder / TRUTH_OF).is_file():
-        read_json(truth_folder / TRUTH_OF, mend=_MEND)  # a damaged one is not one of other queries
+        read_json(truth_folder / TRUTH_OF, mend=_MEND)  # a damaged file raises here
     if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
         message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
         raise StoreError(message)
@@ -331,55 +287,46 @@ def check_truths(task_folder: Path, truth_folder: Path) -> None:
 
 
 def read_hidden(truth_folder: Path) -> dict[str, Any]:
-    """What `truth.json` says; nothing where it cannot be read."""
+    """Read `truth.json`; return an empty dictionary if it cannot be read."""
     try:
-        said = read_json(truth_folder / TRUTH_OF, mend=_MEND)
+        hidden = read_json(truth_folder / TRUTH_OF, mend=_MEND)
     except StoreError:
         return {}
-    return said if isinstance(said, dict) else {}
+    return hidden if isinstance(hidden, dict) else {}
 
 
 def map_of(manifest: Manifest) -> dict[str, str]:
-    """What `task.json` says of a map: what is on it, and all that it was built of."""
+    """Return what `task.json` holds of a map: the hashes of its contents and of its inputs."""
     return {"map_fingerprint": manifest.fingerprint, "map_inputs_sha256": manifest.inputs_sha256}
 
 
 def is_of_map(about: Mapping[str, Any], manifest: Manifest) -> bool:
-    """Whether a task is to be searched in this very build of a map; one of an older program says less of it."""
-    return all(about.get(name, said) == said for name, said in map_of(manifest).items())
+    """Return whether a task belongs to this very build of a map; older programs recorded less of it."""
+    return all(about.get(name, value) == value for name, value in map_of(manifest).items())
 
 
-def _map_said(about: Mapping[str, Any]) -> dict[str, str]:
+def _map_hashes(about: Mapping[str, Any]) -> dict[str, str]:
     return {name: str(about[name]) for name in _MAP if name in about}
 
 
 def read_asked(folder: Path) -> dict[str, str]:
-    """By query id, the hash of the query and of its map: what an answer has to say that it answers.
-
-    Raises
-    ------
-    StoreError
-        If a file is missing or damaged.
-    """
-    about, path = _map_said(read_task(folder)), folder / QUERIES
-    is_said = ASKED in read_schema(path, mend=_MEND).names
-    columns = ["query_id", ASKED] if is_said else QUERY_SCHEMA.names
+    """Read by query id the hash of the query and of its map, which its answer has to carry."""
+    about, path = _map_hashes(read_task(folder)), folder / QUERIES
+    is_recorded = ASKED in read_schema(path, mend=_MEND).names
+    columns = ["query_id", ASKED] if is_recorded else QUERY_SCHEMA.names
     rows = (row for batch in read_batches(path, columns) for row in batch.to_pylist())
     return {row["query_id"]: _asked_of(row, about) for row in rows}
 
 
 def _asked_of(row: Mapping[str, Any], about: Mapping[str, str]) -> str:
-    """As the file says, or reckoned from the row where it was drawn before files said so."""
-    said = row.get(ASKED)
-    return asked_sha256(row, about) if said is None else str(said)
+    """Return the recorded hash, or compute it for files of versions that did not record it."""
+    recorded = row.get(ASKED)
+    return asked_sha256(row, about) if recorded is None else str(recorded)
 
 
 def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
-    """The queries of some ids, each with its bytes for a matcher's process and the hash of what is asked.
-
-    A row group is in memory at a time.
-    """
-    about = _map_said(read_task(folder))
+    """Yield queries of some ids, each with its bytes for a matcher's process and its hash; a row group at a time."""
+    about = _map_hashes(read_task(folder))
     with open_table(folder / QUERIES, mend=_MEND, is_whole=False) as source:
         for batch in source.iter_batches(batch_size=_ROWS):
             sent = batch.select([name for name in batch.schema.names if name != ASKED])
@@ -390,21 +337,15 @@ def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, by
 
 
 def read_ids(folder: Path) -> list[str]:
-    """Ids of a task's queries, in their order.
-
-    Raises
-    ------
-    StoreError
-        If the file is missing or damaged.
-    """
+    """Read the ids of a task's queries, in their order."""
     batches = read_batches(folder / QUERIES, ["query_id"])
     return [str(name) for batch in batches for name in batch["query_id"].to_pylist()]
 
 
 def read_view_bytes(folder: Path) -> dict[str, int]:
-    """Bytes of what each query shows, as it travels: the packed view, confidences and vectors, nothing compressed.
+    """Return the bytes of each query's view as it travels: packed cells, confidences and vectors, without compression.
 
-    The size of a packed view follows from its shape, so that no view is read. Stored results say it.
+    The size of packed cells follows from their shape, so that no view is read. Stored results record the bytes.
     """
     if VIEW_BYTES in read_schema(folder / QUERIES, mend=_MEND).names:
         table = read_table(folder / QUERIES, mend=_MEND, columns=["query_id", VIEW_BYTES])
@@ -424,13 +365,13 @@ def read_view_bytes(folder: Path) -> dict[str, int]:
 
 
 def read_queries(folder: Path) -> Iterator[Query]:
-    """Queries of a task in the order of their ids, a row group in memory at a time."""
+    """Yield the queries of a task in the order of their ids, a row group in memory at a time."""
     for row in _rows(folder / QUERIES, QUERY_SCHEMA):
         yield _made(folder / QUERIES, query_of, row)
 
 
 def read_heads(folder: Path) -> Iterator[Head]:
-    """Queries of a task without their views, in the order of their ids."""
+    """Yield the queries of a task without their views, in the order of their ids."""
     for batch in read_batches(folder / QUERIES, HEAD_SCHEMA.names):
         rows = batch.drop_columns(["candidates"]).to_pylist()
         for row, poses in zip(rows, _made(folder / QUERIES, poses_of, batch["candidates"]), strict=True):
@@ -438,13 +379,13 @@ def read_heads(folder: Path) -> Iterator[Head]:
 
 
 def read_truths(folder: Path) -> Iterator[Truth]:
-    """Truths of a task in the order of the query ids."""
+    """Yield the truths of a task in the order of the query ids."""
     for row in _rows(folder / TRUTH, TRUTH_SCHEMA):
         yield _made(folder / TRUTH, truth_of, row)
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """Some columns of queries or truths, a row group in memory at a time.
+    """Yield some columns of queries or truths, a row group in memory at a time.
 
     Raises
     ------
@@ -456,13 +397,12 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
         for batch in source.iter_batches(batch_size=_ROWS, columns=list(columns)):
             empty = next((name for name in columns if name not in MAY_BE_NULL and batch[name].null_count), None)
             if empty is not None:
-                message = f"{path} is damaged ({empty} is null in a row): {_MEND}"
-                raise StoreError(message)
+                raise _damaged(path, f"{empty} is null in a row")
             yield batch
 
 
 def check_columns(path: Path, needed: Sequence[str]) -> None:
-    """Refuse queries or truths without some columns; raises as `read_batches` does."""
+    """Refuse queries or truths that lack columns; raise as `read_batches` does."""
     _check_columns(path, read_schema(path, mend=_MEND), needed)
 
 
@@ -478,19 +418,18 @@ def _check_columns(path: Path, found: pa.Schema, needed: Sequence[str]) -> None:
 
 
 def _is_known(field: pa.Field) -> bool:
-    """Whether a column has the type that it has in files of ours, those of a release included."""
+    """Return whether a column has the type that it has in our files or in a release."""
     schemas = (FILE_SCHEMA, TRUTH_SCHEMA, PLAIN_TRUTH_SCHEMA)
     wanted = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
     return not wanted or any(is_like(field.type, kind) for kind in wanted)
 
 
 def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:
-    """What a row says, which may be anyone's."""
+    """Convert a row, which may be malformed."""
     try:
         return make(row)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
-        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
-        raise StoreError(message) from error
+        raise _damaged(path, error) from error
 
 
 def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user asks for -> one request for each region and suite; all that can be refused before anything is read."""
+"""Planning: a user's wishes become one request for each region and suite; errors are found before anything is read."""
 
 import datetime as dt
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final
 
@@ -21,80 +21,55 @@ from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
 from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
 
-PRIVATE_ROOT: Final = "private"  # below the root of public queries: nothing of the two is ever in one folder
+PRIVATE_ROOT: Final = "private"  # below the root of public queries, so that no folder holds both
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request:
-    """What is asked for: one suite on one region.
+class Settings:
+    """Settings of all requests of a user.
 
-    Parameters
-    ----------
-    suite : str
-        Its name.
-    region : RegionFile
-        Where.
-    split : Split
-        Says the blocks and their parts.
-    count : int
-        Sites; each carries all the variants of the suite.
-    seed : int or PrivateSeed
-        Root of all chance.
-    out : Path
-        Root of what is built.
-    group : PriorGroup, optional
-        Priors; those of the suite unless given.
-    elsewhere : RegionFile, optional
-        Where views of a wrong place are taken.
-    extract_folders : sequence of Path
-        For regions that are not built yet.
-    may_be_fewer : bool
-        Whether as many sites as the region holds will do.
-    choice : Choice
-        Of the suite's variants; those that are left out change no other query.
+    `count` is the number of sites, each with all variants of a suite; with `may_be_fewer`, fewer will do if the region
+    holds no more. Priors are those of the suite unless `group` is given. `choice` selects variants and does not change
+    their queries.
     """
+
+    count: int
+    seed: Seed
+    out: Path
+    group: PriorGroup | None = None
+    extract_folders: tuple[Path, ...] = ()
+    may_be_fewer: bool = False
+    choice: Choice = EVERYTHING
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(Settings):
+    """One suite on one region, with the split and the region for views of a wrong place."""
 
     suite: str
     region: RegionFile
     split: Split
-    count: int
-    seed: Seed
-    out: Path
-    group: PriorGroup | None = None
     elsewhere: RegionFile | None = None
-    extract_folders: tuple[Path, ...] = ()
-    may_be_fewer: bool = False
-    choice: Choice = EVERYTHING
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
-    """What a user asks for: suites, regions, a split, and how much of each; no regions are all that can be built.
-
-    `regions` are ids or files; the other fields are those of a `Request`.
-    """
+class Wanted(Settings):
+    """Suites, a split, and regions as ids or files; without regions, all of the split that can be built."""
 
     suites: tuple[str, ...]
     regions: tuple[str, ...]
     split: str
-    count: int
-    seed: Seed
-    out: Path
-    group: PriorGroup | None = None
-    extract_folders: tuple[Path, ...] = ()
     region_folders: tuple[Path, ...] = ()
-    may_be_fewer: bool = False
-    choice: Choice = EVERYTHING
 
 
 def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
-    """Turn what a user asks for into one request for each region and suite; nothing is read but files of settings.
+    """Plan one request for each region and suite; read nothing but settings.
 
     Raises
     ------
     ConfigError
-        If a suite, region or split is unknown, the split is not sound or does not speak of a region, the count is not
-        positive, or the truths would lie among the tasks.
+        If a suite, region or split is unknown, the split is not sound or lacks a region, the count is not positive, or
+        the truths would be among the tasks.
     """
     for name in wanted.suites:
         fault = wanted.choice.lack(find_suite(name))
@@ -118,54 +93,37 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
     if stranger is not None:
         message = f"split {split.spec.id!r} does not speak of region {stranger!r}: add it to a split file of your own"
         raise ConfigError(message)
+    settings = {item.name: getattr(wanted, item.name) for item in fields(Settings)}
     return tuple(
-        Request(
-            suite=name,
-            region=item,
-            split=split,
-            count=wanted.count,
-            seed=wanted.seed,
-            out=wanted.out,
-            group=wanted.group,
-            elsewhere=wrong_place(split, item, known),
-            extract_folders=wanted.extract_folders,
-            may_be_fewer=wanted.may_be_fewer,
-            choice=wanted.choice,
-        )
+        Request(suite=name, region=item, split=split, elsewhere=wrong_place(split, item, known), **settings)
         for item in {item.id: item for item in named}.values()
         for name in dict.fromkeys(wanted.suites)
     )
 
 
 def root_of(out: Path, seed: PrivateSeed | None) -> Path:
-    """Root of what a seed draws: that of public queries, or for a private seed the folder `private` in it.
-
-    Examples
-    --------
-    >>> root_of(Path("out"), PrivateSeed("3f" * 16)).as_posix(), root_of(Path("out"), None).as_posix()
-    ('out/private', 'out')
-    """
+    """Return the root of what a seed draws: `out` for public queries, the folder `private` in it for a private seed."""
     return out if seed is None else out / PRIVATE_ROOT
 
 
 def check_count(count: int) -> None:
-    """Refuse to draw no queries."""
+    """Refuse a count below one."""
     if count < 1:
         message = f"--n must be at least 1, got {count}"
         raise ConfigError(message)
 
 
 def check_roots(out: Path) -> None:
-    """Refuse to write truths where those who may see the tasks would find them."""
-    check_apart(out / "tasks", out / "truth")
+    """Refuse to write truths where processes that may see the tasks would find them."""
+    check_separate(out / "tasks", out / "truth")
     above = next((folder for folder in (out, *out.resolve().parents) if (folder / task_files.TASK).is_file()), None)
     if above is not None:
         message = f"{out / 'truth'} lies inside {above}, where the queries are: choose another --out"
         raise ConfigError(message)
 
 
-def check_apart(tasks: Path, truth: Path) -> None:
-    """Refuse folders of tasks and of truths of which one lies within the other, links followed."""
+def check_separate(tasks: Path, truth: Path) -> None:
+    """Refuse folders of tasks and truths of which one is inside the other, links followed."""
     one, two = tasks.resolve(), truth.resolve()
     if two.is_relative_to(one) or one.is_relative_to(two):
         message = f"{truth} lies inside {tasks}, where the queries are: choose another --out"
@@ -173,7 +131,7 @@ def check_apart(tasks: Path, truth: Path) -> None:
 
 
 def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -> bool:
-    """Whether a region is a town, or its newest extract is on this machine."""
+    """Return whether a region is synthetic, or its newest extract is on this machine."""
     offline = spec.model_copy(update={"extract": [item.model_copy(update={"urls": ()}) for item in spec.extract]})
     try:
         plan_build(offline, out=out, extract_folders=request_folders)
@@ -183,7 +141,7 @@ def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -
 
 
 def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile]) -> RegionFile | None:
-    """The region where views of a wrong place are taken: the next place of the split, town for town and real for real.
+    """Return the region for views of a wrong place: the next place of the split of the same kind, synthetic or real.
 
     It depends on the split alone, so that asking for more regions changes no query.
     """
@@ -200,14 +158,7 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
 
 
 def aged_dates(spec: RegionFile) -> tuple[dt.date, ...]:
-    """Dates of the older maps for real ageing: for each age the nearest there is, oldest first.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-    >>> [str(date) for date in aged_dates(read_region_file(find_region_file("dreieich")))]
-    ['2013-07-19']
-    """
+    """Return the dates of older maps for real ageing: the nearest one for each age, oldest first."""
     newest = spec.pick(None).date
     older = sorted(extract.date for extract in spec.extract if extract.date < newest)
     if not older:

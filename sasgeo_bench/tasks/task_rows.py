@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries and truths as rows: the columns of `queries.parquet` and `truth.parquet`, and back."""
+"""Queries and truths as rows: the columns of `queries.parquet` and `truth.parquet`, in both directions."""
 
 import datetime as dt
 import hashlib
@@ -21,17 +21,20 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 POSE_FIELDS: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
+# Columns that are fields of a query, and of its prior.
+_FIELDS: Final = (
+    *("query_id", "track", "suite", "suite_version", "part", "region"),
+    *("observed_on", "season", "prior_group"),
+)
+_PRIOR_FIELDS: Final = ("radius_m", "yaw_deg", "yaw_sigma_deg", "scale_sigma")
 _POSE: Final = pa.struct([(name, pa.float64()) for name in POSE_FIELDS])
-
 
 _VECTOR: Final = pa.struct(
     [("class", pa.string()), ("level", pa.int16()), ("is_bridge", pa.bool_()), ("wkb", pa.binary())]
 )
 
-
-_ASKED_VERSION: Final = 1  # raised if the same row is to be answered in another way, not when other rows are drawn
+_ASKED_VERSION: Final = 1  # raised if the same row asks for another answer, not if other rows are drawn
 _META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
-
 
 # The last five columns are for sequences and images, which no suite draws yet.
 QUERY_SCHEMA: Final = pa.schema(
@@ -68,12 +71,9 @@ QUERY_SCHEMA: Final = pa.schema(
     metadata=_META,
 )
 
-
-# What is asked, in one word: an answer says it too, so that it is taken for that query on that map and for no other.
-ASKED: Final = "asked_sha256"
-VIEW_BYTES: Final = "view_bytes"  # column of stored results, which hold no views: bytes that each of them has
+ASKED: Final = "asked_sha256"  # hash of a query and its map; an answer carries it, so that it counts for no other
+VIEW_BYTES: Final = "view_bytes"  # column of stored results, which hold no views: bytes of each view
 FILE_SCHEMA: Final = QUERY_SCHEMA.append(pa.field(ASKED, pa.string()))
-
 
 HEAD_SCHEMA: Final = pa.schema(
     [
@@ -84,7 +84,6 @@ HEAD_SCHEMA: Final = pa.schema(
         )
     ]
 )
-
 
 TRUTH_SCHEMA: Final = pa.schema(
     [
@@ -111,8 +110,7 @@ TRUTH_SCHEMA: Final = pa.schema(
     metadata=_META,
 )
 
-
-# Columns of queries and truths that need not say anything; of no use where what they go with is missing.
+# Columns of queries and truths that may be null.
 MAY_BE_NULL: Final = frozenset(
     {
         *("confidence", "observed_on", "season", "prior_easting_m", "prior_northing_m", "prior_radius_m"),
@@ -121,8 +119,7 @@ MAY_BE_NULL: Final = frozenset(
     }
 )
 
-
-# Truths as a release holds them: lists of pairs where not every reader of parquet knows maps.
+# Truths in a release: lists of pairs, since not every reader of parquet knows maps.
 _PAIR: Final = pa.struct([("name", pa.string()), ("value", pa.float64())])
 PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
     TRUTH_SCHEMA.get_field_index("measured"), pa.field("measured", pa.list_(_PAIR))
@@ -130,38 +127,31 @@ PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
 
 
 def query_row(query: Query) -> dict[str, Any]:
-    """One query as a row of `QUERY_SCHEMA`."""
+    """Return one query as a row of `QUERY_SCHEMA`."""
     seen, prior = query.evidence, query.prior
     center = prior.center_m or (None, None)
-    return {
-        "query_id": query.query_id,
-        "track": query.track,
-        "suite": query.suite,
-        "suite_version": query.suite_version,
-        "part": query.part,
-        "region": query.region,
-        "cell_size_m": seen.cell_size_m,
-        "rows": seen.shape[0],
-        "cols": seen.shape[1],
-        "classes": list(seen.classes),
-        "evidence": pack(seen.cells),
-        "confidence": None if seen.confidence is None else seen.confidence.tobytes(),
-        "observed_on": query.observed_on,
-        "season": query.season,
-        "prior_group": query.prior_group,
-        "prior_easting_m": center[0],
-        "prior_northing_m": center[1],
-        "prior_radius_m": prior.radius_m,
-        "prior_yaw_deg": prior.yaw_deg,
-        "prior_yaw_sigma_deg": prior.yaw_sigma_deg,
-        "prior_scale_sigma": prior.scale_sigma,
-        "candidates": [_pose_row(pose) for pose in query.candidates],
-        "vectors": None if query.vectors is None else _vector_rows(query.vectors),
-    }
+    plain = {name: getattr(query, name) for name in _FIELDS}
+    known = {f"prior_{name}": getattr(prior, name) for name in _PRIOR_FIELDS}
+    return (
+        plain
+        | known
+        | {
+            "cell_size_m": seen.cell_size_m,
+            "rows": seen.shape[0],
+            "cols": seen.shape[1],
+            "classes": list(seen.classes),
+            "evidence": pack(seen.cells),
+            "confidence": None if seen.confidence is None else seen.confidence.tobytes(),
+            "prior_easting_m": center[0],
+            "prior_northing_m": center[1],
+            "candidates": [_pose_row(pose) for pose in query.candidates],
+            "vectors": None if query.vectors is None else _vector_rows(query.vectors),
+        }
+    )
 
 
 def _pose_row(pose: Pose) -> dict[str, float]:
-    return {"easting_m": pose.easting_m, "northing_m": pose.northing_m, "yaw_deg": pose.yaw_deg, "scale": pose.scale}
+    return {name: getattr(pose, name) for name in POSE_FIELDS}
 
 
 def _vector_rows(vectors: "gpd.GeoDataFrame") -> list[dict[str, Any]]:
@@ -174,7 +164,7 @@ def _vector_rows(vectors: "gpd.GeoDataFrame") -> list[dict[str, Any]]:
 
 
 def query_of(row: dict[str, Any]) -> Query:
-    """Inverse of `query_row`."""
+    """Return the query of a row of `QUERY_SCHEMA`."""
     shape = (len(row["classes"]), row["rows"], row["cols"])
     confidence = row["confidence"]
     evidence = Evidence(
@@ -186,23 +176,12 @@ def query_of(row: dict[str, Any]) -> Query:
     has_place = row["prior_radius_m"] is not None
     prior = Prior(
         center_m=(row["prior_easting_m"], row["prior_northing_m"]) if has_place else None,
-        radius_m=row["prior_radius_m"],
-        yaw_deg=row["prior_yaw_deg"],
-        yaw_sigma_deg=row["prior_yaw_sigma_deg"],
-        scale_sigma=row["prior_scale_sigma"],
+        **{name: row[f"prior_{name}"] for name in _PRIOR_FIELDS},
     )
     return Query(
-        query_id=row["query_id"],
-        track=row["track"],
-        suite=row["suite"],
-        suite_version=row["suite_version"],
-        part=row["part"],
-        region=row["region"],
+        **{name: row[name] for name in _FIELDS},
         evidence=evidence,
-        observed_on=row["observed_on"],
-        season=row["season"],
         prior=prior,
-        prior_group=row["prior_group"],
         candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
         vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
     )
@@ -221,54 +200,47 @@ def _vectors_of(rows: list[dict[str, Any]]) -> "gpd.GeoDataFrame":
     )
 
 
-def asked_sha256(row: Mapping[str, Any], map_said: Mapping[str, str]) -> str:
-    """Hash of all that decides an answer: the row of a query, and the map it is to be searched in.
+def asked_sha256(row: Mapping[str, Any], map_hashes: Mapping[str, str]) -> str:
+    """Return the hash of all that decides an answer: the row of a query, and what `task.json` holds of its map.
 
-    Parameters
-    ----------
-    row : mapping
-        Of `QUERY_SCHEMA`, as it is read from a file; what is null or no column of the schema says nothing.
-    map_said : mapping of str to str
-        What `task.json` says of the map.
+    Fields that are null, or not in `QUERY_SCHEMA`, do not count.
 
     Examples
     --------
     >>> asked_sha256({"query_id": "a", "season": None}, {}) == asked_sha256({"query_id": "a", "more": 1}, {})
     True
     """
-    said = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
-    text = json.dumps([_ASKED_VERSION, dict(map_said), said], sort_keys=True, default=_plain)
+    fields = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
+    text = json.dumps([_ASKED_VERSION, dict(map_hashes), fields], sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _plain(value: bytes | dt.date) -> str:
-    """A value that JSON does not know, as text."""
     return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
 
 
 def truth_row(truth: Truth) -> dict[str, Any]:
-    """One truth as a row of `TRUTH_SCHEMA`."""
-    pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(("easting_m", "northing_m", "yaw_deg", "scale"))
+    """Return one truth as a row of `TRUTH_SCHEMA`."""
+    pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(POSE_FIELDS)
     names = [name for name in TRUTH_SCHEMA.names if name not in pose and name != "measured"]
     return {name: getattr(truth, name) for name in names} | pose | {"measured": list(truth.measured.items())}
 
 
 def truth_of(row: dict[str, Any]) -> Truth:
-    """Inverse of `truth_row`; rows of a release (`PLAIN_TRUTH_SCHEMA`) are read too."""
-    names = ("easting_m", "northing_m", "yaw_deg", "scale")
-    pose = None if row["easting_m"] is None else Pose(**{name: row[name] for name in names})
-    rest = {name: value for name, value in row.items() if name not in (*names, "measured")}
+    """Return the truth of a row of `TRUTH_SCHEMA`, or of a release (`PLAIN_TRUTH_SCHEMA`)."""
+    pose = None if row["easting_m"] is None else Pose(**{name: row[name] for name in POSE_FIELDS})
+    rest = {name: value for name, value in row.items() if name not in (*POSE_FIELDS, "measured")}
     pairs = [(pair["name"], pair["value"]) if isinstance(pair, dict) else pair for pair in row["measured"]]
     return Truth(**rest, pose=pose, measured=dict(pairs))
 
 
 def truth_sha256(truth: Truth) -> str:
-    """Hash of all that a truth says."""
+    """Return the hash of a truth."""
     return hashlib.sha256(json.dumps(truth_row(truth), sort_keys=True).encode()).hexdigest()
 
 
 def asked_under(asked: str, key: str | None) -> str:
-    """What an answer says that it answers: the hash of what is asked, and of what the matcher had learnt, if anything.
+    """Return the hash that an answer carries: that of the question and, if the matcher has learned, of what it learned.
 
     Examples
     --------
@@ -279,7 +251,7 @@ def asked_under(asked: str, key: str | None) -> str:
 
 
 def poses_of(lists: pa.ListArray) -> list[tuple[Pose, ...]]:
-    """Poses of each row of a column of lists; without a dictionary for each, which takes longer than the pose."""
+    """Return the poses of each row of a column of lists, without the slow way over a dictionary for each."""
     columns = [lists.values.field(name).to_numpy(zero_copy_only=False).tolist() for name in POSE_FIELDS]
     poses = [
         Pose(easting_m=easting_m, northing_m=northing_m, yaw_deg=yaw_deg, scale=scale)
@@ -289,25 +261,25 @@ def poses_of(lists: pa.ListArray) -> list[tuple[Pose, ...]]:
 
 
 def query_bytes(query: Query) -> bytes:
-    """One query as it goes to a matcher's process: a row in Arrow's stream format."""
+    """Return one query as it goes to a matcher's process: a row in Arrow's stream format."""
     return stream_of(pa.RecordBatch.from_pylist([query_row(query)], schema=QUERY_SCHEMA))
 
 
 def query_from(data: bytes) -> Query:
-    """Inverse of `query_bytes`."""
+    """Return the query of `query_bytes`."""
     with pa.ipc.open_stream(data) as stream:
         return query_of(stream.read_all().to_pylist()[0])
 
 
 def pairs_bytes(pairs: Iterable[tuple[bytes, Truth]]) -> tuple[list[int], bytes]:
-    """Queries, each as its bytes, with their truths, as they go to a process that learns; how long each query is."""
+    """Return queries (as bytes) and truths as they go to a process that learns, and the length of each query."""
     queries, truths = zip(*pairs, strict=True)
     rows = pa.RecordBatch.from_pylist([truth_row(truth) for truth in truths], schema=TRUTH_SCHEMA)
     return [len(query) for query in queries], b"".join((*queries, stream_of(rows)))
 
 
 def pairs_from(sizes: Sequence[int], data: bytes) -> Iterator[tuple[Query, Truth]]:
-    """Inverse of `pairs_bytes`."""
+    """Yield the pairs of `pairs_bytes`."""
     ends = list(accumulate(sizes, initial=0))
     with pa.ipc.open_stream(data[ends[-1] :]) as stream:
         truths = [truth_of(row) for row in stream.read_all().to_pylist()]
@@ -316,14 +288,14 @@ def pairs_from(sizes: Sequence[int], data: bytes) -> Iterator[tuple[Query, Truth
 
 
 def stream_of(batch: pa.RecordBatch) -> bytes:
-    """Some rows in Arrow's stream format."""
+    """Return a batch in Arrow's stream format."""
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, batch.schema) as stream:
         stream.write_batch(batch)
     return bytes(sink.getvalue())
 
 
-_LIKE: Final = (  # a kind of column, and which others can be read as it
+_LIKE: Final = (  # a kind of column, and the kinds that can be read as it
     (pa.types.is_floating, (pa.types.is_floating, pa.types.is_integer)),
     (pa.types.is_integer, (pa.types.is_integer,)),
     (pa.types.is_string, (pa.types.is_string, pa.types.is_large_string)),
@@ -333,7 +305,7 @@ _LIKE: Final = (  # a kind of column, and which others can be read as it
 
 
 def is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
-    """Whether a column can be read as another: any float for a float, any string for a string, null for anything.
+    """Return whether a column can be read as another type: floats and strings of any size, null for anything.
 
     Examples
     --------
@@ -349,7 +321,7 @@ def is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
 
 
 def _is_like_inside(found: pa.DataType, wanted: pa.DataType) -> bool:
-    """Whether items of a list can be read as others; structs may have more fields."""
+    """Return whether items of a list can be read as another type; structs may have more fields."""
     if not pa.types.is_struct(wanted):
         return is_like(found, wanted)
     names = [field.name for field in found] if pa.types.is_struct(found) else []

@@ -15,20 +15,22 @@ from sasgeo_bench.osm.features import check_features
 
 Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
 
+ROADS: Final = ("road_major", "road_minor", "path_track")
+
 _ARC_SEGMENTS: Final = 16
-_DECIMALS: Final = 3  # as in `extract.read`: shared vertices stay equal
-_FINE_DECIMALS: Final = 6  # of a cut or a copy: both stay on the line that was cut, so that the mask stays cell by cell
+_DECIMALS: Final = 3  # as in `osm.read`: shared vertices stay equal
+_FINE_DECIMALS: Final = 6  # of a cut or a copy: both stay on the cut line, so that the mask stays the same
 _AT_M: Final = 0.1  # a road this near to a junction meets it
-_BEND_M: Final = 10.0  # of a road whose junction is moved, what is bent to meet it
-_OPPOSITE: Final = -0.8  # cosine between two arms of a road that goes on
+_BEND_M: Final = 10.0  # length of a road that is bent to meet a moved junction
+_OPPOSITE: Final = -0.8  # cosine between two arms of a continuing road
 _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Paste:
-    """One copy: what lies within a disc around `source_m` takes the place of what lies around `target_m`.
+    """One copy: the features in a disc around `source_m` replace those in a disc around `target_m`.
 
-    `change` edits the copy before it is moved, in the coordinates of the source; None copies it as it is.
+    `change` edits the copy in the coordinates of the source; None copies it unchanged.
     """
 
     source_m: tuple[float, float]
@@ -38,28 +40,9 @@ class Paste:
 
 
 def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFrame:
-    """Copy parts of a map.
+    """Copy parts of a feature table; features that cross the rim of a disc are cut there.
 
-    Parameters
-    ----------
-    features : geopandas.GeoDataFrame
-        A feature table.
-    pastes : sequence of Paste
-        Sources are read from the table as given, whatever is pasted over them.
-
-    Returns
-    -------
-    geopandas.GeoDataFrame
-        Another feature table; whatever crosses the rim of a disc is cut there.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.osm.features import DTYPES, make_features
-    >>> base = {name: [0] for name in DTYPES} | {"osm_type": ["way"], "class": ["building"], "timestamp": [None]}
-    >>> house = make_features(base | {"geometry": [shapely.box(0, 0, 9, 9)]}, epsg=32632)
-    >>> twice = paste(house, [Paste(source_m=(4.5, 4.5), target_m=(104.5, 4.5), radius_m=20.0)])
-    >>> twice.geometry.iloc[1].bounds
-    (100.0, 0.0, 109.0, 9.0)
+    Sources are read from the given table, even if another copy overwrites them.
     """
     if not pastes:
         return features
@@ -79,7 +62,7 @@ def _types(features: gpd.GeoDataFrame) -> Iterable[tuple[str, object]]:
 
 
 def around(features: gpd.GeoDataFrame, center_m: tuple[float, float], radius_m: float) -> gpd.GeoDataFrame:
-    """What lies within a disc, cut at its rim."""
+    """Return the features within a disc, cut at its rim."""
     return _cut(features, _disc(center_m, radius_m), keep_inside=True)
 
 
@@ -98,7 +81,7 @@ def _disc(center_m: tuple[float, float], radius_m: float) -> shapely.Polygon:
 
 
 def _cut(features: gpd.GeoDataFrame, area: shapely.Geometry, *, keep_inside: bool) -> gpd.GeoDataFrame:
-    """Features inside (or outside) an area; what crosses its rim is cut, parts of another dimension are dropped."""
+    """Return features inside (or outside) an area, cut at its rim; drop parts of a lower dimension."""
     geometry = features.geometry.to_numpy()
     shapely.prepare(area)
     meets, within = shapely.intersects(area, geometry), shapely.contains_properly(area, geometry)
@@ -114,7 +97,7 @@ def _cut(features: gpd.GeoDataFrame, area: shapely.Geometry, *, keep_inside: boo
 
 
 def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Drop the points and lines that a cut leaves of areas, and the points it leaves of lines."""
+    """Drop the points and lines that a cut leaves of areas, and the points that it leaves of lines."""
     found = np.empty(len(shapes), dtype=object)
     wanted = shapely.get_dimensions(like)
     for at, shape in enumerate(shapes):
@@ -126,10 +109,7 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
 
 
 def mirror(features: gpd.GeoDataFrame, classes: Sequence[str], center_m: tuple[float, float]) -> gpd.GeoDataFrame:
-    """Mirror the features of some classes from east to west about a place; the others stay.
-
-    Amount and kind of what is there are as before, only its place has changed.
-    """
+    """Mirror the features of some classes from east to west about a place, which keeps their kind and amount."""
     is_one = features["class"].isin(list(classes)).to_numpy()
     shapes = features.geometry.to_numpy().copy()
     flip, shift = np.array([-1.0, 1.0]), np.array([2 * center_m[0], 0.0])
@@ -138,7 +118,7 @@ def mirror(features: gpd.GeoDataFrame, classes: Sequence[str], center_m: tuple[f
 
 
 def split_long(features: gpd.GeoDataFrame, *, piece_m: float, least_area_m2: float) -> gpd.GeoDataFrame:
-    """Cut large buildings across their long side into a row of houses; their union stays exactly what it was."""
+    """Cut large buildings across their long side into a row of houses; their union stays exactly the same."""
     is_large = (features["class"] == "building").to_numpy() & (features.geometry.area.to_numpy() >= least_area_m2)
     rows = [features[~is_large]]
     for _, row in features[is_large].iterrows():
@@ -176,22 +156,13 @@ def _row_of_houses(shape: shapely.Geometry, piece_m: float) -> list[shapely.Geom
 def open_gaps(
     features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, gap_m: float, rng: np.random.Generator
 ) -> gpd.GeoDataFrame:
-    """Take one arm off each junction: the road that ends or passes there stops short, `gap_m` beyond the other's edge.
+    """Shorten one random arm of each junction, so that the road stops `gap_m` before the edge of the other one.
 
-    Parameters
-    ----------
-    features : geopandas.GeoDataFrame
-        A feature table; roads are cut.
-    junctions_m : ndarray of float, shape (N, 2)
-        Easting and northing of the junctions.
-    gap_m : float
-        What stays free between the edges of the two roads.
-    rng : numpy.random.Generator
-        Picks the arm.
+    `junctions_m` has shape (N, 2), easting and northing.
     """
     shapes = features.geometry.to_numpy().copy()
     width_m = np.nan_to_num(features["width_m"].to_numpy(dtype=np.float64), nan=4.0)
-    is_road = features["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    is_road = features["class"].isin(ROADS).to_numpy()
     for point in junctions_m:
         place = shapely.Point(point)
         near = np.flatnonzero(is_road & (shapely.distance(shapes, place) < _AT_M))
@@ -209,21 +180,13 @@ def open_gaps(
 def stagger(
     features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, offset_m: float, rng: np.random.Generator
 ) -> gpd.GeoDataFrame:
-    """Make two T-junctions of each X-junction: one road's further part starts `offset_m` along the other road.
+    """Replace each X-junction by two T-junctions: one road's far part starts `offset_m` along the other road.
 
-    Parameters
-    ----------
-    features : geopandas.GeoDataFrame
-        A feature table; roads are cut and moved.
-    junctions_m : ndarray of float, shape (N, 2)
-        Easting and northing of the junctions; where no road goes on across another one nothing is done.
-    offset_m : float
-        Between the two new junctions.
-    rng : numpy.random.Generator
-        Picks the road and the way it is moved.
+    Road and direction are random. `junctions_m` has shape (N, 2), easting and northing; junctions where no road
+    continues across another one stay.
     """
     shapes = features.geometry.to_numpy().copy()
-    is_road = features["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    is_road = features["class"].isin(ROADS).to_numpy()
     for point in junctions_m:
         arms = _arms(shapes, np.flatnonzero(is_road), point)
         pairs = [
@@ -244,7 +207,7 @@ def stagger(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Arm:
-    """A road that leaves a junction: which feature, in which direction (a unit vector), and which of its neighbours."""
+    """A road that leaves a junction: feature, direction (a unit vector), vertex, and step to the next vertex."""
 
     index: int
     direction: NDArray[np.float64]
@@ -253,7 +216,7 @@ class _Arm:
 
 
 def _arms(shapes: NDArray[np.object_], roads: NDArray[np.int64], point: NDArray[np.float64]) -> list[_Arm]:
-    """Arms of a junction that is a vertex of every road that meets there; roads in several parts are left alone."""
+    """Return the arms of a junction that is a vertex of each of its roads; roads in several parts are skipped."""
     found = []
     near = roads[shapely.distance(shapes[roads], shapely.Point(point)) < _AT_M]
     for index in near.tolist():
@@ -273,7 +236,7 @@ def _arms(shapes: NDArray[np.object_], roads: NDArray[np.int64], point: NDArray[
 def _end_moved(
     line: shapely.Geometry, point: NDArray[np.float64], arm: _Arm, shift: NDArray[np.float64]
 ) -> shapely.Geometry:
-    """Bend the first metres of an arm to where it begins now; a road that passed the junction is in two parts then."""
+    """Bend the first metres of an arm to its new start; split a road that passed the junction into two parts."""
     at = shapely.get_coordinates(line)
     moved = (point + shift).round(_DECIMALS)
     length_m = float(np.hypot(*(at[arm.vertex + arm.step] - at[arm.vertex])))
@@ -287,12 +250,12 @@ def _end_moved(
 
 
 def level_crossings(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Bring every bridge down to the ground: roads that passed over each other now meet in a junction."""
+    """Lower every bridge to the ground: roads that passed over each other now meet in a junction."""
     table = features[(features["class"] != "bridge").to_numpy()].copy()
     table["level"] = np.zeros(len(table), dtype=np.int16)
     table["is_bridge"] = np.zeros(len(table), dtype=bool)
     shapes = table.geometry.to_numpy().copy()
-    is_road = table["class"].isin(["road_major", "road_minor", "path_track"]).to_numpy()
+    is_road = table["class"].isin(ROADS).to_numpy()
     roads = np.flatnonzero(is_road & (shapely.get_dimensions(shapes) == 1))  # a square is a road too, and no line
     tree = shapely.STRtree(shapes[roads])
     first, second = tree.query(shapes[roads], predicate="crosses")
@@ -309,7 +272,7 @@ def level_crossings(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 def _with_vertices(line: shapely.Geometry, points: list[shapely.Geometry]) -> shapely.Geometry:
-    """Add points that lie on a line as vertices of it."""
+    """Add points on a line as vertices of it."""
     for point in points:
         parts = []
         for part in shapely.get_parts(line):

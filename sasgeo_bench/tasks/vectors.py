@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vectors of a view: lines and outlines in the view's frame, as a table and as features a graph is made of."""
+"""Perceived vectors: lines and outlines in the view's frame, as a table and as features of a graph."""
 
 from typing import Final
 
 import geopandas as gpd
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from rasterio.features import shapes as polygons_of
 
 from sasgeo_bench.osm.features import DTYPES, make_features
@@ -18,7 +17,7 @@ _EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere
 
 
 def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.GeoDataFrame:
-    """Gather perceived vectors; coordinates are rounded to a decimetre."""
+    """Return a table of perceived vectors, with coordinates rounded to a decimetre."""
     shapes = np.array([row[3] for row in rows], dtype=object)
     rounded = shapely.transform(shapes, lambda at: at.round(_DECIMALS) + 0.0) if len(rows) else shapes
     return gpd.GeoDataFrame(
@@ -32,10 +31,7 @@ def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.Geo
 
 
 def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.GeoDataFrame:
-    """Instances as the mask alone gives them: one for each connected patch of a class.
-
-    What touches is one; vectors made so carry nothing that the mask does not.
-    """
+    """Return an instance for each connected patch of a class, which adds nothing to the mask."""
     mask = (evidence.layer(class_name) == PRESENT).astype(np.uint8)
     corners = cell_offsets_m(evidence.shape, evidence.cell_size_m)
     step_m = evidence.cell_size_m
@@ -46,13 +42,7 @@ def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.G
 
 
 def as_features(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Perceived vectors as a feature table, so that `graph.build_graph` makes a graph of them.
-
-    Examples
-    --------
-    >>> len(as_features(vector_table([])))
-    0
-    """
+    """Return perceived vectors as a feature table, from which `graph.build_graph` makes a graph."""
     count = len(vectors)
     columns: dict[str, object] = {
         "osm_type": ["way"] * count,
@@ -64,12 +54,7 @@ def as_features(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         "is_bridge": vectors["is_bridge"].to_numpy(),
         "is_tunnel": np.zeros(count, dtype=bool),
         "is_visible": np.ones(count, dtype=bool),
-        "width_m": _widths(vectors),
+        "width_m": np.where(shapely.get_dimensions(vectors.geometry.to_numpy()) == 1, 4.0, np.nan),
         "geometry": vectors.geometry.to_numpy(),
     }
     return make_features({name: columns[name] for name in (*DTYPES, "geometry")}, epsg=_EPSG)
-
-
-def _widths(vectors: gpd.GeoDataFrame) -> NDArray[np.float64]:
-    is_line = shapely.get_dimensions(vectors.geometry.to_numpy()) == 1
-    return np.where(is_line, 4.0, np.nan)

@@ -11,7 +11,7 @@ from sasgeo_bench.leaderboard.lookalike import find_lookalike, find_pair
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.class_weights import HAND
 from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.tasks.suites.mining import RINGS, Windows, least_apart_m
+from sasgeo_bench.tasks.suites.mining import RINGS, Windows, min_distance_m
 
 
 def windows(shares, *, spacing_m):
@@ -29,10 +29,10 @@ def windows(shares, *, spacing_m):
 
 def test_the_most_varied_place_gets_its_like_that_is_far_enough():
     shares = [(0.2, 0.2), (0.2, 0.2), (0.4, 0.0), (0.21, 0.1), (0.9, 0.0), (0.0, 0.5)]
-    pair = find_pair(windows(shares, spacing_m=least_apart_m(100.0) / 2))
+    pair = find_pair(windows(shares, spacing_m=min_distance_m(100.0) / 2))
     assert pair.here_m == (0.0, 0.0)
     # The second place has the same shares, but lies too near.
-    assert pair.there_m[0] == pytest.approx(1.5 * least_apart_m(100.0))
+    assert pair.there_m[0] == pytest.approx(1.5 * min_distance_m(100.0))
     assert pair.apart == pytest.approx(np.hypot(0.01, 0.1), abs=1e-5)
 
 

@@ -9,7 +9,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, make_tasks, why_to_draw
-from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_said
+from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record
 from sasgeo_bench.tasks.seed_file import take_seed
 from sasgeo_bench.tasks.suites.base import Seeds
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -49,7 +49,7 @@ def test_public_seeds_draw_what_they_always_drew(seed, query, draw):
     seeds = Seeds(root=seed, names=("vaduz", "clean", "1"))
     assert seeds.under("site", 0).digest("query", "control", "localization").hex()[:24] == query
     assert draw is None or seeds.rng("prior").integers(10**9) == draw
-    assert seed_said(seed) == {"seed": seed}
+    assert seed_record(seed) == {"seed": seed}
 
 
 @pytest.mark.parametrize("text", ["", "7f" * 16 + "x", "0x" + TEXT, TEXT.upper(), "7f 7f", "geheim"])
@@ -61,7 +61,7 @@ def test_text_that_is_no_seed_is_refused_and_not_repeated(text):
 
 def test_digits_are_counted_as_bits_and_never_shown():
     assert [PrivateSeed(text).bits for text in (TEXT, "7" * 39, "7" * 20, "f" * 16, "12345")] == [128, 129, 66, 64, 16]
-    assert TEXT not in f"{SEED} {SEED!r} {Seeds(root=SEED, names=())} {seed_said(SEED)}"
+    assert TEXT not in f"{SEED} {SEED!r} {Seeds(root=SEED, names=())} {seed_record(SEED)}"
 
 
 def test_a_private_seed_draws_other_than_the_number_of_the_same_digits():

@@ -25,7 +25,7 @@ from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, Drawer, Jo
 from sasgeo_bench.tasks.split import SplitFile, make_split
 from sasgeo_bench.tasks.suites import alias, clean
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, State, Variant
-from sasgeo_bench.tasks.suites.mining import STRIDE_M, candidates, least_apart_m
+from sasgeo_bench.tasks.suites.mining import STRIDE_M, candidates, min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.twin import Paste, paste
 
@@ -299,7 +299,7 @@ def test_the_loneliest_candidate_is_not_the_true_one(drawn):
 
 def test_candidates_keep_as_far_from_each_other_as_from_the_truth(drawn, wide):
     for query, truth in drawn:
-        least_m = least_apart_m(query.evidence.shape[0] * query.evidence.cell_size_m / 2)
+        least_m = min_distance_m(query.evidence.shape[0] * query.evidence.cell_size_m / 2)
         assert nearest_others_m(points_of(query)).min() > least_m - np.sqrt(2) * 2 * STRIDE_M, truth.kind
         assert LEAST_CANDIDATES <= len(query.candidates) <= max(CANDIDATES)
     assert len({len(query.candidates) for query, _ in drawn}) > 1

@@ -37,7 +37,7 @@ from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION, Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import check_task, has_truths, put_task
-from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_said
+from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.tasks.sampling import make_prior
 from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, Seeds, State, changed_share
@@ -98,7 +98,7 @@ def make_paper_task(
     folder = build_made(_spec(seed), _generated(seed, seeds), out=out, tell=tell)
     drawer = PaperDrawer.of(region_files.read_region(folder), seeds)
     pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
-    hidden = {**seed_said(private or seed), "request_sha256": _request_sha256(seed, trials, private)}
+    hidden = {**seed_record(private or seed), "request_sha256": _request_sha256(seed, trials, private)}
     made = put_task(pairs, _about(drawer.region), hidden, out=out, tell=tell)
     tell(f"{SUITE} on {region_name(seed)}: {made.queries} trials in {made.folder}")
     return made.folder

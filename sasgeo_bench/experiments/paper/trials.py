@@ -12,7 +12,7 @@ from sasgeo_bench.experiments.paper.tiles import CELL_M, CLASSES
 from sasgeo_bench.experiments.paper.windows import WINDOW_CELLS, Windows
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.perturbations.base import check_ranges, hide
 from sasgeo_bench.tasks.perturbations.crop import CentralCrop
 from sasgeo_bench.tasks.suites.base import Seeds, State
@@ -143,7 +143,7 @@ def map_change(probability: float) -> Ageing:
         name: Rates(vanish_per_year=-math.log1p(-chance), appear_per_year=math.log1p(chance))
         for name, chance in by_class.items()
     }
-    return Ageing(years=1.0, rates=AgeingRates(classes=rates, places=()), place="procedural")
+    return Ageing(years=1.0, rates=rates, place="procedural")
 
 
 @dataclass(frozen=True, kw_only=True)

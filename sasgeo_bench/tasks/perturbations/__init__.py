@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perturbations: one file each; evidence in, harder evidence out."""
+"""Perturbations, one file each: evidence in, harder evidence out."""

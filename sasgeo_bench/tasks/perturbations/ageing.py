@@ -1,101 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic ageing of the world that is seen: things vanish, others appear, some are drawn anew a little off.
+"""Synthetic ageing of the seen world: objects vanish, appear, or are redrawn slightly off.
 
-For places without dated extracts, and with rates measured elsewhere: a place must never be aged by rates of its own,
-or the test would ask for the numbers the training was given.
+For places without dated extracts, with rates measured elsewhere. A place is never aged by its own rates, since a method
+may have been trained on them.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Self
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
-from sasgeo_bench.tasks.perturbations.base import check_ranges, with_cells
+from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated
 from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects, thin_classes
 from sasgeo_bench.tasks.perturbations.resample import shifted
 
-Mask = NDArray[np.bool_]
-
 _BLOCKED_BY: Final = ("building", "water", "railway", "road_major", "road_minor")
-_TRIES: Final = 12  # to find a free place for a new thing
-_PIECE_M: Final = 40.0  # a line vanishes, appears and is redrawn in pieces about this long
-_NEAR_M: Final = 60.0  # a new thing stands within this distance of the one it is like
+_TRIES: Final = 12  # to find a free place for a new object
+_PIECE_M: Final = 40.0  # length of the pieces in which lines vanish, appear and are redrawn
+_NEAR_M: Final = 60.0  # largest distance of a new object from the one it copies
 _MOST_NEW: Final = 150  # of one class in one view
-_LARGEST_SHARE: Final = 0.1  # of the view, for a thing to appear a second time
-_GROUPS: Final = 4  # of things drawn anew, each with a shift of its own
+_LARGEST_SHARE: Final = 0.1  # of the view, for an object to be copied
+_GROUPS: Final = 4  # of redrawn objects, each with its own shift
 _CLEARED: Final = {"building": ("green", "farmland"), "parking": ("green", "farmland"), "water": ("green", "farmland")}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rates:
-    """Yearly rates of one class: of vanishing per thing there is, of appearing per thing there is by then; 1/year."""
+    """Yearly rates of one class, 1/year: of vanishing and appearing per present object."""
 
     vanish_per_year: float
     appear_per_year: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no rate."""
+        """Check the ranges."""
         check_ranges(self, vanish_per_year=(0, 5), appear_per_year=(0, 5))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AgeingRates:
-    """Rates by class, and the places they were measured in.
-
-    Examples
-    --------
-    >>> rows = [{"class": "building", "vanish_per_year": 0.005, "appear_per_year": 0.02}]
-    >>> AgeingRates.from_rows(rows, places=["vaduz"]).classes["building"].appear_per_year
-    0.02
-    """
-
-    classes: Mapping[str, Rates]
-    places: tuple[str, ...]
-
-    @classmethod
-    def from_rows(cls, rows: Iterable[Mapping[str, Any]], *, places: Iterable[str]) -> Self:
-        """Take a table with the columns class, vanish_per_year and appear_per_year.
-
-        Raises
-        ------
-        PerturbError
-            If a row lacks a column, holds no rate, or a class comes twice.
-        """
-        classes: dict[str, Rates] = {}
-        for row in rows:
-            missing = sorted({"class", "vanish_per_year", "appear_per_year"} - set(row))
-            if missing or row["class"] in classes:
-                fault = f"lacks {missing[0]}" if missing else "names its class a second time"
-                message = f"a row of the ageing rates {fault}: {dict(row)!r}"
-                raise PerturbError(message)
-            classes[row["class"]] = Rates(
-                vanish_per_year=row["vanish_per_year"], appear_per_year=row["appear_per_year"]
-            )
-        return cls(classes=classes, places=tuple(places))
-
-    @classmethod
-    def set_by_hand(cls) -> Self:
-        """Those of the taxonomy, which were set by hand and so come from no place.
-
-        Examples
-        --------
-        >>> AgeingRates.set_by_hand().places
-        ()
-        """
-        classes = {
-            item.name: Rates(
-                vanish_per_year=item.persistence.vanish_per_year, appear_per_year=item.persistence.appear_per_year
-            )
-            for item in load_taxonomy().classes
-        }
-        return cls(classes=classes, places=())
+def rates_by_hand() -> dict[str, Rates]:
+    """Return the rates of the taxonomy by class, which were set by hand and come from no place."""
+    items = ((item.name, item.persistence) for item in load_taxonomy().classes)
+    return {
+        name: Rates(vanish_per_year=item.vanish_per_year, appear_per_year=item.appear_per_year) for name, item in items
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,13 +57,13 @@ class Ageing:
     Parameters
     ----------
     years : float
-        How much newer the world is than the map.
-    rates : AgeingRates
-        By class; one that has none does not age.
-    place : str
-        Where the view is.
+        Age of the map at the time of the view.
+    rates : mapping of str to Rates
+        By class; a class without rates does not age.
+    place, measured_in : str, tuple of str
+        Where the view is, and where the rates were measured.
     redrawn : float
-        Share of what stays that is seen a little off, because it was drawn anew; only where years pass.
+        Fraction of the remaining objects that are shifted because they were redrawn; only if years pass.
     shift_m : float
         Standard deviation of that shift in each direction, metres.
 
@@ -122,39 +74,35 @@ class Ageing:
 
     Notes
     -----
-    A thing is a connected component; lines, which all connect, go and come in pieces of about 40 m. The sea, which is
-    water that reaches a coastline, stays as it is. A thing vanishes
-    with probability 1 - exp(-vanish * years). As many appear as a Poisson draw of mean
-    (exp(appear * years) - 1) * things says, which is what measured rates of appearing mean, each a turned copy of one
-    of its class, set down nearby where no building, water, road or railway is. One that finds no free place in twelve
-    tries is left out, so dense places grow less than asked.
+    An object is a connected component; lines, which all connect, are cut into pieces of about 40 m. The sea (water that
+    touches a coastline) stays. An object vanishes with probability 1 - exp(-vanish * years). The number of new objects
+    is Poisson with mean (exp(appear * years) - 1) * objects. Each is a rotated copy of one of its class, placed nearby
+    where no building, water, road or railway is. One without a free place after twelve tries is dropped, so dense
+    places grow less.
 
     Examples
     --------
-    >>> view = Evidence(classes=("building",), cells=np.eye(64, dtype=np.uint8)[None], cell_size_m=1.0)
-    >>> Ageing(years=5.0, rates=AgeingRates.from_rows([], places=["vaduz"]), place="vaduz")
+    >>> Ageing(years=5.0, rates={}, place="vaduz", measured_in=("vaduz",))
     Traceback (most recent call last):
     sasgeo_bench.errors.PerturbError: Ageing: the rates come from 'vaduz' itself, take those of other places
     """
 
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"years": 0.0}
-    MOVES: ClassVar[bool] = False
-
     years: float
-    rates: AgeingRates
+    rates: Mapping[str, Rates]
     place: str
+    measured_in: tuple[str, ...] = ()
     redrawn: float = 0.0
     shift_m: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and a place's own rates."""
+        """Check the ranges, and that the rates are not the place's own."""
         check_ranges(self, years=(0, 200), redrawn=(0, 1), shift_m=(0, 100))
-        if self.place in self.rates.places:
+        if self.place in self.measured_in:
             message = f"Ageing: the rates come from {self.place!r} itself, take those of other places"
             raise PerturbError(message)
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
-        """Let things vanish and move in all classes first, then let new ones appear on what is free by then."""
+        """Remove and shift objects of all classes first, then add new ones on free ground."""
         if self.years == 0:
             return evidence
         pool = NoisePool(evidence.shape)
@@ -162,23 +110,23 @@ class Ageing:
         sea = _sea(layers)
         if sea is not None:
             layers["water"] &= ~sea
-        things = {
-            name: _things(name, mask, pool, evidence.cell_size_m, rng)
+        objects = {
+            name: _objects_of(name, mask, pool, evidence.cell_size_m, rng)
             for name, mask in layers.items()
-            if name in self.rates.classes and mask.any()
+            if name in self.rates and mask.any()
         }
-        for name, found in things.items():
+        for name, found in objects.items():
             layers[name] = self._older(name, layers[name], found, evidence.cell_size_m, rng)
         if sea is not None:
             layers["water"] |= sea
-        for name, found in things.items():
+        for name, found in objects.items():
             self._appear(name, layers, found, evidence.cell_size_m, rng)
         return with_cells(evidence, np.stack(list(layers.values())).view(np.uint8))
 
     def _older(self, name: str, mask: Mask, found: Objects, cell_size_m: float, rng: np.random.Generator) -> Mask:
-        """The class without what vanished, and with some of the rest a little off."""
+        """Return the class without the vanished objects, and with some of the others shifted."""
         count = len(found.areas_cells)
-        gone = rng.random(count) < 1 - np.exp(-self.rates.classes[name].vanish_per_year * self.years)
+        gone = rng.random(count) < 1 - np.exp(-self.rates[name].vanish_per_year * self.years)
         anew = ~gone & (rng.random(count) < self.redrawn)
         kept = mask & ~found.mask_of(gone | anew)
         group = rng.integers(0, _GROUPS, size=count)
@@ -190,9 +138,9 @@ class Ageing:
     def _appear(
         self, name: str, layers: dict[str, Mask], found: Objects, cell_size_m: float, rng: np.random.Generator
     ) -> None:
-        """Set new things down in place, and clear what grew there."""
+        """Add new objects in place, and clear the ground cover below them."""
         usable = np.flatnonzero(found.areas_cells <= _LARGEST_SHARE * found.labels.size)
-        mean = np.expm1(self.rates.classes[name].appear_per_year * self.years) * len(found.areas_cells)
+        mean = np.expm1(self.rates[name].appear_per_year * self.years) * len(found.areas_cells)
         count = min(int(rng.poisson(mean)), _MOST_NEW)
         if not count or not len(usable):
             return
@@ -200,19 +148,19 @@ class Ageing:
         taken = _taken(name, layers)
         for source in rng.choice(usable, size=count).tolist():
             box = boxes[source]
-            stamp = _turned(found.labels[box] == source + 1, rng)
-            window = _free_window(stamp, box, taken, cell_size_m, rng)
+            footprint = _turned(found.labels[box] == source + 1, rng)
+            window = _free_window(footprint, box, taken, cell_size_m, rng)
             if window is None:
                 continue
-            layers[name][window] |= stamp
-            taken[window] |= stamp & (name not in thin_classes())
+            layers[name][window] |= footprint
+            taken[window] |= footprint & (name not in thin_classes())
             for below in _CLEARED.get(name, ()):
                 if below in layers:
-                    layers[below][window] &= ~stamp
+                    layers[below][window] &= ~footprint
 
 
 def _sea(layers: Mapping[str, Mask]) -> Mask | None:
-    """Water that reaches a coastline, which does not age as ponds do; None without one."""
+    """Return water that touches a coastline and does not age; None without any."""
     water, coast = layers.get("water"), layers.get("coastline")
     if water is None or coast is None or not coast.any():
         return None
@@ -220,8 +168,8 @@ def _sea(layers: Mapping[str, Mask]) -> Mask | None:
     return np.isin(bodies, np.setdiff1d(np.unique(bodies[dilated(coast, 1.5)]), [0])) if count else None
 
 
-def _things(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.random.Generator) -> Objects:
-    """Components of an area class; of a line, the pieces between the changes of sign of smooth noise."""
+def _objects_of(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.random.Generator) -> Objects:
+    """Return the components of an area class, or the pieces of a line class between sign changes of smooth noise."""
     if name not in thin_classes():
         return find_objects(mask)
     hills = pool.take(_PIECE_M / cell_size_m, rng) > 0
@@ -233,7 +181,7 @@ def _things(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.
 
 
 def _taken(name: str, layers: Mapping[str, Mask]) -> Mask:
-    """Where nothing new of a class may stand: a line may cross roads, nothing else may."""
+    """Return where no new object of a class may stand; a line may cross roads."""
     blockers = ("building", "water") if name in thin_classes() else (*_BLOCKED_BY, name)
     taken = np.zeros(layers[name].shape, dtype=bool)
     for blocker in blockers:
@@ -242,18 +190,17 @@ def _taken(name: str, layers: Mapping[str, Mask]) -> Mask:
     return dilated(taken, 1.5)
 
 
-def _turned(stamp: Mask, rng: np.random.Generator) -> Mask:
-    """The thing turned by quarters and mirrored at random."""
+def _turned(footprint: Mask, rng: np.random.Generator) -> Mask:
     quarters, mirrored = rng.integers(0, (4, 2)).tolist()
-    return np.rot90(stamp[:, ::-1] if mirrored else stamp, quarters)
+    return np.rot90(footprint[:, ::-1] if mirrored else footprint, quarters)
 
 
 def _free_window(
-    stamp: Mask, box: tuple[slice, ...], taken: Mask, cell_size_m: float, rng: np.random.Generator
+    footprint: Mask, box: tuple[slice, ...], taken: Mask, cell_size_m: float, rng: np.random.Generator
 ) -> tuple[slice, slice] | None:
-    """A window near a box in which the thing meets nothing; None where none was found."""
-    height, width = stamp.shape
-    size = np.array(stamp.shape)
+    """Return a window near a box in which the object overlaps nothing; None if none was found."""
+    height, width = footprint.shape
+    size = np.array(footprint.shape)
     middle = np.array([(part.start + part.stop) / 2 for part in box])
     away = size.max() + rng.uniform(0, _NEAR_M / cell_size_m, size=(_TRIES, 1))
     heading = rng.uniform(0, 2 * np.pi, size=_TRIES)
@@ -261,6 +208,6 @@ def _free_window(
     for row, col in corners.astype(int).tolist():
         window = (slice(row, row + height), slice(col, col + width))
         is_inside = row >= 0 and col >= 0 and row + height <= taken.shape[0] and col + width <= taken.shape[1]
-        if is_inside and not (taken[window] & stamp).any():
+        if is_inside and not (taken[window] & footprint).any():
             return window
     return None

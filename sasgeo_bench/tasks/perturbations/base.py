@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every perturbation is and keeps to, and how much one did."""
+"""The interface of perturbations, and code that they share."""
 
-import dataclasses
-from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar, Protocol, TypeVar
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,87 +12,15 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 
-Cells = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-
-
-class Perturbation(Protocol):
-    """A frozen dataclass that makes a view harder; all that is random comes from the generator it is given.
-
-    `NEUTRAL` holds the parameters that make it do nothing: with them it returns the same cells. `MOVES` says whether
-    cells change their place; where they do not, what was unknown stays unknown. A stored confidence stays with its
-    cell.
-    """
-
-    NEUTRAL: ClassVar[Mapping[str, float]]
-    MOVES: ClassVar[bool]
-
-    def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
-        """Return a harder view; the given one stays as it was."""
-        ...
-
-
-AnyPerturbation = TypeVar("AnyPerturbation", bound=Perturbation)
-
-
-def apply(perturbations: Iterable[Perturbation], evidence: Evidence, rng: np.random.Generator) -> Evidence:
-    """Perturb a view by each in turn.
-
-    Each draws from a generator of its own, so that the strength of one changes nothing in what the next one draws.
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("road_minor",), cells=np.ones((1, 4, 4), dtype=np.uint8), cell_size_m=1.0)
-    >>> apply([], view, np.random.default_rng(0)) is view
-    True
-    """
-    perturbations = tuple(perturbations)
-    for perturb, own_rng in zip(perturbations, rng.spawn(len(perturbations)), strict=True):
-        evidence = perturb(evidence, own_rng)
-    return evidence
-
-
-def neutral(perturbation: AnyPerturbation) -> AnyPerturbation:
-    """Return the same perturbation at strength 0: the control of a matched pair."""
-    return dataclasses.replace(perturbation, **perturbation.NEUTRAL)  # type: ignore[type-var]
-
-
-def check_perturbation(perturbation: Perturbation, evidence: Evidence, *, seed: int = 0) -> None:
-    """Hold a perturbation, also one of a user's own, to what all of them promise, on one view.
-
-    Raises
-    ------
-    PerturbError
-        If strength 0 changes a cell, equal seeds differ, shape or classes change, something unknown becomes known
-        without having moved, or the input was written to.
-    """
-    name, kept = type(perturbation).__name__, evidence.cells.copy()
-    first, second = (perturbation(evidence, np.random.default_rng(seed)) for _ in range(2))
-    unknown = kept == UNKNOWN
-    same_frame = first.classes == evidence.classes and first.cells.shape == kept.shape
-    promises = {
-        "leaves its input as it was": np.array_equal(evidence.cells, kept),
-        "keeps classes, shape and cell size": same_frame and first.cell_size_m == evidence.cell_size_m,
-        "gives the same for the same seed": np.array_equal(first.cells, second.cells),
-        "keeps unknown what is unknown": perturbation.MOVES or (same_frame and (first.cells[unknown] == UNKNOWN).all()),
-        "changes nothing at strength 0": np.array_equal(
-            neutral(perturbation)(evidence, np.random.default_rng(seed)).cells, kept
-        ),
-    }
-    broken = [promise for promise, holds in promises.items() if not holds]
-    if broken:
-        message = f"{name} breaks what every perturbation promises: that it {'; that it '.join(broken)}"
-        raise PerturbError(message)
+# A frozen dataclass that makes a view harder. It does not change the given view, at strength 0 it changes no cell, and
+# all randomness comes from the generator. Unknown cells stay unknown unless cells change their place; the confidence of
+# a cell moves with it.
+Perturbation = Callable[[Evidence, np.random.Generator], Evidence]
 
 
 def check_ranges(owner: object, **ranges: tuple[float, float]) -> None:
-    """Refuse, in one line, a parameter that is no number or lies outside its range (ends included).
-
-    Raises
-    ------
-    PerturbError
-        Naming the perturbation, the parameter, the range and what was given.
-    """
+    """Raise a PerturbError if a named attribute is not a number within its range, ends included."""
     for name, (low, high) in ranges.items():
         value: Any = getattr(owner, name)
         is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
@@ -101,40 +30,23 @@ def check_ranges(owner: object, **ranges: tuple[float, float]) -> None:
 
 
 def share_changed(before: Evidence, after: Evidence) -> float:
-    """Share of the cells, over all classes, that differ.
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("water",), cells=np.zeros((1, 2, 2), dtype=np.uint8), cell_size_m=1.0)
-    >>> share_changed(view, view.replace(np.array([[[0, 0], [0, 1]]], dtype=np.uint8)))
-    0.25
-    """
+    """Return the fraction of cells, over all classes, that differ."""
     return float((before.cells != after.cells).mean())
 
 
 def share_hidden(before: Evidence, after: Evidence) -> float:
-    """Share of what was known, over all classes, that became unknown; 0 where nothing was known.
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("water",), cells=np.array([[[0, 1], [2, 2]]], dtype=np.uint8), cell_size_m=1.0)
-    >>> share_hidden(view, view.replace(np.array([[[0, 2], [2, 2]]], dtype=np.uint8)))
-    0.5
-    """
+    """Return the fraction of known cells, over all classes, that became unknown; 0 if none was known."""
     known = before.cells != UNKNOWN
     return float((after.cells[known] == UNKNOWN).mean()) if known.any() else 0.0
 
 
-def with_cells(evidence: Evidence, cells: Cells) -> Evidence:
-    """The view with other cells and the confidence it had; what was unknown is so again.
-
-    UNKNOWN is the largest state, so one maximum does it.
-    """
-    return evidence.replace(np.maximum(cells, evidence.cells & UNKNOWN), evidence.confidence)
+def with_cells(evidence: Evidence, cells: NDArray[np.uint8]) -> Evidence:
+    """Return the view with other cells and its own confidence; unknown cells stay unknown."""
+    return evidence.replace(np.maximum(cells, evidence.cells & UNKNOWN), evidence.confidence)  # UNKNOWN is the largest
 
 
-def hide(evidence: Evidence, mask: Mask, class_names: Iterable[str] | None = None) -> Evidence:
-    """Make the cells of a mask, shape (rows, cols) or (C, rows, cols), unknown, for all classes or those named.
+def hide(evidence: Evidence, mask: Mask) -> Evidence:
+    """Make the cells of a mask unknown; its shape is (rows, cols) for all classes or (C, rows, cols).
 
     Examples
     --------
@@ -142,10 +54,29 @@ def hide(evidence: Evidence, mask: Mask, class_names: Iterable[str] | None = Non
     >>> hide(view, np.array([[False, True]])).cells.tolist()
     [[[0, 2]]]
     """
-    veil = mask.view(np.uint8) * np.uint8(UNKNOWN)
-    if class_names is None:
-        return evidence.replace(np.maximum(evidence.cells, veil), evidence.confidence)
-    cells = evidence.cells.copy()
-    for index in (evidence.classes.index(name) for name in class_names if name in evidence.classes):
-        np.maximum(cells[index], veil, out=cells[index])
-    return evidence.replace(cells, evidence.confidence)
+    return evidence.replace(np.maximum(evidence.cells, mask.view(np.uint8) * np.uint8(UNKNOWN)), evidence.confidence)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Occlusion(ABC):
+    """Base of the perturbations that make a fraction of the view unknown.
+
+    Parameters
+    ----------
+    share : float
+        Fraction of the cells to hide, 0 to 1.
+    """
+
+    share: float
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        check_ranges(self, share=(0, 1))
+
+    def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
+        """Hide the cells of `mask`."""
+        return evidence if self.share == 0 else hide(evidence, self.mask(evidence, rng))
+
+    @abstractmethod
+    def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
+        """Return the cells to hide, as `hide` takes them."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smooth random fields and the masks cut from them: what makes errors lie together as real ones do."""
+"""Smooth random fields and masks cut from them, so that errors are correlated in space as real ones are."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,24 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.angles import rotation
+
 Field = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SIGMA: Final = 0.575  # standard deviation of smooth noise: interpolation takes the rest of the variance
-_MIRRORED: Final = (-1, 0, 1)  # how OpenCV names a flip: both ways, upside down, sideways
-_FEWEST: Final = 4096  # enough values to place a threshold within half a percent
+SIGMA: Final = 0.575  # standard deviation of smooth noise: interpolation removes the rest of the variance
+_MIRRORED: Final = (-1, 0, 1)  # flip codes of OpenCV: both axes, vertical, horizontal
+_FEWEST: Final = 4096  # values that place a threshold within half a percent
 
 
 def smooth_noise(shape: tuple[int, int], scale_cells: float, rng: np.random.Generator) -> Field:
-    """Gaussian noise whose hills and hollows are about `scale_cells` wide, shape (rows, cols); mean 0, deviation SIGMA.
+    """Draw Gaussian noise with features about `scale_cells` wide, shape (rows, cols); mean 0, deviation SIGMA.
 
-    Normal values on a coarse lattice, drawn out twice by linear interpolation, which rounds the corners a single step
-    would leave; the lattice is cut out at a random place, so that it lies nowhere twice. Equal for equal generators.
-
-    Examples
-    --------
-    >>> smooth_noise((20, 30), 5.0, np.random.default_rng(0)).shape
-    (20, 30)
+    Normal values on a coarse lattice are interpolated linearly twice, since a single step would leave corners. The
+    lattice has a random offset, so that it coincides in no two fields.
     """
     scale = max(1.0, float(scale_cells))
     rows, cols = shape
@@ -41,23 +38,15 @@ def smooth_noise(shape: tuple[int, int], scale_cells: float, rng: np.random.Gene
 
 
 class NoisePool:
-    """Smooth fields for many layers of one view, each cut from a larger one of its width: cheaper than one field each.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> pool = NoisePool((20, 30))
-    >>> pool.take(5.0, rng).shape, pool.take(5.0, rng).shape
-    ((20, 30), (20, 30))
-    """
+    """Draw smooth fields for many layers of a view as windows of a larger one, which is faster."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        """Nothing is drawn before it is asked for."""
+        """Draw nothing yet."""
         self._shape = shape
         self._fields: dict[float, Field] = {}
 
     def take(self, scale_cells: float, rng: np.random.Generator) -> Field:
-        """Cut a window of `smooth_noise`, at random and mirrored at random; read it, do not write to it."""
+        """Cut a random window of `smooth_noise`, mirrored at random; do not write to it."""
         rows, cols = self._shape
         spare_rows, spare_cols = rows // 3 + 1, cols // 3 + 1
         whole = self._fields.get(scale_cells)
@@ -71,24 +60,12 @@ class NoisePool:
 
 
 def top_share(field: Field, share: float) -> Mask:
-    """The cells with the highest values, exactly `share` of them where no two are equal.
-
-    Examples
-    --------
-    >>> top_share(np.array([[0.0, 1.0], [2.0, 3.0]], dtype=np.float32), 0.5).tolist()
-    [[False, False], [True, True]]
-    """
+    """Return the cells with the highest values, exactly a fraction `share` of them if no two are equal."""
     return field >= highest(field.ravel(), share * field.size)
 
 
 def highest(values: Field, count: float) -> float:
-    """The threshold that the `count` highest of some values reach; above all of them where `count` rounds to 0.
-
-    Examples
-    --------
-    >>> highest(np.array([5.0, 1.0, 3.0], dtype=np.float32), 2)
-    3.0
-    """
+    """Return the threshold that the `count` highest values reach; infinity if `count` rounds to 0."""
     kth = round(count)
     if kth <= 0 or values.size == 0:
         return float("inf")
@@ -98,14 +75,7 @@ def highest(values: Field, count: float) -> float:
 
 
 def highest_within(field: Field, mask: Mask, count: float, rng: np.random.Generator) -> float:
-    """`highest` of a field within a mask; off some of the rows where the mask is large, so to about half a percent.
-
-    Examples
-    --------
-    >>> field = np.array([[5.0, 1.0], [3.0, 9.0]], dtype=np.float32)
-    >>> highest_within(field, field < 9.0, 2, np.random.default_rng(0))
-    3.0
-    """
+    """Return `highest` of a field within a mask; of a sample of rows if the mask is large (to about half a percent)."""
     size = np.count_nonzero(mask)
     step = size // _FEWEST
     if step < 2:  # noqa: PLR2004 - a part must be smaller than the whole
@@ -117,59 +87,40 @@ def highest_within(field: Field, mask: Mask, count: float, rng: np.random.Genera
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Centres:
-    """Where the centres of a view's cells lie from its middle: `right_m` of shape (1, cols), `up_m` of (rows, 1)."""
+    """Centres of a view's cells relative to its middle: `right_m` of shape (1, cols), `up_m` of (rows, 1)."""
 
     right_m: NDArray[np.float64]
     up_m: NDArray[np.float64]
 
+    def along_and_across(self, direction_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return distances along a direction, clockwise from up, and across it, each of shape (rows, cols)."""
+        right, up = rotation(direction_deg)[:, 1]
+        return self.right_m * right + self.up_m * up, self.right_m * up - self.up_m * right
+
 
 def centres(shape: tuple[int, int], cell_size_m: float) -> Centres:
-    """Centres of the cells of a view; the two broadcast to its shape.
-
-    Examples
-    --------
-    >>> centres((2, 2), 1.0).up_m.tolist()
-    [[0.5], [-0.5]]
-    """
+    """Return the centres of the cells of a view; the two arrays broadcast to its shape."""
     up, right = (np.linspace(-count / 2, count / 2, 2 * count + 1)[1::2] * cell_size_m for count in shape)
     return Centres(right_m=right[None, :], up_m=-up[:, None])
 
 
 @lru_cache(maxsize=64)
 def disc(radius_cells: float) -> NDArray[np.uint8]:
-    """Structuring element of a disc.
-
-    Examples
-    --------
-    >>> disc(1.0).tolist()
-    [[0, 1, 0], [1, 1, 1], [0, 1, 0]]
-    """
+    """Return the structuring element of a disc."""
     reach = int(radius_cells)
     rows, cols = np.ogrid[-reach : reach + 1, -reach : reach + 1]
     element = np.asarray(rows**2 + cols**2 <= radius_cells**2, dtype=np.uint8)
-    element.flags.writeable = False  # it is kept for the next call
+    element.flags.writeable = False  # it is cached
     return element
 
 
 def dilated(mask: Mask, radius_cells: float) -> Mask:
-    """Grow a mask by a disc.
-
-    Examples
-    --------
-    >>> dilated(np.eye(3, dtype=bool), 1.0).sum()
-    np.int64(7)
-    """
+    """Grow a mask by a disc."""
     return _morph(cv2.dilate, mask, radius_cells)
 
 
 def eroded(mask: Mask, radius_cells: float) -> Mask:
-    """Shrink a mask by a disc; beyond the edge it is taken to go on.
-
-    Examples
-    --------
-    >>> eroded(np.ones((3, 3), dtype=bool), 1.0).sum()
-    np.int64(9)
-    """
+    """Shrink a mask by a disc; outside the view it is taken to continue."""
     return _morph(cv2.erode, mask, radius_cells)
 
 

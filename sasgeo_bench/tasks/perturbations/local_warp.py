@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A smooth local distortion: relief, a stitched mosaic, a drawing that follows no survey.
+"""A smooth local distortion: relief, a stitched mosaic, an inaccurate drawing.
 
-Cells no longer overlap with the map while roads keep their order: what a graph should withstand, and a raster not.
+Cells no longer overlap with the map, while roads keep their order: a graph should withstand that, a raster cannot.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,58 +15,45 @@ from sasgeo_bench.tasks.perturbations.base import check_ranges
 from sasgeo_bench.tasks.perturbations.fields import centres
 from sasgeo_bench.tasks.perturbations.resample import resample
 
+_WAVELENGTH_M: Final = 90.0
 _WAVES: Final = 16
-_SPREAD: Final = 0.2  # wavelengths lie within this share of the mean one
-_STEPS: Final = 30  # each brings a moved point nearer by the field's steepness; ten do for a gentle one
+_SPREAD: Final = 0.2  # relative spread of the wavelengths around their mean
+_STEPS: Final = 30  # of the iteration; ten suffice for a gentle field
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalWarp:
-    """Move cells by a smooth displacement field with mean 0.
+    """Move cells by a smooth displacement field with mean 0 and a mean wavelength of 90 m.
 
     Parameters
     ----------
     rms_m : float
-        Root mean square length of the displacement, metres; exactly this in every view.
-    wavelength_m : float
-        Mean wavelength, metres.
+        Root mean square length of the displacement, metres; exact in every view.
 
     Notes
     -----
-    Sixteen plane waves in random directions for each component. Where `rms_m` is more than about a tenth of the
-    wavelength the field folds in places, and some ground is seen twice; `folded_share` says how much: 10 m fold 0.09
-    of the view at 60 m, 0.005 at 90 m and nothing at 120 m, 15 m fold 0.24, 0.08 and 0.01, 5 m nothing.
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("water",), cells=np.zeros((1, 64, 64), dtype=np.uint8), cell_size_m=2.0)
-    >>> warp = LocalWarp(rms_m=5.0, wavelength_m=90.0)
-    >>> field = warp.field(view.shape, view.cell_size_m, np.random.default_rng(0))
-    >>> round(float(np.sqrt((field**2).sum(axis=0).mean())), 6)
-    5.0
+    Sixteen plane waves in random directions for each component. Where `rms_m` exceeds about a tenth of the wavelength
+    the field folds, and some ground is seen twice (`folded_share`): at 5 m nothing, at 10 m 0.005 of the view, at 15 m
+    0.08.
     """
 
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"rms_m": 0.0}
-    MOVES: ClassVar[bool] = True
-
     rms_m: float
-    wavelength_m: float = 90.0
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_ranges(self, rms_m=(0, 1e3), wavelength_m=(1, 1e5))
+        """Check the range."""
+        check_ranges(self, rms_m=(0, 1e3))
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
-        """Warp the view; ground from beyond it is unknown."""
+        """Warp the view; ground from outside it is unknown."""
         if self.rms_m == 0:
             return evidence
         return warped(evidence, self.field(evidence.shape, evidence.cell_size_m, rng))
 
     def field(self, shape: tuple[int, int], cell_size_m: float, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Displacement (right, up) of every cell, shape (2, rows, cols), metres: a cell shows what lies that far off.
+        """Draw the displacement (right, up) of every cell, shape (2, rows, cols), metres.
 
-        A call of the warp itself draws the same field from an equal generator, so perceived vectors can be moved with
-        the cells (`moved`), or left.
+        A cell shows the ground that far off. An equal generator gives the field that a call of the warp uses, so that
+        vectors can be moved with the cells (`moved`).
         """
         at = centres(shape, cell_size_m)
         field = np.stack([self._component(at.right_m.ravel(), at.up_m.ravel(), rng) for _ in range(2)])
@@ -78,35 +64,28 @@ class LocalWarp:
     def _component(
         self, right_m: NDArray[np.float64], up_m: NDArray[np.float64], rng: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Sum of plane waves: each is a product of a row and a column, so that all of them are one matrix product."""
-        wavelengths_m = self.wavelength_m * rng.uniform(1 - _SPREAD, 1 + _SPREAD, size=_WAVES)
+        """Return a sum of plane waves; each is a product of a row and a column, so one matrix product gives the sum."""
+        wavelengths_m = _WAVELENGTH_M * rng.uniform(1 - _SPREAD, 1 + _SPREAD, size=_WAVES)
         heading, phase = rng.uniform(0, 2 * np.pi, size=(2, _WAVES))
         number = 2 * np.pi / wavelengths_m
         across = np.outer(number * np.cos(heading), right_m)
         along = np.outer(up_m, number * np.sin(heading)) + phase
         rows = np.concatenate((np.cos(along), -np.sin(along)), axis=1)
-        # Not `@`: its last digit depends on how many threads the machine has, and with it what a seed gives.
+        # Not `@`: its last digit depends on the number of threads, and the queries of a seed would too.
         return np.asarray(np.einsum("rw,wc->rc", rows, np.concatenate((np.cos(across), np.sin(across)))))
 
 
 def warped(evidence: Evidence, field_m: NDArray[np.float64]) -> Evidence:
-    """Show in each cell what lies `field_m`, shape (2, rows, cols), off."""
+    """Show in each cell the ground `field_m` off, shape (2, rows, cols)."""
     at = centres(evidence.shape, evidence.cell_size_m)
     return resample(evidence, at.right_m + field_m[0], at.up_m + field_m[1])
 
 
 def moved(points_m: NDArray[np.float64], field_m: NDArray[np.float64], cell_size_m: float) -> NDArray[np.float64]:
-    """Where a warp shows points of the view, shape (N, 2), (right, up) from its middle in metres.
+    """Return where a warp shows points of the view, shape (N, 2), (right, up) from its middle in metres.
 
-    The cell at p shows what lies at p + d(p), so a point q is shown where p + d(p) = q, found by repeating
-    p = q - d(p) to within a cell. Where the field folds there are several such places, and this need not end at one.
-
-    Examples
-    --------
-    >>> shift = np.zeros((2, 8, 8))
-    >>> shift[0] = 1.0
-    >>> moved(np.array([[0.0, 0.0]]), shift, 1.0).round(6).tolist()
-    [[-1.0, 0.0]]
+    The cell at p shows the ground at p + d(p), so a point q is shown at the p with p + d(p) = q. The iteration p = q -
+    d(p) finds it to within a cell; where the field folds there are several solutions, and it may not converge.
     """
     rows, cols = field_m.shape[1:]
     shown = np.array(points_m, dtype=np.float64)
@@ -118,13 +97,7 @@ def moved(points_m: NDArray[np.float64], field_m: NDArray[np.float64], cell_size
 
 
 def folded_share(field_m: NDArray[np.float64], cell_size_m: float) -> float:
-    """Share of the cells where a warp turns the ground over: the determinant of its Jacobian is negative.
-
-    Examples
-    --------
-    >>> folded_share(np.zeros((2, 8, 8)), 1.0)
-    0.0
-    """
+    """Return the fraction of cells where the warp folds: the determinant of its Jacobian is negative."""
     (right_by_row, right_by_col), (up_by_row, up_by_col) = (np.gradient(part, cell_size_m) for part in field_m)
     determinant = (1 + right_by_col) * (1 - up_by_row) + right_by_row * up_by_col
     return float((determinant < 0).mean())

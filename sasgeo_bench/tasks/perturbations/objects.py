@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Single things within a layer: connected components, what may be built where, and which classes are thin."""
+"""Objects of a layer as connected components; line classes."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -15,28 +15,21 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Objects:
-    """The connected things of one layer.
+    """The connected objects of one layer.
 
-    `labels` is int32 of shape (rows, cols), 0 where there is none; `areas_cells` has one entry per thing, that of
-    label 1 first.
+    `labels` is int32 of shape (rows, cols), 0 for the background; `areas_cells` holds the area of label 1 first.
     """
 
     labels: NDArray[np.int32]
     areas_cells: NDArray[np.int64]
 
     def mask_of(self, chosen: Mask) -> Mask:
-        """Cells of the things chosen, one boolean each."""
+        """Return the cells of the objects that a boolean for each object selects."""
         return np.concatenate((np.zeros(1, dtype=bool), chosen)).take(self.labels)
 
 
 def find_objects(mask: Mask) -> Objects:
-    """Part a layer into things that touch nowhere, not even at a corner.
-
-    Examples
-    --------
-    >>> find_objects(np.array([[True, False, True], [True, False, False]])).areas_cells.tolist()
-    [2, 1]
-    """
+    """Label the objects of a layer; cells that touch at a corner belong together."""
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8, ltype=cv2.CV_32S)
     areas = np.bincount(labels[mask], minlength=count)
     return Objects(labels=np.asarray(labels, dtype=np.int32), areas_cells=areas[1:])
@@ -44,24 +37,12 @@ def find_objects(mask: Mask) -> Objects:
 
 @cache
 def thin_classes() -> frozenset[str]:
-    """Classes that are lines: their errors are gaps and shifts, and a cell of tolerance is due to them.
-
-    Examples
-    --------
-    >>> "path_track" in thin_classes(), "water" in thin_classes()
-    (True, False)
-    """
+    """Return the line classes: their errors are gaps and shifts, and they have one cell of tolerance."""
     return frozenset(item.name for item in load_taxonomy().classes if item.kind == "line")
 
 
 def pick_up_to(areas_cells: NDArray[np.int64], budget_cells: float, rng: np.random.Generator) -> Mask:
-    """Choose things at random until their area is spent; the last one by lot, so that the mean is the budget.
-
-    Examples
-    --------
-    >>> pick_up_to(np.array([10, 10, 10]), 20.0, np.random.default_rng(0)).sum()
-    np.int64(2)
-    """
+    """Choose objects at random until their area is used up; the last one by lot, so that the mean is the budget."""
     order = rng.permutation(len(areas_cells))
     spent = np.cumsum(areas_cells[order])
     chosen = np.zeros(len(order), dtype=bool)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells of a view that take their content from elsewhere in it: what every geometric perturbation ends with."""
+"""Resampling of the cells of a view, the last step of geometric perturbations."""
 
 from typing import TypeVar
 
@@ -13,19 +13,9 @@ Metres = NDArray[np.floating]
 
 
 def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
-    """Take each cell from the one that holds a place, metres from the middle; UNKNOWN where that is beyond the view.
+    """Fill each cell from the place (`right_m`, `up_m`) metres from the middle; UNKNOWN if that is outside the view.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        The view.
-    right_m, up_m : ndarray of float, shape (rows, cols)
-        Where each cell takes its content from.
-
-    Returns
-    -------
-    Evidence
-        A view of the same frame. Confidence moves with its cell and is 0 beyond the view.
+    Both places broadcast to shape (rows, cols). Confidence moves with its cell and is 0 outside the view.
 
     Examples
     --------
@@ -45,7 +35,7 @@ def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
 
 
 def shifted(layer: NDArray[Value], rows: int, cols: int, *, beyond: int) -> NDArray[Value]:
-    """Move a layer down and right by whole cells, with a value for what comes from beyond the view.
+    """Move a layer down and right by whole cells; cells from outside the view get the value `beyond`.
 
     Examples
     --------
@@ -64,7 +54,6 @@ def shifted(layer: NDArray[Value], rows: int, cols: int, *, beyond: int) -> NDAr
 def _take(
     stack: NDArray[np.uint8], places: NDArray[np.intp], within: NDArray[np.bool_], beyond: int
 ) -> NDArray[np.uint8]:
-    """Values of every layer at flat places; `beyond` outside."""
     taken = np.take(stack.reshape(len(stack), -1), places.ravel(), axis=1).reshape(stack.shape)
     if not within.all():
         taken[:, ~within] = beyond

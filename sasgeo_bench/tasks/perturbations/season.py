@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seasons: what leaves, snow, drought and harvest change in a view, class by class."""
+"""Seasons: changes of a view by leaves, snow, drought and harvest, class by class."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -11,20 +10,20 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.base import check_ranges, with_cells
+from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import Field, dilated, highest, smooth_noise, top_share
 from sasgeo_bench.tasks.perturbations.objects import find_objects
 
 Kind = Literal["leaf_on", "snow", "low_water", "harvest"]
-Mask = NDArray[np.bool_]
 Layers = dict[str, NDArray[np.uint8]]
 
 _UNDER_LEAVES: Final = ("path_track", "road_minor", "waterway", "field_boundary")
 _SNOWED_UNDER: Final = ("path_track", "field_boundary")
 _WHITE: Final = ("farmland", "green", "parking")
+_PATCH_M: Final = 25.0  # width of the patches that change; fields change as a whole
 _RETREAT_M: Final = 12.0  # of the waterline at strength 1, from a gentle bank
 _LARGEST_MEADOW: Final = 0.25  # of the view
-_REGROWN: Final = 0.3  # of the share of fields that look like green, the share of green that looks like a field
+_REGROWN: Final = 0.3  # ratio of the fraction of green that looks like fields to that of fields that look like green
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +33,11 @@ class Season:
     Parameters
     ----------
     kind : {"leaf_on", "snow", "low_water", "harvest"}
-        `leaf_on`: paths, minor roads, streams and hedges within green are not seen. `snow`: paths and field boundaries
-        are not seen, fields, green and car parks cannot be told. `low_water`: the waterline retreats, streams fall dry.
-        `harvest`: fields look like green, some green like fields, boundaries between them go.
+        `leaf_on`: paths, minor roads, streams and hedges within green disappear. `snow`: paths and field boundaries
+        disappear, fields, green and car parks become unknown. `low_water`: the waterline retreats, streams fall dry.
+        `harvest`: fields look like green, some green looks like fields, boundaries between them disappear.
     strength : float
-        0 to 1: share of what the season may change that it does change; of the waterline's retreat of 12 m.
-    patch_m : float
-        About how wide the patches are in which it does; fields go as a whole.
+        0 to 1: fraction that changes of what the season can change; of 12 m for the retreat of the waterline.
 
     Examples
     --------
@@ -52,16 +49,12 @@ class Season:
     [[0, 0, 0, 0], [2, 2, 2, 2]]
     """
 
-    NEUTRAL: ClassVar[Mapping[str, float]] = {"strength": 0.0}
-    MOVES: ClassVar[bool] = False
-
     kind: Kind
     strength: float
-    patch_m: float = 25.0
 
     def __post_init__(self) -> None:
-        """Refuse a season that is none and values out of range."""
-        check_ranges(self, strength=(0, 1), patch_m=(0.1, 1e4))
+        """Check the season and the range."""
+        check_ranges(self, strength=(0, 1))
         if self.kind not in get_args(Kind):
             message = f"Season: kind is one of {', '.join(get_args(Kind))}, got {self.kind!r}"
             raise PerturbError(message)
@@ -72,7 +65,7 @@ class Season:
             return evidence
         cells = evidence.cells.copy()
         layers = dict(zip(evidence.classes, cells, strict=True))
-        noise = smooth_noise(evidence.shape, self.patch_m / evidence.cell_size_m, rng)
+        noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
         if self.kind == "leaf_on":
             _clear(layers, _UNDER_LEAVES, _strongest(noise, _of(layers, "green"), self.strength))
         elif self.kind == "snow":
@@ -88,22 +81,22 @@ class Season:
         return with_cells(evidence, cells)
 
     def _dry(self, layers: Layers, noise: Field, cell_size_m: float) -> None:
-        """Let the waterline retreat, further where the noise is strong, as where the bank is gentle."""
+        """Move the waterline inwards, more where the noise is strong, as from a gentle bank."""
         water = _of(layers, "water")
         if water.any():
-            # Beyond the view water goes on, so its edge is no bank.
+            # Water continues outside the view, so the edge of the view is no bank.
             from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * cell_size_m
             gentle = np.clip(1 + noise / 2, 0.2, 2.0)
             _clear(layers, ("water",), water & (from_bank_m <= self.strength * _RETREAT_M * gentle))
-        # A line within a lake or broad river is where it flows: it does not fall dry before the water around it.
+        # A line within a lake or broad river does not fall dry before the water around it.
         _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
 
     def _harvest(self, layers: Layers, noise: Field, rng: np.random.Generator) -> None:
-        """Take fields for green and green for fields, each as a whole, and lose the boundaries that ran between."""
+        """Exchange fields and green, each parcel as a whole, and remove the boundaries between them."""
         boundary = _of(layers, "field_boundary")
         farmland, green = _of(layers, "farmland"), _of(layers, "green")
         mown = _some_parcels(farmland, boundary, self.strength, rng)
-        # Green that fills the view is a wood or a mountain side, and no field.
+        # Green that fills the view is a wood or a mountain side, not a field.
         grown = _some_parcels(green & ~farmland, boundary, self.strength * _REGROWN, rng, most=_LARGEST_MEADOW)
         for name, gained, lost in (("green", mown, grown), ("farmland", grown, mown)):
             if name in layers:
@@ -113,28 +106,25 @@ class Season:
 
 
 def _of(layers: Layers, name: str) -> Mask:
-    """Where a class is present; nowhere if the view has no such class."""
     if name in layers:
         return np.asarray(layers[name] == PRESENT)
     return np.zeros(next(iter(layers.values())).shape, dtype=bool)
 
 
 def _clear(layers: Layers, names: tuple[str, ...], mask: Mask) -> None:
-    """Make classes absent in a mask."""
     for name in names:
         if name in layers:
             layers[name][mask] = ABSENT
 
 
 def _strongest(noise: Field, mask: Mask, share: float) -> Mask:
-    """The share of a mask where the noise is strongest."""
     return mask & (noise >= highest(noise[mask], share * np.count_nonzero(mask)))
 
 
 def _some_parcels(mask: Mask, boundary: Mask, share: float, rng: np.random.Generator, *, most: float = 1.0) -> Mask:
-    """Parcels between boundaries, each chosen with probability `share`, with the boundary cells that belong to them.
+    """Choose parcels between boundaries with probability `share`; return them with their boundary cells.
 
-    One that covers more than `most` of the view stays.
+    Parcels that cover more than `most` of the view are never chosen.
     """
     parcels = find_objects(mask & ~boundary)
     is_chosen = (rng.random(len(parcels.areas_cells)) < share) & (parcels.areas_cells <= most * mask.size)

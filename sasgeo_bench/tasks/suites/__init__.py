@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The suites: one file each; region + sites + seed -> queries and truths."""
+"""Suites, one file each: they draw queries and truths from a region, sites and a seed."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `absent`: views whose place cannot be found, each kind apart."""
+"""Suite `absent`: views whose place cannot be found, in several kinds."""
 
 from dataclasses import replace
 from typing import Final
@@ -9,100 +9,98 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.suites.base import (
+    MAIN_VIEW_CELLS,
     Draft,
     Scene,
-    Seeds,
+    Shot,
     Site,
     State,
     Suite,
     SuiteCard,
     Variant,
     controls,
-    perceived,
 )
 
 PATCH_CELLS: Final = 24
 _TURNS: Final = 4
 _TRIES: Final = 256
-_MOST_DRAWN: Final = 0.003  # of a feature-poor view
+_MOST_DRAWN: Final = 0.003  # of the cells of a feature-poor view
 
 
 class AbsentSuite(Suite):
     """Outside the searched map, feature-poor, another town, or a corrupted view; the control is as everywhere."""
 
     def lack(self, scene: Scene) -> str | None:
-        """A place to take a wrong view from is needed."""
+        """Refuse a scene without another region for wrong views."""
         if scene.elsewhere is None:
             return "no other region: name a second one, views of a wrong place are taken there"
         return None
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """Make the view of one kind of absence."""
-        seen = perceived(scene.world, site, variant, seeds)
-        if variant.kind == "outside":
-            # The disc that is searched lies so far off that the view's footprint is beyond it.
-            return Draft(evidence=seen, is_present=False, away_m=2 * variant.side_m)
-        if variant.kind == "feature-poor":
-            return _feature_poor(scene, site, variant, seeds)
-        if variant.kind == "wrong place" and scene.elsewhere is not None:
-            other = _same_place_elsewhere(scene, scene.elsewhere, site, variant, seeds)
+    def draw(self, shot: Shot) -> Draft:
+        """Draw one kind of absence."""
+        kind, elsewhere = shot.variant.kind, shot.scene.elsewhere
+        if kind == "outside":
+            # The searched disc is so far away that it excludes the footprint of the view.
+            return Draft(evidence=shot.perceived(), is_present=False, away_m=2 * shot.variant.side_m)
+        if kind == "feature-poor":
+            return _feature_poor(shot)
+        if kind == "wrong place" and elsewhere is not None:
+            other = replace(shot, site=_same_place_elsewhere(shot, elsewhere))
             return Draft(
-                evidence=perceived(scene.elsewhere, other, variant, seeds),
+                evidence=other.perceived(other.clean(elsewhere)),
                 is_present=False,
                 has_pose=False,
-                density=other.density,
-                measured={"density": other.density},
+                density=other.site.density,
+                measured={"density": other.site.density},
             )
-        if variant.kind == "corrupted view":
-            broken = shuffle_patches(seen, seeds.rng("patches"))
-            moved = float((broken.cells != seen.cells).mean())
-            return Draft(evidence=broken, is_present=False, measured={"cells_changed": moved})
+        seen = shot.perceived()
+        if kind == "corrupted view":
+            broken = shuffle_patches(seen, shot.seeds.rng("patches"))
+            return Draft(evidence=broken, is_present=False, measured={"cells_changed": share_changed(seen, broken)})
         return Draft(evidence=seen)
 
 
-def _feature_poor(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-    """A place of the same block with nearly nothing drawn on it; the site's own view without its things if none is.
+def _feature_poor(shot: Shot) -> Draft:
+    """Draw a place of the same block with hardly any feature, or the site's own view without its features.
 
-    The place is on the map, so an answer may be right; but there is next to nothing to tell it by.
+    The place is on the map, so an answer may be right; but hardly anything distinguishes it.
     """
-    poor = _poor_place(scene, site, variant, seeds)
-    if poor is not None:
-        return Draft(
-            evidence=perceived(scene.world, replace(site, pose=poor.pose), variant, seeds),
-            pose=poor.pose,
-            density=poor.density,
-            measured={"is_real_place": 1.0},
-        )
-    seen = perceived(scene.world, site, variant, seeds)
-    return Draft(evidence=strip(seen), density=0.0, measured={"is_real_place": 0.0})
+    poor = _poor_place(shot)
+    if poor is None:
+        return Draft(evidence=strip(shot.perceived()), density=0.0, measured={"is_real_place": 0.0})
+    seen = replace(shot, site=poor).perceived()
+    return Draft(evidence=seen, pose=poor.pose, density=poor.density, measured={"is_real_place": 1.0})
 
 
-def _poor_place(scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Site | None:
-    """A place in the site's block whose square is mapped and holds hardly anything drawn."""
-    block = next(item for item in scene.blocks if item.id == site.block)
-    west, south, east, north = block.bounds_m
-    state, rng = scene.map, seeds.rng("feature-poor")
-    half = round(variant.side_m / 2 / state.grid.cell_size_m)
+def _poor_place(shot: Shot) -> Site | None:
+    """Return a place in the site's block whose square is mapped and holds hardly any feature."""
+    state, rng = shot.scene.map, shot.seeds.rng("feature-poor")
+    west, south, east, north = next(item for item in shot.scene.blocks if item.id == shot.site.block).bounds_m
     for _ in range(_TRIES):
         point = rng.uniform((west, south), (east, north))
-        if not state.is_mapped(point, scene.view_reach_m):
-            continue
-        density = _density(state, point, half)
-        if density <= _MOST_DRAWN:
-            pose = replace(site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
-            return replace(site, pose=pose, density=density)
+        if state.is_mapped(point, shot.scene.view_reach_m):
+            density = _density(state, point, shot.variant)
+            if density <= _MOST_DRAWN:
+                return _moved(shot.site, point, density)
     return None
 
 
-def _density(state: State, point: NDArray[np.float64], half: int) -> float:
-    """Share of drawn cells in a square that is mapped."""
+def _moved(site: Site, point: NDArray[np.float64], density: float) -> Site:
+    pose = replace(site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
+    return replace(site, pose=pose, density=density)
+
+
+def _density(state: State, point: NDArray[np.float64], variant: Variant) -> float:
+    """Return the fraction of drawn cells in a mapped square of the size of a view."""
+    half = round(variant.side_m / 2 / state.grid.cell_size_m)
     row, col = state.grid.to_cells(point[None, :])[0].tolist()
     return float(state.drawn[row - half : row + half, col - half : col + half].mean())
 
 
 def strip(evidence: Evidence) -> Evidence:
-    """Leave only ground cover: every drawn thing is absent, as over open land, forest or water."""
+    """Keep only ground cover, as over open land, forest or water."""
     cells = evidence.cells.copy()
     for index, name in enumerate(evidence.classes):
         if name not in ("green", "farmland", "water", "coastline"):
@@ -110,38 +108,33 @@ def strip(evidence: Evidence) -> Evidence:
     return evidence.replace(cells)
 
 
-def shuffle_patches(evidence: Evidence, rng: np.random.Generator, *, patch_cells: int = PATCH_CELLS) -> Evidence:
-    """Cut the view into patches, shuffle and turn them: every local statistic stays, the place is gone."""
-    rows, cols = (size // patch_cells for size in evidence.shape)
+def shuffle_patches(evidence: Evidence, rng: np.random.Generator) -> Evidence:
+    """Shuffle and rotate square patches of the view: local statistics stay, the place is gone."""
     cells = evidence.cells.copy()
-    patches = [
-        (slice(r * patch_cells, (r + 1) * patch_cells), slice(c * patch_cells, (c + 1) * patch_cells))
-        for r in range(rows)
-        for c in range(cols)
-    ]
+    starts = (range(0, size - PATCH_CELLS + 1, PATCH_CELLS) for size in evidence.shape)
+    rows, cols = ([slice(at, at + PATCH_CELLS) for at in listed] for listed in starts)
+    patches = [(row, col) for row in rows for col in cols]
     order, turns = rng.permutation(len(patches)), rng.integers(0, _TURNS, len(patches))
     for target, source, turn in zip(patches, order.tolist(), turns.tolist(), strict=True):
         cells[(slice(None), *target)] = np.rot90(evidence.cells[(slice(None), *patches[source])], turn, axes=(1, 2))
     return evidence.replace(cells)
 
 
-def _same_place_elsewhere(scene: Scene, other: State, site: Site, variant: Variant, seeds: Seeds) -> Site:
-    """Of many places in the other region, that with the density nearest to the site's: an easy giveaway is no test."""
-    rng = seeds.rng("elsewhere")
+def _same_place_elsewhere(shot: Shot, other: State) -> Site:
+    """Return the place of the other region whose density is nearest to the site's, so that it gives nothing away."""
+    rng = shot.seeds.rng("elsewhere")
     west, south, east, north = other.grid.bounds_m
-    half = round(variant.side_m / 2 / other.grid.cell_size_m)
     points = [
         point
         for point in rng.uniform((west, south), (east, north), (_TRIES, 2))
-        if other.is_mapped(point, scene.view_reach_m)
+        if other.is_mapped(point, shot.scene.view_reach_m)
     ]
     if not points:
         message = f"{other.region} is too small to take a view of a wrong place from: choose another split"
         raise ConfigError(message)
-    densities = [_density(other, point, half) for point in points]
-    best = int(np.argmin(np.abs(np.array(densities) - site.density)))
-    pose = replace(site.pose, easting_m=float(points[best][0]), northing_m=float(points[best][1]))
-    return replace(site, pose=pose, density=densities[best])
+    densities = [_density(other, point, shot.variant) for point in points]
+    best = int(np.argmin(np.abs(np.array(densities) - shot.site.density)))
+    return _moved(shot.site, points[best], densities[best])
 
 
 SUITE: Final = AbsentSuite(
@@ -157,7 +150,7 @@ SUITE: Final = AbsentSuite(
         needs=("another region",),
     ),
     variants=(
-        *controls(),
+        *controls(views=(MAIN_VIEW_CELLS,)),
         *(
             Variant(role="stress", kind=kind, strength=1.0)
             for kind in ("outside", "feature-poor", "wrong place", "corrupted view")

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `alias`: other places look like the true one, and the matcher should know that it cannot know."""
+"""Suite `alias`: other places look like the true one, and the matcher should report that it cannot decide."""
 
 from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Seeds, Site, SuiteCard, Variant, perceived
+from sasgeo_bench.tasks.suites.base import Draft, Shot, SuiteCard, Variant
 from sasgeo_bench.tasks.suites.twins import TwinSuite
 
 NEIGHBOUR_M: Final = 5.0
@@ -13,21 +13,21 @@ COPIES: Final = 3
 
 
 class AliasSuite(TwinSuite):
-    """R1: the truth is not among the candidates. R2: neighbours 5 m apart. R4: identical blocks."""
+    """R1: the truth is not among the candidates. R2: neighbours 5 m away. R4: identical blocks."""
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """One view; the variant says what the candidates are."""
-        seen = perceived(scene.world, site, variant, seeds)
-        if variant.kind.startswith("R1"):
+    def draw(self, shot: Shot) -> Draft:
+        """Perceive one view; the variant determines the candidates."""
+        seen, kind = shot.perceived(), shot.variant.kind
+        if kind.startswith("R1"):
             return Draft(evidence=seen, is_present=False, is_removed=True)
-        if variant.kind.startswith("R2"):
-            return Draft(evidence=seen, has_twins=False, neighbours_m=_neighbours(seeds.rng("neighbours")))
-        has_twins = variant.kind.startswith("R4")
+        if kind.startswith("R2"):
+            return Draft(evidence=seen, has_twins=False, neighbours_m=_neighbours(shot.seeds.rng("neighbours")))
+        has_twins = kind.startswith("R4")
         return Draft(evidence=seen, has_twins=has_twins, measured={"twins": float(COPIES * has_twins)})
 
 
 def _neighbours(rng: np.random.Generator) -> tuple[tuple[float, float], ...]:
-    """A cross of five places 5 m apart, moved so that any of the five may be the true one."""
+    """Return a cross of five places 5 m from each other, moved so that any of them may be the true one."""
     cross = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]) * NEIGHBOUR_M
     moved = cross - cross[rng.integers(len(cross))]
     return tuple((float(x), float(y)) for x, y in moved)
@@ -52,9 +52,6 @@ SUITE: Final = AliasSuite(
         Variant(role="stress", kind="R2 neighbours", strength=1.0),
         Variant(role="stress", kind="R4 identical blocks", strength=1.0),
     ),
-    change_of=None,
-    find=lambda scene: None,  # noqa: ARG005
-    needs="",
     copies=COPIES,
     is_swapped=False,
 )

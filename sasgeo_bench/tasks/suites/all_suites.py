@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every suite by its name; a new suite is a file of its own and a line here."""
+"""All suites by name; a new suite is a file of its own and a line here."""
 
 import difflib
 from typing import Final
@@ -47,23 +47,12 @@ SUITES: Final[dict[str, Suite]] = {
         absent.SUITE,
     )
 }
-# Drawn for every board beside its experiment, and for none of its figures.
+# With the controls, which every board draws in addition to its experiment.
 EVERY_SUITE: Final[dict[str, Suite]] = {**SUITES, board_controls.SUITE.card.name: board_controls.SUITE}
 
 
 def find_suite(name: str) -> Suite:
-    """Return the suite of a name.
-
-    Raises
-    ------
-    ConfigError
-        If there is none; the line suggests the nearest one.
-
-    Examples
-    --------
-    >>> find_suite("real-age").card.version
-    1
-    """
+    """Return the suite of a name; raise a ConfigError that suggests the nearest name if there is none."""
     if name not in EVERY_SUITE:
         near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
         hint = f", did you mean {near[0]!r}?" if near else ""

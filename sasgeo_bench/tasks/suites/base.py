@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every suite shares: the scene it draws from, the sites, the ladder of variants, and seeds that stay put."""
+"""Base of all suites: the scene they draw from, sites, variants, and stable seeds."""
 
 import datetime as dt
 import hashlib
@@ -45,7 +45,7 @@ class State:
 
     @classmethod
     def of(cls, region: Region, name: str | None = None) -> "State":
-        """State of a region that was read; `name` is its folder where that differs from its id."""
+        """Return the state of a region; `name` is its folder if that differs from its id."""
         return cls(
             region=name or region.manifest.id,
             date=region.manifest.extract.date,
@@ -57,42 +57,41 @@ class State:
         )
 
     def view(self, pose: Pose, *, size_cells: int, cell_size_m: float) -> Evidence:
-        """What a perfect view from a pose would see of this state."""
+        """Return what a perfect detector would see from a pose."""
         cells = observe(self.bits, self.grid, pose, size_cells=size_cells, cell_size_m=cell_size_m)
         return Evidence(classes=self.classes, cells=cells, cell_size_m=cell_size_m)
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
-        """Where the map says anything, shape (rows, cols)."""
+        """Return the mapped cells, shape (rows, cols)."""
         return np.asarray(self.bits.bits >> np.uint32(31) == 0)
 
     def is_mapped(self, en_m: NDArray[np.float64], half_m: float) -> bool:
-        """Whether all of a square around a place is on the map."""
+        """Return whether a square around a place is wholly mapped."""
         row, col = self.grid.to_cells(np.asarray(en_m)[None, :])[0].tolist()
         half = math.ceil(half_m / self.grid.cell_size_m)
         inside = half <= row < self.grid.rows - half and half <= col < self.grid.cols - half
         return inside and bool(self.known[row - half : row + half + 1, col - half : col + half + 1].all())
 
     def has(self, class_name: str) -> NDArray[np.bool_]:
-        """Where one class is present, shape (rows, cols)."""
+        """Return where one class is present, shape (rows, cols)."""
         bit, unknown = 1 << self.classes.index(class_name), 1 << 31
         return np.asarray(self.bits.bits & np.uint32(bit | unknown) == np.uint32(bit))
 
     @cached_property
     def drawn(self) -> NDArray[np.bool_]:
-        """Where any of `DRAWN_CLASSES` is present: what a matcher can hold on to."""
+        """Return where any of `DRAWN_CLASSES` is present."""
         mask = np.uint32(sum(1 << self.classes.index(name) for name in DRAWN_CLASSES if name in self.classes))
         return np.asarray((self.bits.bits & mask).astype(bool) & self.known)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """All that a suite draws from: the map to be searched, the world to be seen, and where queries may lie.
+    """The map to search, the world to see, and everything else that a suite draws from.
 
-    `view_reach_m` is how far from its centre a view may show anything: half a diagonal at the largest scale. `others`
-    are states of the same place at other dates, oldest first; `elsewhere` is another place, where one was given;
-    `scenes` are the tags of the region; `twins` are the places that look like each site; `ageing` has the rates of
-    other places.
+    `view_reach_m` is the largest distance that a view shows from its centre. `others` are states at other dates, oldest
+    first; `elsewhere` is another place; `scenes` are the tags of the region; `twins` are the places that look like each
+    site; `ageing` has the rates of other places.
     """
 
     map: State
@@ -106,13 +105,13 @@ class Scene:
     ageing: Ageing | None = None
 
     def state(self, region: str) -> State:
-        """The state of a map by its name."""
+        """Return the state of a map by its name."""
         return next(state for state in (self.map, *self.others) if state.region == region)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """One query to be made at every site."""
+    """One query to draw at every site."""
 
     role: Role
     kind: str
@@ -122,27 +121,24 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """Unique within a suite; part of the seed of a query's id."""
+        """Return the name within the suite, part of the seed of a query's id."""
         return f"{self.role}/{self.kind}/{self.strength:g}/{self.view_cells}/{self.cell_size_m:g}"
 
     @property
     def side_m(self) -> float:
-        """Side of the view on the ground for scale 1."""
+        """Return the side of the view on the ground for scale 1."""
         return self.view_cells * self.cell_size_m
+
+    def view(self, state: State, pose: Pose) -> Evidence:
+        """Return what a perfect detector would see of a state from a pose."""
+        return state.view(pose, size_cells=self.view_cells, cell_size_m=self.cell_size_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice:
-    """Which of a suite's variants are drawn; what is empty leaves all in.
+    """A selection of a suite's variants; an empty field selects all.
 
-    Parameters
-    ----------
-    views_cells : tuple of int
-        Sizes of views, controls and falsifiers among them.
-    kinds : tuple of str
-        Kinds of stress, as they begin; controls and falsifiers are drawn whatever they are.
-    tracks : tuple of str
-        What is asked.
+    `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected.
 
     Examples
     --------
@@ -156,7 +152,7 @@ class Choice:
     tracks: tuple[Track, ...] = ()
 
     def takes(self, variant: Variant, track: Track) -> bool:
-        """Whether this variant is asked on this track."""
+        """Return whether a variant on a track is selected."""
         return (
             (not self.views_cells or variant.view_cells in self.views_cells)
             and (not self.kinds or variant.role != "stress" or variant.kind.startswith(self.kinds))
@@ -164,7 +160,7 @@ class Choice:
         )
 
     def lack(self, suite: "Suite") -> str | None:
-        """Say what the suite has nothing of, or None if all that is named is there."""
+        """Return why the selection does not fit the suite, or None if it does."""
         if self == EVERYTHING:
             return None
         stresses = [variant for variant in suite.variants if variant.role == "stress"]
@@ -190,7 +186,7 @@ def _begins(known: object, wanted: object) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """One place and heading where a control and its stresses are seen; `is_copy` where it is the copy of another."""
+    """One place and heading where a control and its stresses are seen; `is_copy` marks a copy of another place."""
 
     index: int
     pose: Pose
@@ -198,16 +194,21 @@ class Site:
     density: float
     is_copy: bool = False
 
+    @property
+    def en_m(self) -> tuple[float, float]:
+        """Return easting and northing."""
+        return (self.pose.easting_m, self.pose.northing_m)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Draft:
-    """What a suite made of a site and a variant, before ids, priors and candidates are added.
+    """A query drawn by a suite, before ids, priors and candidates are added.
 
-    `vectors` lie in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
-    where it was not taken in this map. For retrieval, `is_removed` leaves the true place out of the candidates,
-    `neighbours_m` puts a cluster of places in place of each, and `has_twins` says whether the site's twins are among
-    them. `away_m` puts the searched disc at least so far from the truth that it lies outside. `group` overrides the
-    prior group. `density` is that of the place that is seen, where that is not the site.
+    `vectors` are in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
+    if it was not taken in this map. For retrieval, `is_removed` removes the true place from the candidates,
+    `neighbours_m` replaces each candidate by a cluster of places, and `has_twins` adds the site's twins. `away_m` is
+    the least distance from the truth to the rim of a searched disc that excludes it. `group` overrides the prior group.
+    `density` is that of the seen place, if that is not the site.
     """
 
     evidence: Evidence
@@ -225,14 +226,20 @@ class Draft:
     changed_share: float | None = None
     measured: dict[str, float] = field(default_factory=dict)
 
+    @classmethod
+    def of_change(cls, evidence: Evidence, before: Evidence, after: Evidence, **measured: float) -> "Draft":
+        """Return a draft that records the changed share between two perfect views."""
+        share = changed_share(before, after)
+        return cls(evidence=evidence, changed_share=share, measured={"changed_share": share, **measured})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuiteCard:
-    """What a suite does and why, for people.
+    """Purpose and design of a suite, for people.
 
-    `separates` says what should differ if the mechanism works; `falsifier` which variant must show no gain. Where
-    `has_own_priors`, what is known before is what the suite is about, and no other group can be asked for. `needs` is
-    what its scene must hold beside a map.
+    `separates` states what should differ if the mechanism works, `falsifier` which variant must show no gain. A suite
+    that `has_own_priors` is about priors and accepts no other group. `needs` lists what its scene must hold besides a
+    map.
     """
 
     name: str
@@ -251,11 +258,10 @@ class SuiteCard:
 
 @dataclass(frozen=True, kw_only=True)
 class Edit:
-    """What a suite does to a map before queries are drawn.
+    """Changes of a map before queries are drawn.
 
-    `map_pastes` make the map that is searched, `world_pastes` the world that is seen (None where it is the map itself);
-    `sites` are those that are left, some of them moved to a copy; `twins` are the places that look like each of them,
-    by its index.
+    `map_pastes` make the searched map, `world_pastes` the seen world (None if it is the map itself); `sites` are the
+    remaining ones, some of them moved to a copy; `twins` are the places that look like each of them, by its index.
     """
 
     sites: tuple[Site, ...]
@@ -266,118 +272,110 @@ class Edit:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite(ABC):
-    """Region + sites + seed -> queries and truths; a child says how one query is drawn."""
+    """Base of suites: they draw queries and truths from a scene, sites and a seed."""
 
     card: SuiteCard
     variants: tuple[Variant, ...]
 
     def lack(self, scene: Scene) -> str | None:
-        """Say what the region lacks for this suite, or None if it can carry it."""
+        """Return what the region lacks for this suite, or None."""
         return None if scene.map.drawn.any() else "no road, building or other thing to hold on to"
 
-    def usable(self, scene: Scene) -> tuple[Variant, ...]:
-        """Variants that this scene can carry."""
-        del scene
+    def usable(self, scene: Scene) -> tuple[Variant, ...]:  # noqa: ARG002
+        """Return the variants that the scene allows."""
         return self.variants
 
-    def map_region(self, scene: Scene, variant: Variant) -> str:
-        """Name of the map that a variant's queries search."""
-        del variant
+    def map_region(self, scene: Scene, variant: Variant) -> str:  # noqa: ARG002
+        """Return the name of the map that a variant's queries search."""
         return scene.map.region
 
-    def tracks(self, variant: Variant) -> tuple[Track, ...]:
-        """What is asked with a variant's views."""
-        del variant
+    def tracks(self, variant: Variant) -> tuple[Track, ...]:  # noqa: ARG002
+        """Return the tracks of a variant."""
         return self.card.tracks
 
     @property
     def main_side_m(self) -> float:
-        """Side of the view that most variants share."""
+        """Return the most frequent side of a view."""
         sides_m = [variant.side_m for variant in self.variants]
         return max(set(sides_m), key=lambda side_m: (sides_m.count(side_m), -side_m))
 
-    def spacing_m(self, scene: Scene) -> float:
-        """Least distance between two sites."""
-        del scene
+    def spacing_m(self, scene: Scene) -> float:  # noqa: ARG002
+        """Return the least distance between two sites."""
         return self.main_side_m
 
     def clear_m(self, scene: Scene) -> float:
-        """Half the side of the square around a site that must be mapped whole: what the largest view reaches."""
+        """Return half the side of the square around a site that must be mapped: the reach of the largest view."""
         return scene.view_reach_m
 
-    def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
-        """Easting and northing of places the sites must be centred near, shape (N, 2); None for anywhere."""
-        del scene
+    def anchors(self, scene: Scene) -> NDArray[np.float64] | None:  # noqa: ARG002
+        """Return places (easting, northing) that sites must be near, shape (N, 2); None for anywhere."""
         return None
 
-    def edit(self, scene: Scene, sites: Sequence[Site], seeds: "Seeds") -> Edit | None:
-        """Changes of the map and the world that the sites need, or None."""
-        del scene, sites, seeds
+    def edit(self, scene: Scene, sites: Sequence[Site], seeds: "Seeds") -> Edit | None:  # noqa: ARG002
+        """Return the changes of map and world that the sites need, or None."""
         return None
 
     @abstractmethod
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: "Seeds") -> Draft:
-        """Make one query's evidence and truth."""
+    def draw(self, shot: "Shot") -> Draft:
+        """Draw the evidence and truth of one query."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Seeds:
-    """Streams of chance for one site, told apart by their purpose and nothing else.
+    """Random streams of one site; each depends on its purpose alone.
 
-    Parameters
-    ----------
-    root : int or PrivateSeed
-        The seed of the whole request.
-    names : tuple of str
-        Region, suite and site.
-
-    Examples
-    --------
-    >>> seeds = Seeds(root=1, names=("vaduz", "clean", "7"))
-    >>> bool(seeds.rng("yaw").integers(100) == seeds.rng("yaw").integers(100))
-    True
+    `root` is the seed of the whole request; `names` are region, suite and site.
     """
 
     root: Seed
     names: tuple[str, ...]
 
     def digest(self, *purpose: object) -> bytes:
-        """SHA-256 of the seed, the names and a purpose."""
+        """Return the SHA-256 of the seed, the names and a purpose."""
         root = self.root if isinstance(self.root, int) else self.root.root
         text = "/".join(map(str, (root, *self.names, *purpose)))
         return hashlib.sha256(text.encode()).digest()
 
     def rng(self, *purpose: object) -> np.random.Generator:
-        """A generator for one purpose; asking for it again gives the same stream from the start."""
+        """Return the generator of a purpose, always at the start of its stream."""
         return np.random.default_rng(int.from_bytes(self.digest(*purpose)[:16], "big"))
 
     def under(self, *names: object) -> "Seeds":
-        """Seeds of something within."""
+        """Return the seeds of a part."""
         return Seeds(root=self.root, names=(*self.names, *map(str, names)))
 
 
-def perceived(
-    state: State,
-    site: Site,
-    variant: Variant,
-    seeds: Seeds,
-    *,
-    error_factor: float = 1.0,
-    clean: Evidence | None = None,
-) -> Evidence:
-    """View of a state with perception's errors; the same errors in every variant of a site with this view.
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One view to draw: a variant at a site of a scene, and the seeds of the site."""
 
-    What differs between a control and its stress is then the stress alone. `clean` is the view without errors, where
-    it is no longer that of the state.
-    """
-    if clean is None:
-        clean = state.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-    rng = seeds.rng("perception", variant.view_cells, variant.cell_size_m)
-    return Perception(error_factor=error_factor)(clean, rng)
+    scene: Scene
+    site: Site
+    variant: Variant
+    seeds: Seeds
+
+    def rng(self, *purpose: object) -> np.random.Generator:
+        """Return the generator of a purpose for this size of view."""
+        return self.seeds.rng(*purpose, self.variant.view_cells)
+
+    def clean(self, state: State | None = None) -> Evidence:
+        """Return what a perfect detector would see of a state; of the world unless given."""
+        return self.variant.view(state or self.scene.world, self.site.pose)
+
+    def perceived(self, clean: Evidence | None = None, *, error_factor: float = 1.0) -> Evidence:
+        """Return a clean view, that of the world unless given, with errors of perception.
+
+        They are the same in every variant of a site with this view, so a control differs from its stress by the stress
+        alone.
+        """
+        rng = self.seeds.rng("perception", self.variant.view_cells, self.variant.cell_size_m)
+        return Perception(error_factor=error_factor)(self.clean() if clean is None else clean, rng)
 
 
 def changed_share(first: Evidence, second: Evidence) -> float:
-    """Share of what either view shows, over all classes, that only one of them shows; unknown cells are left out.
+    """Return the fraction of the cells present in either view, over all classes, that are present in only one.
+
+    Unknown cells do not count.
 
     Examples
     --------
@@ -395,16 +393,12 @@ def changed_share(first: Evidence, second: Evidence) -> float:
 
 
 def ladder(
-    kind: str,
-    strengths: tuple[float, ...],
-    *,
-    small: tuple[float, ...] = (),
-    large: tuple[float, ...] = (),
+    kind: str, strengths: tuple[float, ...], *, small: tuple[float, ...] = (), large: tuple[float, ...] = ()
 ) -> tuple[Variant, ...]:
-    """Stress variants: strengths at the main view, and those of the views half and twice as wide.
+    """Return stress variants: strengths at the main view, and at the views half and twice as wide.
 
-    A plain matcher should fail somewhere on the ladder and succeed somewhere else: what is stressed little in a large
-    view is found by all, and what is stressed much in a small one by none.
+    A plain matcher should fail on some steps of the ladder and succeed on others: all find a large view with little
+    stress, none a small one with much.
 
     Examples
     --------
@@ -418,29 +412,30 @@ def ladder(
     )
 
 
-def controls(kind: str = "control", *, views: tuple[int, ...] = (MAIN_VIEW_CELLS,)) -> tuple[Variant, ...]:
-    """One control for each size of view."""
-    return tuple(Variant(role="control", kind=kind, view_cells=cells) for cells in views)
+def pair(control: str, stress: str, falsifier: str) -> tuple[Variant, ...]:
+    """Return a control, a stress of strength 1 and a falsifier of these kinds."""
+    return (
+        Variant(role="control", kind=control),
+        Variant(role="stress", kind=stress, strength=1.0),
+        Variant(role="falsifier", kind=falsifier),
+    )
+
+
+def controls(*, views: tuple[int, ...] = VIEW_CELLS) -> tuple[Variant, ...]:
+    """Return one control for each size of view."""
+    return tuple(Variant(role="control", kind="control", view_cells=cells) for cells in views)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlainSuite(Suite):
-    """A suite whose stress is one change of the evidence, the rest as in the control.
-
-    `change` gets the variant, the perceived view and a generator; for a control it is not called. `check` measures what
-    was done.
-    """
+    """A suite whose stress is one change of the evidence: `change` gets variant, perceived view and generator."""
 
     change: Callable[[Variant, Evidence, np.random.Generator], Evidence]
-    check: Callable[[Evidence, Evidence], dict[str, float]] | None = None
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """Perceive, then change."""
-        before = perceived(scene.world, site, variant, seeds)
-        if variant.role == "control":
+    def draw(self, shot: Shot) -> Draft:
+        """Perceive, then change unless it is a control."""
+        before = shot.perceived()
+        if shot.variant.role == "control":
             return Draft(evidence=before)
-        after = self.change(variant, before, seeds.rng("change", variant.kind, variant.view_cells))
-        measured = {"unknown_added": after.unknown_share - before.unknown_share}
-        if self.check is not None:
-            measured |= self.check(before, after)
-        return Draft(evidence=after, measured=measured)
+        after = self.change(shot.variant, before, shot.rng("change", shot.variant.kind))
+        return Draft(evidence=after, measured={"unknown_added": after.unknown_share - before.unknown_share})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `controls`: queries whose right score is known beforehand; a board on which they fail is not to be trusted."""
+"""Suite `controls`: views whose right score is known beforehand; a board on which they fail is not to be trusted."""
 
 from dataclasses import replace
 from typing import Final
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence, LayerBits
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup, Track
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Seeds, Site, State, SuiteCard, Variant, changed_share
+from sasgeo_bench.tasks.suites.base import Draft, Shot, State, SuiteCard, Variant, changed_share
 from sasgeo_bench.tasks.suites.twins import TwinSuite
 
 VIEW_CELLS: Final = 96
-# Narrower than the way to a site's twin, so that a noise-free view has one place alone.
+# Smaller than the distance to a site's twin, so that only one place fits a noise-free view.
 NEAR: Final = PriorGroup(radius_m=100.0, yaw="weak", scale_sigma=0.03)
 _TWIN_DRAWS: Final = 3  # queries of each pair of twins
 _PIECE_M: Final = 32.0
@@ -22,32 +22,28 @@ _TRIES: Final = 400
 
 
 class ControlSuite(TwinSuite):
-    """Views without error: of the map, of a wrong map, of one of two places that are the same, and of nothing.
+    """Views without error: of the map, of a wrong map, of one of two identical places, and of nothing.
 
-    A wrong map is the world cut into pieces that are shuffled, or turned by half around a point. Its views keep the
-    place of their site as their truth, so that whoever scores better than chance has it from somewhere else.
+    A wrong map is the world cut into shuffled pieces, or rotated by 180 degrees around a point. Its views keep the
+    place of their site as their truth, so a score better than chance shows a leak.
     """
 
     def tracks(self, variant: Variant) -> tuple[Track, ...]:
-        """Twins are told apart among candidates alone."""
+        """Ask for twins only among candidates."""
         return ("retrieval",) if variant.kind == TWINS else self.card.tracks
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """See what the kind says; the candidates of all but `TWINS` are without the site's twin."""
-        clear = _view(scene.world, site.pose, variant)
-        if variant.kind == BLIND:
+    def draw(self, shot: Shot) -> Draft:
+        """See the map of the variant's kind; only `TWINS` has the site's twin among its candidates."""
+        clear, kind = shot.clean(), shot.variant.kind
+        if kind == BLIND:
             nothing = clear.replace(np.full_like(clear.cells, UNKNOWN))
             return Draft(evidence=nothing, is_present=False, has_pose=False, is_removed=True, has_twins=False)
-        if variant.kind == SHUFFLED:
-            return _wrong(_view(shuffled(scene.world, seeds.rng(SHUFFLED)), site.pose, variant), clear)
-        if variant.kind == TURNED:
-            return _wrong(_view(scene.world, _turned(scene, site, seeds.rng(TURNED)), variant), clear)
-        is_twin = variant.kind == TWINS
+        if kind == SHUFFLED:
+            return _wrong(shot.clean(shuffled(shot.scene.world, shot.seeds.rng(SHUFFLED))), clear)
+        if kind == TURNED:
+            return _wrong(shot.variant.view(shot.scene.world, _turned(shot)), clear)
+        is_twin = kind == TWINS
         return Draft(evidence=clear, has_twins=is_twin, group=None if is_twin else NEAR)
-
-
-def _view(state: State, pose: Pose, variant: Variant) -> Evidence:
-    return state.view(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
 
 
 def _wrong(seen: Evidence, clear: Evidence) -> Draft:
@@ -55,10 +51,7 @@ def _wrong(seen: Evidence, clear: Evidence) -> Draft:
 
 
 def shuffled(state: State, rng: np.random.Generator) -> State:
-    """Cut a state into squares of 32 m and lay those that are mapped whole in any order; all others stay.
-
-    Its features and graph are those of before: it is there to be seen.
-    """
+    """Shuffle squares of 32 m of a state's layers that are wholly mapped; features and graph stay."""
     side = max(1, round(_PIECE_M / state.grid.cell_size_m))
     rows, cols = state.grid.rows // side, state.grid.cols // side
     bits, inner = state.bits.bits.copy(), (slice(rows * side), slice(cols * side))
@@ -70,17 +63,17 @@ def shuffled(state: State, rng: np.random.Generator) -> State:
     return replace(state, bits=LayerBits(bits=bits, count=state.bits.count))
 
 
-def _turned(scene: Scene, site: Site, rng: np.random.Generator) -> Pose:
-    """Where a site's view comes from if the world is turned by half around some point: a mapped place well away."""
+def _turned(shot: Shot) -> Pose:
+    """Return where the view comes from if the world is rotated by 180 degrees: a mapped place well away."""
+    scene, here, rng = shot.scene, np.array(shot.site.en_m), shot.seeds.rng(TURNED)
     least_m = 2 * scene.view_reach_m
     west_m, south_m, east_m, north_m = scene.world.grid.bounds_m
-    here = np.array([site.pose.easting_m, site.pose.northing_m])
     points = rng.uniform((west_m, south_m), (east_m, north_m), (_TRIES, 2))
     far = points[np.hypot(*(points - here).T) >= least_m]
     for place in far:
         if scene.world.is_mapped(place, scene.view_reach_m):
-            return _at(site.pose, place)
-    return _at(site.pose, far[0] if len(far) else here + least_m)
+            return _at(shot.site.pose, place)
+    return _at(shot.site.pose, far[0] if len(far) else here + least_m)
 
 
 def _at(pose: Pose, place: NDArray[np.float64]) -> Pose:
@@ -109,8 +102,5 @@ SUITE: Final = ControlSuite(
             for number in range(1, _TWIN_DRAWS + 1)
         ),
     ),
-    change_of=None,
-    find=lambda scene: None,  # noqa: ARG005
-    needs="",
     is_swapped=False,
 )

@@ -3,33 +3,18 @@
 
 from typing import Final
 
-from sasgeo_bench.tasks.suites.base import (
-    VIEW_CELLS,
-    Draft,
-    PlainSuite,
-    Scene,
-    Seeds,
-    Site,
-    SuiteCard,
-    Variant,
-    controls,
-    ladder,
-    perceived,
-)
-
-ERROR_FACTORS: Final = (0.5, 1.0, 2.0, 3.0, 4.0)
-SMALL_FACTORS: Final = (1.0, 2.0, 3.0)
+from sasgeo_bench.tasks.perturbations.base import share_changed
+from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 
-class CleanSuite(PlainSuite):
-    """Perception from twice as good as in its own domain to four times as bad; the control is free of noise."""
+class CleanSuite(Suite):
+    """Perception from half to four times its error in domain; controls and falsifiers have no error."""
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """See the world with as much error as the variant says; controls and falsifiers without any."""
-        perfect = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-        seen = perceived(scene.world, site, variant, seeds, error_factor=variant.strength, clean=perfect)
-        changed = float((seen.cells != perfect.cells).mean())
-        return Draft(evidence=seen, measured={"cells_changed": changed})
+    def draw(self, shot: Shot) -> Draft:
+        """Perceive the world with the error factor of the variant."""
+        perfect = shot.clean()
+        seen = shot.perceived(perfect, error_factor=shot.variant.strength)
+        return Draft(evidence=seen, measured={"cells_changed": share_changed(perfect, seen)})
 
 
 SUITE: Final = CleanSuite(
@@ -44,9 +29,8 @@ SUITE: Final = CleanSuite(
         tracks=("localization", "retrieval"),
     ),
     variants=(
-        *controls(views=VIEW_CELLS),
+        *controls(),
         Variant(role="falsifier", kind="no error"),
-        *ladder("perception", ERROR_FACTORS, small=SMALL_FACTORS, large=(1.0, 3.0)),
+        *ladder("perception", (0.5, 1.0, 2.0, 3.0, 4.0), small=(1.0, 2.0, 3.0), large=(1.0, 3.0)),
     ),
-    change=lambda variant, evidence, rng: evidence,  # noqa: ARG005 - `draw` does it all
 )

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `false-unknown`: perception says unknown where it had been right."""
+"""Suite `false-unknown`: perception reports unknown where it was right."""
 
 from typing import Final
 
 from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
-from sasgeo_bench.tasks.suites.base import VIEW_CELLS, PlainSuite, SuiteCard, Variant, controls, ladder
+from sasgeo_bench.tasks.suites.base import PlainSuite, SuiteCard, Variant, controls, ladder
 
 SUITE: Final = PlainSuite(
     card=SuiteCard(
@@ -17,7 +17,7 @@ SUITE: Final = PlainSuite(
         strength_unit="share of the cells",
     ),
     variants=(
-        *controls(views=VIEW_CELLS),
+        *controls(),
         *ladder("U5", (0.15, 0.3, 0.6, 0.8, 0.9), small=(0.3, 0.6, 0.8), large=(0.6, 0.9)),
         Variant(role="falsifier", kind="none"),
     ),

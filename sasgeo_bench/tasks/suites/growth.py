@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `growth`: many buildings stand that the map does not know."""
+"""Suite `growth`: many buildings stand that the map does not have."""
 
 from typing import Final
 
@@ -7,56 +7,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
-from sasgeo_bench.tasks.suites.base import (
-    VIEW_CELLS,
-    Draft,
-    Scene,
-    Seeds,
-    Site,
-    Suite,
-    SuiteCard,
-    Variant,
-    changed_share,
-    controls,
-    ladder,
-    perceived,
-)
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 from sasgeo_bench.tasks.suites.twins import nodes_of, places_of
 
-ERROR_FACTOR: Final = 2.0  # the detector across domains: in its own, new houses alone mislead nobody
+ERROR_FACTOR: Final = 2.0  # the detector across domains: in its own, new houses alone mislead no matcher
 NEW_PER_OLD: Final = (0.5, 1.0, 2.0, 4.0)
 
 
 class GrowthSuite(Suite):
-    """Buildings appear near those that are there; nothing vanishes."""
+    """Buildings appear near existing ones; nothing vanishes."""
 
     def lack(self, scene: Scene) -> str | None:
-        """Growth starts from buildings."""
+        """Refuse a region without buildings."""
         return None if len(self.anchors(scene)) else "no building to grow from"
 
     def anchors(self, scene: Scene) -> NDArray[np.float64]:
-        """Near buildings."""
+        """Return the buildings."""
         return places_of(nodes_of(scene, ("building", "building_cluster")))
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """Let the place grow, then perceive; a control sees it as mapped."""
-        if variant.strength == 0:
-            seen = perceived(scene.world, site, variant, seeds, error_factor=ERROR_FACTOR)
-            return Draft(evidence=seen, changed_share=0.0)
-        clean = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-        grown = growth(variant.strength)(clean, seeds.rng("growth", variant.view_cells))
-        share = changed_share(clean, grown)
-        measured = {"changed_share": share, "new_per_old_area": _new_per_old(clean, grown)}
-        seen = perceived(scene.world, site, variant, seeds, error_factor=ERROR_FACTOR, clean=grown)
-        return Draft(evidence=seen, changed_share=share, measured=measured)
+    def draw(self, shot: Shot) -> Draft:
+        """Add buildings, then perceive; a control sees the place as mapped."""
+        if shot.variant.strength == 0:
+            return Draft(evidence=shot.perceived(error_factor=ERROR_FACTOR), changed_share=0.0)
+        clean = shot.clean()
+        grown = growth(shot.variant.strength)(clean, shot.rng("growth"))
+        seen = shot.perceived(grown, error_factor=ERROR_FACTOR)
+        return Draft.of_change(seen, clean, grown, new_per_old_area=_new_per_old(clean, grown))
 
 
 def growth(new_per_old: float) -> Ageing:
-    """Ageing in which so many buildings appear for each that is there, and nothing else happens."""
+    """Return ageing in which so many buildings appear for each existing one, and nothing else happens."""
     building = Rates(vanish_per_year=0.0, appear_per_year=float(np.log1p(new_per_old)))
-    rates = AgeingRates(classes={"building": building}, places=())
-    return Ageing(years=1.0, rates=rates, place="-")
+    return Ageing(years=1.0, rates={"building": building}, place="-")
 
 
 def _new_per_old(before: Evidence, after: Evidence) -> float:
@@ -77,7 +60,7 @@ SUITE: Final = GrowthSuite(
         min_density=0.05,
     ),
     variants=(
-        *controls(views=VIEW_CELLS),
+        *controls(),
         *ladder("S3", NEW_PER_OLD, small=NEW_PER_OLD, large=(2.0,)),
         Variant(role="falsifier", kind="no growth"),
     ),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `local-warp`: what is seen is bent smoothly, so that cells miss the map while roads keep their order."""
+"""Suite `local-warp`: the view is bent smoothly, so that cells miss the map while roads keep their order."""
 
 from typing import Final
 
@@ -8,44 +8,25 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, folded_share, moved, warped
-from sasgeo_bench.tasks.suites.base import (
-    VIEW_CELLS,
-    Draft,
-    Scene,
-    Seeds,
-    Site,
-    Suite,
-    SuiteCard,
-    Variant,
-    controls,
-    ladder,
-    perceived,
-)
-from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors, round_vectors
+from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, SuiteCard, Variant, controls, ladder
+from sasgeo_bench.tasks.suites.vectors import round_vectors, site_vectors
 
 RMS_M: Final = (5.0, 10.0, 15.0)
-_STEP_M: Final = 8.0  # of vertices before a line is bent: an eighth of the shortest wave
-_STRAIGHT_M: Final = 0.3  # what bending may leave out again: finer than the vectors' own noise
+_STEP_M: Final = 8.0  # between vertices before a line is bent: an eighth of the shortest wave
+_STRAIGHT_M: Final = 0.3  # tolerance of simplification after bending: finer than the noise of the vectors
 
 
 class LocalWarpSuite(Suite):
-    """One field of shifts for a site, of growing strength; vectors are bent with the cells, as one camera sees both."""
+    """One displacement field for a site, of growing strength; vectors move with the cells, as one camera sees both."""
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+    def draw(self, shot: Shot) -> Draft:
         """Perceive, then bend."""
-        seen = perceived(scene.world, site, variant, seeds)
-        vectors = perceive_vectors(
-            scene.world,
-            site.pose,
-            side_m=variant.side_m,
-            noise=VectorNoise(),
-            rng=seeds.rng("vectors", variant.view_cells),
-        )
-        if variant.strength == 0:
+        seen, vectors = shot.perceived(), site_vectors(shot)
+        if shot.variant.strength == 0:
             return Draft(evidence=seen, vectors=vectors)
-        warp = LocalWarp(rms_m=variant.strength)
-        field_m = warp.field(seen.shape, seen.cell_size_m, seeds.rng("warp", variant.view_cells))
+        field_m = LocalWarp(rms_m=shot.variant.strength).field(seen.shape, seen.cell_size_m, shot.rng("warp"))
         after = warped(seen, field_m)
         return Draft(
             evidence=after,
@@ -53,13 +34,13 @@ class LocalWarpSuite(Suite):
             measured={
                 "rms_m": float(np.sqrt((field_m**2).sum(axis=0).mean())),
                 "folded": folded_share(field_m, seen.cell_size_m),
-                "cells_changed": float((after.cells != seen.cells).mean()),
+                "cells_changed": share_changed(seen, after),
             },
         )
 
 
 def bent(vectors: gpd.GeoDataFrame, field_m: NDArray[np.float64], cell_size_m: float) -> gpd.GeoDataFrame:
-    """Vectors of a view moved as a warp moves its cells."""
+    """Move the vectors of a view as a warp moves its cells."""
     dense = shapely.segmentize(vectors.geometry.to_numpy(), _STEP_M)
     shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))
     return round_vectors(vectors, shapely.simplify(shapes, _STRAIGHT_M))
@@ -75,9 +56,5 @@ SUITE: Final = LocalWarpSuite(
         falsifier="A field of 0 m: scores as in the control.",
         strength_unit="m rms of the shift",
     ),
-    variants=(
-        *controls(views=VIEW_CELLS),
-        *ladder("G1", RMS_M, small=RMS_M, large=(15.0,)),
-        Variant(role="falsifier", kind="no warp"),
-    ),
+    variants=(*controls(), *ladder("G1", RMS_M, small=RMS_M, large=(15.0,)), Variant(role="falsifier", kind="no warp")),
 )

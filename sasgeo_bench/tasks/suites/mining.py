@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoys: the places most like the true one by four unlike scorers, so that they favour no single method."""
+"""Decoys: the places most like the true one by four different scorers, so that they favour no single method."""
 
 import math
 from collections.abc import Iterator
@@ -17,28 +17,28 @@ from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State
 
 SCORERS: Final = ("histogram", "rings", "distance", "graph")
 STRIDE_M: Final = 32.0
-LEAST_RADII: Final = 3.0  # no decoy nearer to the truth, in footprint radii (half diagonals)
+LEAST_RADII: Final = 3.0  # least distance of a decoy from the truth, in half diagonals of the footprint
 
 _COARSE_M: Final = 8.0
 RINGS: Final = 4
 _SECTORS: Final = 12
-_FAR_M: Final = 64.0  # distances are cut here: farther than this is far
+_FAR_M: Final = 64.0  # distances are clipped here
 _THIN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "building")
 _NODE_KINDS: Final = (
     *("intersection", "dead_end", "crossing", "building", "building_cluster", "level_crossing"),
     *("river_bend", "road_rail_crossing", "road_water_crossing"),
 )
-_SHORTLIST: Final = 400  # places whose best turn is looked for; the others are too unlike at any turn
+_SHORTLIST: Final = 400  # places whose best rotation is searched; the others are too different at any rotation
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Windows:
-    """Every place on a lattice of a map, as four scorers describe it.
+    """Every place on a lattice of a map, with the descriptors of four scorers.
 
-    `points_m` is easting and northing, shape (N, 2); `spacing_m` the lattice; each descriptor has shape (N, D), scaled
-    so that its columns have unit variance over the map, but `polar`, shape (N, D, sectors), and `shares`, shape (N, D),
-    of the drawn classes in rings, both 0..1.
+    `points_m` is easting and northing, shape (N, 2). Each descriptor of `plain` and `spectrum` has shape (N, D); those
+    of `plain` have columns of unit variance over the map. `polar` has shape (N, D, sectors); `shares`, shape (N, D),
+    are fractions of the drawn classes in rings, 0..1.
     """
 
     points_m: NDArray[np.float64]
@@ -50,27 +50,15 @@ class Windows:
 
 
 def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
-    """Describe every place of a map that is mapped, for views of one size.
+    """Describe every mapped place of a map, on a lattice, for views of one side.
 
-    Parameters
-    ----------
-    state : State
-        The map.
-    side_m : float
-        Side of the view.
-    clear_m : float
-        Half the side of the square that must be mapped whole, as around a site: nearer to the rim of the map a place
-        could not be the true one, and a matcher would know.
-
-    Returns
-    -------
-    Windows
-        All such places on a lattice.
+    A square of half side `clear_m` around a place must be mapped, as around a site: a place nearer to the rim of the
+    map could not be the true one.
 
     Notes
     -----
-    The scorers: shares of the classes in the disc; shares in rings; distances to thin classes on a polar grid, at the
-    best turn; nodes of the graph by kind in two rings. None of them is a method that is scored.
+    The scorers: fractions of the classes in the disc; fractions in rings; distances to thin classes on a polar grid at
+    the best rotation; graph nodes by kind in two rings. None of them is an evaluated method.
     """
     factor = max(1, round(_COARSE_M / state.grid.cell_size_m))
     grid = state.grid.coarsen(factor)
@@ -82,7 +70,7 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
         np.arange(step // 2, grid.rows, step), np.arange(step // 2, grid.cols, step), indexing="ij"
     )
     square = np.ones((2 * math.ceil(clear_m / grid.cell_size_m) + 1,) * 2, dtype=np.uint8)
-    # Beyond the map nothing is known: the border counts as 0.
+    # Outside the map nothing is known: the border counts as 0.
     whole = (known >= 1).astype(np.uint8)
     mapped = cv2.erode(whole, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)[rows, cols] == 1
     cells = np.column_stack((rows[mapped], cols[mapped])).astype(np.int64)
@@ -112,7 +100,7 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
 
 
 def _mean_blocks(mask: NDArray[np.bool_], factor: int) -> Floats:
-    """Share of a mask in square blocks; the last ones are padded with False."""
+    """Return the fraction of a mask in square blocks; the last blocks are padded with False."""
     rows, cols = -(-mask.shape[0] // factor), -(-mask.shape[1] // factor)
     padded = np.zeros((rows * factor, cols * factor), dtype=np.uint8)
     padded[: mask.shape[0], : mask.shape[1]] = mask
@@ -122,7 +110,7 @@ def _mean_blocks(mask: NDArray[np.bool_], factor: int) -> Floats:
 
 
 def _rings(radius: float, count: int) -> list[Floats]:
-    """Kernels of equal area that tile a disc, each summing to 1."""
+    """Return kernels of equal area that tile a disc, each with sum 1."""
     reach = int(np.ceil(radius))
     down, right = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     ring = np.floor(count * (down**2 + right**2) / max(radius, 1.0) ** 2).astype(int)
@@ -138,7 +126,7 @@ def _filtered(share: Floats, kernel: Floats) -> Floats:
 
 
 def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -> Floats:
-    """Cut distances to thin classes, sampled on rings and sectors, shape (N, classes * rings, sectors), 0..1."""
+    """Return clipped distances to thin classes on rings and sectors, shape (N, classes * rings, sectors), 0..1."""
     turns = np.arange(_SECTORS) * 2 * np.pi / _SECTORS
     reach = radius * (np.arange(RINGS) + 0.5) / RINGS
     down = np.rint(-np.cos(turns)[None, :] * reach[:, None]).astype(int)  # sector 0 is north, the next one clockwise
@@ -157,7 +145,7 @@ def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -
 
 
 def _node_counts(nodes: gpd.GeoDataFrame, points_m: NDArray[np.float64], radius_m: float) -> Floats:
-    """Nodes of each kind within half the disc's area and within all of it, as square roots (variance of a count)."""
+    """Return square roots of the counts of nodes of each kind, within half the disc's area and within all of it."""
     kinds = nodes["kind"].to_numpy()
     counts = np.zeros((len(points_m), 2 * len(_NODE_KINDS)), dtype=np.float32)
     centres = shapely.points(points_m)
@@ -178,10 +166,10 @@ def _scaled(table: Floats) -> Floats:
 class Decoys:
     """Places most like one, most alike first, all far enough from it.
 
-    `alias_index`, 0..1, is how like the likest place is: the mean of how the drawn classes' shares in rings overlap,
-    and of one less the root mean square by which distances to thin classes miss at the best turn. Both have scales of
-    their own, not the map's, so that regions can be compared. `scorer` says which scorer each comes from, `points_m`
-    has shape (N, 2).
+    `alias_index`, 0..1, is the likeness of the most similar place: the mean of the overlap of the drawn classes'
+    fractions in rings, and of 1 minus the root mean square error of distances to thin classes at the best rotation.
+    Neither depends on the map, so regions can be compared. `scorer` names the scorer of each place; `points_m` has
+    shape (N, 2).
     """
 
     points_m: NDArray[np.float64]
@@ -190,26 +178,14 @@ class Decoys:
 
 
 def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Decoys:
-    """Find decoys for one place: the best of each scorer in turn.
+    """Find up to `count` decoys for one place: the best of each scorer in turn.
 
-    Parameters
-    ----------
-    windows : Windows
-        Of the map that is searched.
-    center_m : tuple of float
-        Easting and northing of the true place.
-    count : int
-        At most so many.
-
-    Returns
-    -------
-    Decoys
-        None nearer than `LEAST_RADII` half diagonals to the truth or to another one: were they nearer to each other
-        than to the truth, the loneliest candidate would be the true one.
+    No decoy is nearer than `LEAST_RADII` half diagonals to the truth or to another decoy. If decoys were nearer to each
+    other than to the truth, the most isolated candidate would be the true one.
     """
-    apart_m = np.hypot(*(windows.points_m - center_m).T)
-    is_far = apart_m >= least_apart_m(windows.radius_m)
-    here = int(np.argmin(apart_m)) if len(apart_m) else -1
+    distance_m = np.hypot(*(windows.points_m - center_m).T)
+    is_far = distance_m >= min_distance_m(windows.radius_m)
+    here = int(np.argmin(distance_m)) if len(distance_m) else -1
     if here < 0 or not is_far.any():
         return Decoys(points_m=np.zeros((0, 2)), scorer=(), alias_index=0.0)
     far = np.flatnonzero(is_far)
@@ -219,7 +195,7 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
         order.append(far[np.argsort(distance, kind="stable")])
         if name == "distance":
             misses = float(distance.min()) / math.sqrt(windows.polar[here].size)
-    spacing_m = least_apart_m(windows.radius_m)
+    spacing_m = min_distance_m(windows.radius_m)
     picked = list(_in_turn(order, windows.points_m, spacing_m=spacing_m, count=count))
     return Decoys(
         points_m=windows.points_m[[index for index, _ in picked]].reshape(-1, 2),
@@ -229,20 +205,14 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
 
 
 def _overlap(shares: Floats, here: int, far: NDArray[np.int64]) -> float:
-    """Largest overlap of the drawn classes' shares in rings with another place's: 1 less Bray and Curtis' index."""
-    apart = np.abs(shares[far] - shares[here]).sum(axis=1)
+    """Return the largest overlap of fractions in rings with another place: 1 minus the Bray-Curtis dissimilarity."""
+    difference = np.abs(shares[far] - shares[here]).sum(axis=1)
     total = (shares[far] + shares[here]).sum(axis=1)
-    return 1.0 - float(np.divide(apart, total, out=np.zeros_like(apart), where=total > 0).min())
+    return 1.0 - float(np.divide(difference, total, out=np.zeros_like(difference), where=total > 0).min())
 
 
-def least_apart_m(radius_m: float) -> float:
-    """Least distance of a decoy from the truth, for views of half that side: three half diagonals.
-
-    Examples
-    --------
-    >>> round(least_apart_m(96.0), 1)
-    407.3
-    """
+def min_distance_m(radius_m: float) -> float:
+    """Return the least distance between a decoy and the truth, for views of half that side: three half diagonals."""
     return LEAST_RADII * radius_m * float(np.sqrt(2))
 
 
@@ -250,7 +220,7 @@ def _distances(windows: Windows, name: str, here: int, far: NDArray[np.int64]) -
     if name in windows.plain:
         table = windows.plain[name]
         return np.asarray(np.linalg.norm(table[far] - table[here], axis=1))
-    # Turns: the spectrum's magnitude is blind to them and picks the short list; there, the best turn counts.
+    # The magnitude of the spectrum does not depend on rotation and gives the short list; there the best one counts.
     rough = np.linalg.norm(windows.spectrum[far] - windows.spectrum[here], axis=1)
     short = np.argsort(rough, kind="stable")[:_SHORTLIST]
     ours, theirs = windows.polar[here], windows.polar[far[short]]
@@ -268,12 +238,12 @@ def _distances(windows: Windows, name: str, here: int, far: NDArray[np.int64]) -
 def _in_turn(
     order: list[NDArray[np.int64]], points_m: NDArray[np.float64], *, spacing_m: float, count: int
 ) -> Iterator[tuple[int, str]]:
-    """First of the first scorer, first of the second, ..., second of the first; none near one taken before."""
+    """Yield the best of each scorer in turn, then the second best, and so on; skip places near a taken one."""
     places = np.rint((points_m - points_m.min(axis=0)) / STRIDE_M).astype(np.int64)
     reach = int(np.ceil(spacing_m / STRIDE_M))
     aside = np.arange(-reach, reach + 1) * STRIDE_M
     disc = np.hypot(aside[:, None], aside[None, :]) < spacing_m
-    # One cell for each place of the lattice, and a rim as wide as the disc, so that it need not be cut.
+    # One cell for each place of the lattice, with a margin as wide as the disc, so that it need not be clipped.
     is_taken = np.zeros(places.max(axis=0) + 1 + 2 * reach, dtype=bool)
     flat = np.ravel_multi_index(tuple((places + reach).T), is_taken.shape)
     taken, at = 0, [0] * len(order)
@@ -292,7 +262,7 @@ def _in_turn(
 
 
 def _next_free(ranked: NDArray[np.int64], start: int, is_taken: NDArray[np.bool_], flat: NDArray[np.int64]) -> int:
-    """Position of the first free place from `start` on; looks at ever longer parts of the ranking."""
+    """Return the position of the first free place from `start` on; look at ever longer parts of the ranking."""
     length = 64
     while start < len(ranked):
         free = np.flatnonzero(~is_taken[flat[ranked[start : start + length]]])
@@ -310,19 +280,20 @@ def candidates(
     jitter_m: float,
     rng: np.random.Generator,
 ) -> tuple[tuple[Pose, ...], int]:
-    """Shuffle the true place among decoys; every one is moved by the same kind of chance.
+    """Shuffle the true place among decoys; return candidates and the index of the true one, -1 without a truth.
 
-    Decoys lie on a lattice and the truth does not: without the jitter, coordinates alone would tell it.
-
-    Returns
-    -------
-    tuple of Pose, int
-        Candidates, and the index of the true one, -1 without a truth.
+    All are jittered alike: decoys are on a lattice and the truth is not, so coordinates alone would reveal it.
     """
     points = decoys_m if truth is None else np.vstack((np.array([truth]), decoys_m))
     moved = points + rng.uniform(-jitter_m, jitter_m, points.shape)
-    order = rng.permutation(len(moved))
-    poses = tuple(
-        Pose(easting_m=round(float(x), 2), northing_m=round(float(y), 2), yaw_deg=yaw_deg) for x, y in moved[order]
-    )
+    poses, order = shuffled_poses(moved, yaw_deg=yaw_deg, rng=rng)
     return poses, -1 if truth is None else int(np.argmin(order))
+
+
+def shuffled_poses(
+    points_m: NDArray[np.float64], *, yaw_deg: float, rng: np.random.Generator
+) -> tuple[tuple[Pose, ...], NDArray[np.int64]]:
+    """Return poses at points, shape (N, 2), in random order, and that order."""
+    order = rng.permutation(len(points_m))
+    easts_norths = points_m[order].tolist()
+    return tuple(Pose(easting_m=round(x, 2), northing_m=round(y, 2), yaw_deg=yaw_deg) for x, y in easts_norths), order

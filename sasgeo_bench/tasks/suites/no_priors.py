@@ -4,34 +4,27 @@
 from typing import Final
 
 from sasgeo_bench.tasks.query import PriorGroup
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Seeds, Site, Suite, SuiteCard, Variant, perceived
-from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.vectors import site_vectors
 
 SCALE_SIGMA: Final = 0.15
-# The views are the same as without priors, and with them their scales: a sigma of 0.03 would say what is not so.
+# The views, and so their scales, are the same as without priors: a sigma of 0.03 would be false.
 GIVEN: Final = PriorGroup(radius_m=500.0, yaw="known", scale_sigma=SCALE_SIGMA)
 LEAST_KM2: Final = 0.5
 
 
 class NoPriorsSuite(Suite):
-    """The same view twice: with nothing known before, and, as falsifier, with priors given."""
+    """The same view twice: without any prior and, as falsifier, with priors."""
 
     def lack(self, scene: Scene) -> str | None:
-        """A map too small to search would know the place already."""
+        """Refuse a map so small that searching it needs no prior."""
         area_km2 = float(scene.map.known.sum()) * scene.map.grid.cell_size_m**2 / 1e6
         return None if area_km2 >= LEAST_KM2 else f"{area_km2:.2f} km2 mapped, at least {LEAST_KM2:g} are needed"
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """Perceive layers and vectors; the variant says what is known before."""
-        vectors = perceive_vectors(
-            scene.world,
-            site.pose,
-            side_m=variant.side_m,
-            noise=VectorNoise(),
-            rng=seeds.rng("vectors", variant.view_cells),
-        )
-        group = None if variant.role == "stress" else GIVEN
-        return Draft(evidence=perceived(scene.world, site, variant, seeds), vectors=vectors, group=group)
+    def draw(self, shot: Shot) -> Draft:
+        """Perceive layers and vectors; the variant determines the priors."""
+        group = None if shot.variant.role == "stress" else GIVEN
+        return Draft(evidence=shot.perceived(), vectors=site_vectors(shot), group=group)
 
 
 SUITE: Final = NoPriorsSuite(

@@ -1,43 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `occlusion`: parts of the view are unknown, by rectangles, by geometry, by what hides, by an adversary."""
+"""Suite `occlusion`: parts of the view are unknown: rectangles, geometry, cover, or an adversary's mask."""
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.adversarial import AdversarialMask
-from sasgeo_bench.tasks.perturbations.base import Perturbation
+from sasgeo_bench.tasks.perturbations.base import Occlusion
 from sasgeo_bench.tasks.perturbations.border import Border
 from sasgeo_bench.tasks.perturbations.canopy import CanopyAndShadow
 from sasgeo_bench.tasks.perturbations.glare import Glare
 from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
 from sasgeo_bench.tasks.perturbations.wedge import TiltWedge
-from sasgeo_bench.tasks.suites.base import VIEW_CELLS, PlainSuite, SuiteCard, Variant, controls, ladder
+from sasgeo_bench.tasks.suites.base import PlainSuite, SuiteCard, Variant, controls, ladder
 
 SHARES: Final = (0.15, 0.3, 0.45, 0.6)
 SMALL_SHARES: Final = (0.3, 0.6)
 ALL_UNKNOWN: Final = "all unknown"
-
-
-# What hides a given share of the view.
-HIDERS: Final[dict[str, Callable[[float], Perturbation]]] = {
-    "none": lambda share: Rectangles(share=share),
-    "U1 rectangles": lambda share: Rectangles(share=share),
-    "U2 border": lambda share: Border(share=share),
-    "U2 wedge": lambda share: TiltWedge(share=share),
-    "U2 glare": lambda share: Glare(share=share),
-    "U3 canopy and shadow": lambda share: CanopyAndShadow(share=share),
-    "U4 adversarial": lambda share: AdversarialMask(share=share),
+HIDERS: Final[dict[str, type[Occlusion]]] = {
+    "none": Rectangles,
+    "U1 rectangles": Rectangles,
+    "U2 border": Border,
+    "U2 wedge": TiltWedge,
+    "U2 glare": Glare,
+    "U3 canopy and shadow": CanopyAndShadow,
+    "U4 adversarial": AdversarialMask,
 }
 
 
 def _hide(variant: Variant, evidence: Evidence, rng: np.random.Generator) -> Evidence:
-    """Occlude a view as the variant says."""
     if variant.kind == ALL_UNKNOWN:
         return evidence.replace(np.full_like(evidence.cells, UNKNOWN))
-    return HIDERS[variant.kind](variant.strength)(evidence, rng)
+    return HIDERS[variant.kind](share=variant.strength)(evidence, rng)
 
 
 SUITE: Final = PlainSuite(
@@ -53,7 +48,7 @@ SUITE: Final = PlainSuite(
         tracks=("localization", "retrieval"),
     ),
     variants=(
-        *controls(views=VIEW_CELLS),
+        *controls(),
         *ladder("U1 rectangles", SHARES, small=SMALL_SHARES, large=(0.6,)),
         *ladder("U2 border", (0.3, 0.6), small=SMALL_SHARES),
         *ladder("U2 wedge", (0.3, 0.6), small=SMALL_SHARES),

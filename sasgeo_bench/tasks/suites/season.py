@@ -3,32 +3,21 @@
 
 from typing import Final, get_args
 
+from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.perturbations.season import Kind, Season
-from sasgeo_bench.tasks.suites.base import (
-    VIEW_CELLS,
-    Draft,
-    Scene,
-    Seeds,
-    Site,
-    Suite,
-    SuiteCard,
-    Variant,
-    controls,
-    ladder,
-    perceived,
-)
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 STRENGTHS: Final = (0.3, 0.6, 0.9)
 SMALL_STRENGTHS: Final = (0.6, 0.9)
 NEEDS: Final = {"leaf_on": ("green",), "snow": (), "low_water": ("water", "waterway"), "harvest": ("farmland",)}
-_LEAST_SHARE: Final = 0.003  # of the mapped cells, for a season to have anything to change
+_LEAST_SHARE: Final = 0.003  # of the mapped cells that the classes of a season cover
 
 
 class SeasonSuite(Suite):
-    """The query says which season it is; in the falsifier it says so and nothing has changed."""
+    """The query gives the season; in the falsifier it does so without any change."""
 
     def usable(self, scene: Scene) -> tuple[Variant, ...]:
-        """Seasons that find what they change."""
+        """Return the seasons whose classes the map has."""
         cells = float(scene.map.known.sum())
         shares = {name: float(scene.map.has(name).sum()) / max(1.0, cells) for name in scene.map.classes}
         able = {
@@ -36,18 +25,15 @@ class SeasonSuite(Suite):
         }
         return tuple(item for item in self.variants if item.role == "control" or item.kind in able)
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """Let the season come, then perceive."""
-        if variant.role == "control":
-            return Draft(evidence=perceived(scene.world, site, variant, seeds))
-        kind = next(kind for kind in get_args(Kind) if kind == variant.kind)
-        clean = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-        changed = Season(kind=kind, strength=variant.strength)(clean, seeds.rng("season", kind, variant.view_cells))
-        return Draft(
-            evidence=perceived(scene.world, site, variant, seeds, clean=changed),
-            season=kind,
-            measured={"cells_changed": float((clean.cells != changed.cells).mean())},
-        )
+    def draw(self, shot: Shot) -> Draft:
+        """Change the view by the season, then perceive it."""
+        if shot.variant.role == "control":
+            return Draft(evidence=shot.perceived())
+        kind = next(kind for kind in get_args(Kind) if kind == shot.variant.kind)
+        clean = shot.clean()
+        changed = Season(kind=kind, strength=shot.variant.strength)(clean, shot.rng("season", kind))
+        measured = {"cells_changed": share_changed(clean, changed)}
+        return Draft(evidence=shot.perceived(changed), season=kind, measured=measured)
 
 
 SUITE: Final = SeasonSuite(
@@ -61,7 +47,7 @@ SUITE: Final = SeasonSuite(
         strength_unit="how far the season has come",
     ),
     variants=(
-        *controls(views=VIEW_CELLS),
+        *controls(),
         *(variant for kind in NEEDS for variant in ladder(kind, STRENGTHS, small=SMALL_STRENGTHS)),
         *(Variant(role="falsifier", kind=kind) for kind in NEEDS),
     ),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where queries lie: places spread over the blocks that are mapped, hold something, and do not overlap."""
+"""Sites of queries: places in mapped blocks that hold features and do not overlap."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,34 +17,30 @@ from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site, Suite
 
 _TRIES: Final = 400  # draws in a block before it counts as full
-_SCALE_CUT: Final = 2.0  # sigmas: a scale farther off is not drawn
-ANCHOR_SPREAD: Final = 0.2  # of the view's side: how far a site lies from what it is about
+_SCALE_CUT: Final = 2.0  # sigmas at which the scales of views are cut
+ANCHOR_SPREAD: Final = 0.2  # largest distance of a site from its anchor, as a fraction of the view's side
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Sums:
-    """Sums over squares in constant time: an integral image of what is known and one of what is drawn."""
+    """Fractions of the cells of a mask in squares, in constant time by an integral image."""
 
-    known: NDArray[np.int32]
-    drawn: NDArray[np.int32]
+    integral: NDArray[np.int32]
 
-    def shares(self, row: int, col: int, half: int) -> tuple[float, float]:
-        """Shares of known and of drawn cells in the square around a cell; beyond the map nothing is known."""
-        rows, cols = self.known.shape
+    @classmethod
+    def of(cls, mask: NDArray[np.bool_]) -> "_Sums":
+        return cls(integral=np.asarray(cv2.integral(mask.view(np.uint8)), dtype=np.int32))
+
+    def share(self, row: int, col: int, half: int) -> float:
+        """Return the fraction in the square around a cell; cells outside the map count as False."""
+        rows, cols = self.integral.shape
         top, bottom = max(0, row - half), min(rows - 1, row + half)
         left, right = max(0, col - half), min(cols - 1, col + half)
         if top >= bottom or left >= right:
-            return (0.0, 0.0)
-        area = float(2 * half) ** 2
-        known, drawn = (
-            float(table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]) / area
-            for table in (self.known, self.drawn)
-        )
-        return (known, drawn)
-
-
-def _integral(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
-    return np.asarray(cv2.integral(mask.view(np.uint8)), dtype=np.int32)
+            return 0.0
+        table = self.integral
+        total = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+        return float(total) / float(2 * half) ** 2
 
 
 def choose_sites(
@@ -52,45 +48,33 @@ def choose_sites(
 ) -> tuple[Site, ...]:
     """Choose places for a suite, block by block in turn.
 
-    Parameters
-    ----------
-    scene : Scene
-        The map and its blocks.
-    suite : Suite
-        Says how much must be there, and near what.
-    count : int
-        How many.
-    seeds : Seeds
-        Of the region and suite.
-    group : PriorGroup
-        Its scale sigma is how much the views' scale varies.
-    may_be_fewer : bool
-        Whether as many as the region holds will do; one at least.
-
-    Returns
-    -------
-    tuple of Site
-        The first `count` of one long sequence: a larger count only adds to it. Centres are at least the suite's spacing
-        apart.
+    The result begins a sequence that does not depend on `count`: a larger count only adds sites. Centres keep the
+    suite's spacing. `seeds` are those of region and suite; the scale sigma of `group` sets the spread of the views'
+    scales.
 
     Raises
     ------
     ConfigError
-        If the region holds fewer.
+        If the region holds fewer places; with `may_be_fewer`, only if it holds none.
     """
-    sums = _Sums(known=_integral(scene.map.known), drawn=_integral(scene.map.drawn))
-    ground = _Ground(scene=scene, suite=suite, anchors=suite.anchors(scene), sums=sums)
+    ground = _Ground(
+        scene=scene,
+        suite=suite,
+        anchors=suite.anchors(scene),
+        known=_Sums.of(scene.map.known),
+        drawn=_Sums.of(scene.map.drawn),
+        seeds=seeds,
+        group=group,
+    )
     found: list[Site] = []
-    centres: list[tuple[float, float]] = []
-    streams = [ground.places(block, seeds.under("block", block.row, block.col), centres) for block in scene.blocks]
+    streams = [ground.sites(block, found) for block in scene.blocks]
     while streams and len(found) < count:
         for stream in list(streams):
-            place = next(stream, None)
-            if place is None:
+            site = next(stream, None)
+            if site is None:
                 streams.remove(stream)
                 continue
-            found.append(_site(place, len(found), seeds, group))
-            centres.append((place.easting_m, place.northing_m))
+            found.append(site)
             if len(found) == count:
                 break
     if not found:
@@ -105,47 +89,39 @@ def choose_sites(
     return tuple(found)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Place:
-    easting_m: float
-    northing_m: float
-    block: str
-    density: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Ground:
-    """What a place must hold to, whatever the block."""
+    """The requirements that all sites of a suite must meet."""
 
     scene: Scene
     suite: Suite
     anchors: NDArray[np.float64] | None
-    sums: _Sums
+    known: _Sums
+    drawn: _Sums
+    seeds: Seeds
+    group: PriorGroup
 
-    def places(self, block: Block, seeds: Seeds, centres: list[tuple[float, float]]) -> Iterator[_Place]:
-        """Draw places of one block that the suite can use, none near `centres`, until too many draws failed."""
-        rng = seeds.rng("places")
+    def sites(self, block: Block, found: Sequence[Site]) -> Iterator[Site]:
+        """Draw sites of one block, none near those found so far in any block, until too many draws failed."""
+        rng = self.seeds.rng("block", block.row, block.col, "places")
         west, south, east, north = block.bounds_m
         near = self._near(block)
         if near is not None and len(near) == 0:
             return
-        spacing_m, spread_m = self.suite.spacing_m(self.scene), ANCHOR_SPREAD * self.suite.main_side_m
-        failed = 0
+        spread_m, failed = ANCHOR_SPREAD * self.suite.main_side_m, 0
         while failed < _TRIES:
             point = rng.uniform((west, south), (east, north))
             if near is not None:
                 point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * spread_m
             place = (float(point[0]), float(point[1]))
-            is_within = west <= place[0] < east and south <= place[1] < north
-            density = self._density(point) if is_within else None
-            if density is None or density < self.suite.card.min_density or not _is_free(place, centres, spacing_m):
+            density = self._density(point) if block.holds(place) else None
+            if density is None or density < self.suite.card.min_density or not self._is_free(place, found):
                 failed += 1
                 continue
             failed = 0
-            yield _Place(easting_m=place[0], northing_m=place[1], block=block.id, density=density)
+            yield Site(index=len(found), pose=self._pose(place), block=block.id, density=density)
 
     def _near(self, block: Block) -> NDArray[np.float64] | None:
-        """Anchors in a block."""
         if self.anchors is None:
             return None
         west, south, east, north = block.bounds_m
@@ -153,41 +129,24 @@ class _Ground:
         return np.asarray(self.anchors[(x >= west) & (x < east) & (y >= south) & (y < north)])
 
     def _density(self, point: NDArray[np.float64]) -> float | None:
-        """Share of drawn cells in the main view, or None where not all is mapped that a view may show."""
+        """Return the fraction of drawn cells in the main view; None unless all that a view may show is mapped."""
         grid = self.scene.map.grid
         row, col = grid.to_cells(point[None, :])[0].tolist()
-        known, _ = self.sums.shares(row, col, math.ceil(self.suite.clear_m(self.scene) / grid.cell_size_m))
-        if known < 1.0:
+        if self.known.share(row, col, math.ceil(self.suite.clear_m(self.scene) / grid.cell_size_m)) < 1.0:
             return None
-        return self.sums.shares(row, col, max(1, round(self.suite.main_side_m / 2 / grid.cell_size_m)))[1]
+        return self.drawn.share(row, col, max(1, round(self.suite.main_side_m / 2 / grid.cell_size_m)))
 
+    def _is_free(self, place: tuple[float, float], found: Sequence[Site]) -> bool:
+        spacing_m = self.suite.spacing_m(self.scene)
+        return all(math.dist(place, site.en_m) >= spacing_m for site in found)
 
-def _is_free(place: tuple[float, float], centres: list[tuple[float, float]], spacing_m: float) -> bool:
-    if not centres:
-        return True
-    apart = np.hypot(*(np.array(centres) - place).T)
-    return bool(apart.min() >= spacing_m)
+    def _pose(self, place: tuple[float, float]) -> Pose:
+        easting_m, northing_m = place
+        rng = self.seeds.rng("site", round(easting_m * 1000), round(northing_m * 1000))
+        scale = 1.0 + self.group.scale_sigma * float(np.clip(rng.standard_normal(), -_SCALE_CUT, _SCALE_CUT))
+        return Pose(easting_m=easting_m, northing_m=northing_m, yaw_deg=float(rng.uniform(0, 360)), scale=scale)
 
 
 def largest_scale(group: PriorGroup) -> float:
-    """Largest scale that a view of a prior group can have.
-
-    Examples
-    --------
-    >>> largest_scale(PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15))
-    1.3
-    """
+    """Return the largest scale of a view of a prior group."""
     return 1.0 + _SCALE_CUT * group.scale_sigma
-
-
-def _site(place: _Place, index: int, seeds: Seeds, group: PriorGroup) -> Site:
-    """Give a place its heading and scale."""
-    rng = seeds.rng("site", round(place.easting_m * 1000), round(place.northing_m * 1000))
-    spread = float(np.clip(rng.standard_normal(), -_SCALE_CUT, _SCALE_CUT))
-    pose = Pose(
-        easting_m=place.easting_m,
-        northing_m=place.northing_m,
-        yaw_deg=float(rng.uniform(0, 360)),
-        scale=1.0 + group.scale_sigma * spread,
-    )
-    return Site(index=index, pose=pose, block=place.block, density=place.density)

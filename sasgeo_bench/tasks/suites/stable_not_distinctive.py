@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite `stable-not-distinctive`: a straight road among changing fields, stable and the same for kilometres."""
+"""Suite `stable-not-distinctive`: a straight road among changing fields, stable but uniform for kilometres."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,70 +10,71 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.angles import bearing_deg, wrap_deg
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Site, Suite, SuiteCard, Variant, perceived
-from sasgeo_bench.tasks.suites.mining import least_apart_m
+from sasgeo_bench.tasks.perturbations.base import share_changed
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
 from sasgeo_bench.tasks.suites.twins import Places
 
 STABLE: Final = ("road_major", "railway", "waterway")
-VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building")  # in this order they change
+VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building")  # in the order of their change
 MOST_ALIASES: Final = 8
 
 _STEP_M: Final = 40.0
-_REACH_M: Final = 90.0  # along the line, either way: most of a view of 192 m
-_STRAIGHT: Final = 0.995  # of the length along it
+_REACH_M: Final = 90.0  # along the line in both directions: most of a view of 192 m
+_STRAIGHT: Final = 0.995  # least ratio of chord and line
 _SAME_DEG: Final = 12.0
 _MOST_BUILT: Final = 0.03
 
 
 class StableNotDistinctive(Suite):
-    """Sites along straight lines of a stable class; other places along such lines of one direction are candidates."""
+    """Sites along straight lines of a stable class; the candidates are other places on parallel lines."""
 
     def lack(self, scene: Scene) -> str | None:
-        """Straight stretches in open land are needed."""
+        """Refuse a region without straight stretches in open land."""
         return None if len(straight_places(scene)) else "no straight major road, railway or waterway in open land"
 
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
-        """On the lines."""
+        """Return places on the lines."""
         return straight_places(scene)[:, :2]
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit | None:
-        """No change of the map: the twins are there, as far off a line as sites are, and as far from each other."""
+        """Find existing twins, with the same distances from a line and from each other as sites; change no map."""
         places = straight_places(scene)
-        apart_m = least_apart_m(self.main_side_m / 2)
+        spacing_m = min_distance_m(self.main_side_m / 2)
         spread_m = ANCHOR_SPREAD * self.main_side_m
         twins = {}
         for site in sites:
             rng = seeds.rng("alias", site.index)
-            here = np.array([site.pose.easting_m, site.pose.northing_m])
+            here = np.array(site.en_m)
             own = places[int(np.argmin(np.hypot(*(places[:, :2] - here).T))), 2]
             turned = np.abs(wrap_deg(2 * (places[:, 2] - own)) / 2)  # a line has no direction: modulo 180
             like = rng.permutation(places[turned <= _SAME_DEG, :2])
             like = like + rng.uniform(-spread_m, spread_m, like.shape)
             is_whole = [scene.map.is_mapped(place, self.clear_m(scene)) for place in like]
-            twins[site.index] = _spaced(like[is_whole], here, apart_m)
+            twins[site.index] = _spaced(like[is_whole], here, spacing_m)
         return Edit(
             map_pastes=(), world_pastes=None, sites=tuple(site for site in sites if twins[site.index]), twins=twins
         )
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+    def draw(self, shot: Shot) -> Draft:
         """Mirror the layers of some volatile classes within the view: all of them at strength 1."""
-        seen = perceived(scene.world, site, variant, seeds)
-        after = mirrored(seen, round(variant.strength * len(VOLATILE)))
-        return Draft(evidence=after, measured={"cells_changed": float((seen.cells != after.cells).mean())})
+        seen = shot.perceived()
+        after = mirrored(seen, round(shot.variant.strength * len(VOLATILE)))
+        return Draft(evidence=after, measured={"cells_changed": share_changed(seen, after)})
 
 
-def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], apart_m: float) -> Places:
-    """The first few places that keep their distance from here and from each other."""
+def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], spacing_m: float) -> Places:
+    """Return the first few places that keep their distance from here and from each other."""
     taken = [here]
     for point in points:
-        if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= apart_m:
+        if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= spacing_m:
             taken.append(point)
     return tuple((float(x), float(y)) for x, y in taken[1:])
 
 
 def mirrored(evidence: Evidence, count: int) -> Evidence:
-    """Mirror the first so many volatile classes from left to right: as much is there as before, elsewhere."""
+    """Mirror the first `count` volatile classes from left to right, which keeps their area."""
     cells = evidence.cells.copy()
     for name in VOLATILE[:count]:
         index = evidence.classes.index(name)
@@ -82,7 +83,7 @@ def mirrored(evidence: Evidence, count: int) -> Evidence:
 
 
 def straight_places(scene: Scene) -> NDArray[np.float64]:
-    """Easting, northing and bearing of points on straight stretches of stable lines in open land, shape (N, 3)."""
+    """Return easting, northing and bearing of points on straight stable lines in open land, shape (N, 3)."""
     features = scene.map.features
     chosen = features["class"].isin(STABLE).to_numpy() & features["is_visible"].to_numpy()
     lines = shapely.line_merge(shapely.union_all(features.geometry.to_numpy()[chosen])) if chosen.any() else None
@@ -106,7 +107,7 @@ def _along(line: shapely.Geometry) -> NDArray[np.float64]:
 
 
 def _is_open(scene: Scene, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Few buildings within the reach of a view."""
+    """Return which places have few buildings within the reach of a view."""
     built, grid = scene.map.has("building"), scene.map.grid
     half = round(_REACH_M / grid.cell_size_m)
     found = []

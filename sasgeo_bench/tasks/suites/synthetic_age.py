@@ -7,70 +7,53 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.ageing.ratebook import PooledRates
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
-from sasgeo_bench.tasks.suites.base import (
-    VIEW_CELLS,
-    Draft,
-    Scene,
-    Seeds,
-    Site,
-    Suite,
-    SuiteCard,
-    Variant,
-    changed_share,
-    controls,
-    ladder,
-    perceived,
-)
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
-REDRAWN_WITHIN_YEARS: Final = 10.0  # the span that the share of redrawn things in a scene's ageing stands for
+REDRAWN_WITHIN_YEARS: Final = 10.0  # span that the `redrawn` of a scene's ageing refers to
 _MOST_NEW_PER_OLD: Final = 1.0
 _SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
 _MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
 
 
 class SyntheticAgeSuite(Suite):
-    """Years pass between map and view; for places of which there is one date only."""
+    """Years pass between map and view; for places with one date only."""
 
     def lack(self, scene: Scene) -> str | None:
-        """Rates of other places are needed."""
+        """Refuse a region without rates of other places."""
         return "no rates of ageing from another place" if scene.ageing is None else super().lack(scene)
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
+    def draw(self, shot: Shot) -> Draft:
         """Let the years pass, then perceive; a control sees the map's own day."""
-        if variant.strength == 0 or scene.ageing is None:
-            return Draft(evidence=perceived(scene.world, site, variant, seeds), changed_share=0.0)
-        clean = scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-        grown = after(scene.ageing, variant.strength)(clean, seeds.rng("ageing", variant.view_cells))
-        share = changed_share(clean, grown)
-        return Draft(
-            evidence=perceived(scene.world, site, variant, seeds, clean=grown),
-            changed_share=share,
-            measured={"changed_share": share},
-        )
+        if shot.variant.strength == 0 or shot.scene.ageing is None:
+            return Draft(evidence=shot.perceived(), changed_share=0.0)
+        clean = shot.clean()
+        grown = after(shot.scene.ageing, shot.variant.strength)(clean, shot.rng("ageing"))
+        return Draft.of_change(shot.perceived(grown), clean, grown)
 
 
 def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
-    """Ageing by measured rates of other places; no year has passed yet.
+    """Return ageing by the measured rates of other places, with no year passed yet.
 
-    What is drawn anew, and how far off, are medians over the classes whose centre moves because they were drawn anew
-    and not because they grew.
+    The share of redrawn objects and their shift are medians over the classes whose centre moves because they were
+    redrawn and not because they grew.
     """
-    told = [pooled.classes[name] for name in _SHIFTED if name in pooled.classes]
+    redrawn = [pooled.classes[name] for name in _SHIFTED if name in pooled.classes]
     shares = [
         1 - (1 - item.redrawn_share) ** (REDRAWN_WITHIN_YEARS / item.years)
-        for item in told
+        for item in redrawn
         if item.redrawn_share is not None
     ]
-    shifts_m = [item.shift_median_m for item in told if item.shift_median_m is not None]
+    shifts_m = [item.shift_median_m for item in redrawn if item.shift_median_m is not None]
     classes = {
         name: Rates(vanish_per_year=item.vanish_per_year, appear_per_year=item.appear_per_year)
         for name, item in pooled.classes.items()
     }
     return Ageing(
         years=0.0,
-        rates=AgeingRates(classes=classes, places=pooled.places),
+        rates=classes,
+        measured_in=pooled.places,
         place=place,
         redrawn=float(np.median(shares)) if shares else 0.0,
         shift_m=float(np.median(shifts_m)) / _MEDIAN_OF_SHIFT if shifts_m else 0.0,
@@ -78,25 +61,17 @@ def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
 
 
 def after(ageing: Ageing, years: float) -> Ageing:
-    """Ageing by so many years; the share that was drawn anew grows with them.
+    """Return ageing by so many years; the share of redrawn objects grows with them.
 
-    A class no more than doubles: rates of appearing were measured on maps that were being filled, and one that is full
-    has not as much to catch up on.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.tasks.perturbations.ageing import AgeingRates
-    >>> slow = Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="-", redrawn=0.36)
-    >>> round(after(slow, 5.0).redrawn, 3)
-    0.2
+    A class at most doubles: rates of appearing were measured on maps that were being completed, and a complete map
+    grows less.
     """
     kept = (1 - ageing.redrawn) ** (years / REDRAWN_WITHIN_YEARS)
     most = float(np.log1p(_MOST_NEW_PER_OLD)) / years if years > 0 else np.inf
     classes = {
-        name: replace(rates, appear_per_year=min(rates.appear_per_year, most))
-        for name, rates in ageing.rates.classes.items()
+        name: replace(rates, appear_per_year=min(rates.appear_per_year, most)) for name, rates in ageing.rates.items()
     }
-    return replace(ageing, years=years, redrawn=1 - kept, rates=replace(ageing.rates, classes=classes))
+    return replace(ageing, years=years, redrawn=1 - kept, rates=classes)
 
 
 SUITE: Final = SyntheticAgeSuite(
@@ -111,7 +86,7 @@ SUITE: Final = SyntheticAgeSuite(
         needs=("rates of ageing",),
     ),
     variants=(
-        *controls(views=VIEW_CELLS),
+        *controls(),
         *ladder("aged", YEARS, small=(5.0, 10.0, 20.0, 40.0), large=(10.0, 40.0)),
         Variant(role="falsifier", kind="no year"),
     ),

@@ -5,39 +5,33 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site, SuiteCard, Variant, perceived
-from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of
+from sasgeo_bench.tasks.suites.base import Scene, Shot, Site, SuiteCard, pair
+from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of, with_neighbours
 from sasgeo_bench.tasks.twin import Change, open_gaps, stagger
 
-GAP_M: Final = 2.0  # one or two cells: what perception's own gaps hide
-OFFSET_M: Final = 5.0  # between two T-junctions: less than a road is wide
-LEAST_JUNCTIONS: Final = 2
-_PAIR_M: Final = 125.0  # between two junctions that a view holds both
+GAP_M: Final = 2.0  # one or two cells: perception's own gaps are as wide
+OFFSET_M: Final = 5.0  # between two T-junctions: less than the width of a road
+_PAIR_M: Final = 125.0  # between two junctions that one view shows
 _SEEN_M: Final = 90.0
 _FEWEST_X: Final = 2
-_ONE_PATCH_CELLS: Final = 4  # cells that differ this near to each other belong to one junction
+_ONE_PATCH_CELLS: Final = 4  # differing cells within this distance belong to one junction
 
 
 def _junctions(scene: Scene) -> NDArray[np.float64]:
-    """Junctions that have another one near."""
-    places = places_of(nodes_of(scene, ["intersection"], least_degree=3))
-    tree = shapely.STRtree(shapely.points(places))
-    hits = tree.query(shapely.points(places), predicate="dwithin", distance=_PAIR_M)[0]
-    return np.asarray(places[np.bincount(hits, minlength=len(places)) >= LEAST_JUNCTIONS])
+    return with_neighbours(places_of(nodes_of(scene, ["intersection"], least_degree=3)), within_m=_PAIR_M)
 
 
 def _near(scene: Scene, site: Site, *, least_degree: int) -> NDArray[np.float64]:
     places = places_of(nodes_of(scene, ["intersection"], least_degree=least_degree))
-    return np.asarray(places[np.hypot(*(places - (site.pose.easting_m, site.pose.northing_m)).T) < _SEEN_M])
+    return np.asarray(places[np.hypot(*(places - site.en_m).T) < _SEEN_M])
 
 
 def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
-    """Two T-junctions for each X where there are some, and otherwise gaps; X-junctions take turns between the two."""
+    """Split X-junctions into two T-junctions at half of the sites that have some; open gaps at all others."""
     crossings = _near(scene, site, least_degree=4)
     if len(crossings) >= _FEWEST_X and rng.random() < 0.5:  # noqa: PLR2004 - half of them
         return lambda piece: stagger(piece, crossings, offset_m=OFFSET_M, rng=rng)
@@ -46,34 +40,22 @@ def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
 
 
 class TopologyTwins(TwinSuite):
-    """As every twin suite; layers show each junction as it is at the true place or as it is at the twin, by lot.
+    """Twins whose layers show each junction as at the true place or as at the twin, by lot.
 
-    A gap is a few cells wide, yet at the exact pose a few cells that perception left alone are enough to tell the two
-    places apart. So that layers cannot, they have each junction either way, as a detector of that resolution would.
+    A gap is a few cells wide, but at the exact pose a few undisturbed cells are enough to distinguish the two places.
+    With junctions drawn by lot, as a detector of that resolution would see them, layers cannot.
     """
 
-    def see(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Evidence:
+    def see(self, shot: Shot) -> Evidence:
         """Perceive the layers with each junction as in one of the two places."""
-        easting_m, northing_m = scene.twins[site.index][0]
-        twin = replace(site.pose, easting_m=easting_m, northing_m=northing_m)
-        own, other = (
-            scene.world.view(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-            for pose in (site.pose, twin)
-        )
-        clean = either(own, other, seeds.rng("junctions", variant.view_cells))
-        return perceived(scene.world, site, variant, seeds, clean=clean)
+        easting_m, northing_m = shot.scene.twins[shot.site.index][0]
+        twin = replace(shot.site.pose, easting_m=easting_m, northing_m=northing_m)
+        other = shot.variant.view(shot.scene.world, twin)
+        return shot.perceived(either(shot.clean(), other, shot.rng("junctions")))
 
 
 def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence:
-    """Where two views differ, take each patch of cells from the one or the other.
-
-    Examples
-    --------
-    >>> cells = np.repeat(np.array([0, 1], dtype=np.uint8), 9).reshape(2, 1, 1, 9)
-    >>> one, two = (Evidence(classes=("a",), cells=item, cell_size_m=1.0) for item in cells)
-    >>> sorted({int(either(one, two, np.random.default_rng(seed)).cells.sum()) for seed in range(20)})  # one patch
-    [0, 9]
-    """
+    """Take each patch of differing cells from one of two views, by lot."""
     differ = (own.cells != other.cells).any(axis=0)
     near = ndimage.binary_dilation(differ, structure=np.ones((3, 3), dtype=bool), iterations=_ONE_PATCH_CELLS // 2)
     patch, count = ndimage.label(near, structure=np.ones((3, 3)))
@@ -95,11 +77,7 @@ SUITE: Final = TopologyTwins(
         group=TWIN_GROUP,
         min_density=0.05,
     ),
-    variants=(
-        Variant(role="control", kind="no vectors"),
-        Variant(role="stress", kind="G2", strength=1.0),
-        Variant(role="falsifier", kind="gaps closed"),
-    ),
+    variants=pair("no vectors", "G2", "gaps closed"),
     change_of=_change,
     find=_junctions,
     needs="no two junctions near each other",

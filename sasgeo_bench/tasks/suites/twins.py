@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the twin suites share: copies of a site elsewhere on the map, changed or not, and queries that must choose."""
+"""Base of the twin suites: copies of a site elsewhere on the map, with or without a change."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,80 +14,66 @@ from scipy import ndimage
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.query import PriorGroup
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant, perceived
-from sasgeo_bench.tasks.suites.mining import least_apart_m
-from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite
+from sasgeo_bench.tasks.suites.mining import min_distance_m
+from sasgeo_bench.tasks.suites.vectors import site_vectors
 from sasgeo_bench.tasks.twin import Change, Paste
 
 LATTICE_M: Final = 16.0
-OFF_M: Final = 24.0  # how far the middle of what is copied lies from the site: its rim must not tell where the site is
+OFF_M: Final = 24.0  # largest offset of a copied disc from its site, so that its rim does not show where the site is
 
 TWIN_GROUP: Final = PriorGroup(radius_m=2000.0, yaw="weak", scale_sigma=0.03)  # wide enough to hold the twins
 
 Places = tuple[tuple[float, float], ...]
-
-# What turns a site into the change of its copy, with the site's own chance.
 ChangeOf = Callable[[Scene, Site, np.random.Generator], Change]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwinSuite(Suite):
-    """Every site has twins: copies elsewhere on the map that differ from it by one change.
+    """Base of suites whose sites have twins: copies elsewhere on the map that differ by one change.
 
-    At every second site the true place has the change and the twin has not, so that "take the plainer one" does not
-    help; of the original and its copies any is the true place, by lot, so that neither does "take the one whose roads
-    go on". A query's view is of the true place; the twins are among its candidates.
+    At every second site (if `is_swapped`) the true place has the change and the twin does not, so that "take the
+    plainer one" does not help. The true place is drawn by lot from the original and its copies, so that "take the one
+    whose roads continue" does not help either. A view shows the true place; the twins are among its candidates.
 
-    Parameters
-    ----------
-    change_of : callable
-        (scene, site, rng) -> what is done to the copy.
-    find : callable
-        Scene -> easting and northing of what the suite is about, shape (N, 2); None for anywhere.
-    needs : str
-        What a region without such places lacks.
-    copies : int
-        Twins of a site.
-    is_swapped : bool
-        Whether every second site is changed in place.
-    falsifier_sees_change : bool
-        Of which of the two places the falsifier's vectors are, at every site: of the changed one, or of the plain one.
-        So they tell nothing about which of the two is seen.
+    `change_of` returns the change of a site's copy. `find` returns the places that sites are near, shape (N, 2), and
+    `needs` names what a region without any lacks. The falsifier's vectors are those of the changed place if
+    `falsifier_sees_change`, else of the plain one, at every site; so they do not show which of the two is seen.
     """
 
-    change_of: ChangeOf | None
-    find: Callable[[Scene], NDArray[np.float64] | None]
-    needs: str
+    change_of: ChangeOf | None = None
+    find: Callable[[Scene], NDArray[np.float64]] | None = None
+    needs: str = ""
     copies: int = 1
     is_swapped: bool = True
     falsifier_sees_change: bool = False
 
     def lack(self, scene: Scene) -> str | None:
-        """Places of the right kind are needed."""
-        places = self.find(scene)
+        """Refuse a region without places of the right kind."""
+        places = self.anchors(scene)
         return None if places is None or len(places) else self.needs
 
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
-        """Near what the suite is about."""
-        return self.find(scene)
+        """Return the places that `find` finds."""
+        return None if self.find is None else self.find(scene)
 
     def radius_m(self, scene: Scene) -> float:
-        """Of the discs that are copied: all that a view may show, wherever the disc's middle lies."""
+        """Return the radius of copied discs, which hold all that a view may show at any offset."""
         return scene.view_reach_m + OFF_M
 
     def spacing_m(self, scene: Scene) -> float:
-        """So that what is copied from one site is not pasted over for another."""
+        """Return a distance at which no copy overwrites the source of another."""
         return 2 * self.clear_m(scene)
 
     def clear_m(self, scene: Scene) -> float:
-        """All that is copied: what is unknown at the site and known at its twin would tell them apart."""
+        """Return the reach of the copied disc: an unknown cell of the site would distinguish it from its twin."""
         return self.radius_m(scene) + OFF_M
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
-        """Find a place for every twin, say what is copied where, and by lot which of them is the true place."""
+        """Find places for the twins, plan the copies, and draw the true place of each site."""
         clear_m = self.clear_m(scene)
-        apart_m = max(least_apart_m(self.main_side_m / 2), 2 * clear_m)
-        targets = find_targets(scene.map, sites, clear_m=clear_m, apart_m=apart_m, copies=self.copies, seeds=seeds)
+        spacing_m = max(min_distance_m(self.main_side_m / 2), 2 * clear_m)
+        targets = find_targets(scene.map, sites, clear_m=clear_m, spacing_m=spacing_m, copies=self.copies, seeds=seeds)
         pastes: list[Paste] = []
         moved: list[Site] = []
         twins: dict[int, Places] = {}
@@ -104,10 +90,10 @@ class TwinSuite(Suite):
     def _pastes(
         self, scene: Scene, site: Site, targets: Places, change: Change | None, seeds: Seeds
     ) -> Iterator[Paste]:
-        """The copies of one site; where the site is the changed one, itself as well."""
+        """Yield the copies of one site, and the site itself if it is the changed one."""
         turn, share = seeds.rng("off", *_key(site)).random(2)
         off_m = OFF_M * np.sqrt(share) * np.array([np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)])
-        source = np.array([site.pose.easting_m, site.pose.northing_m]) + off_m
+        source = np.array(site.en_m) + off_m
         is_changed = self.is_swapped and site.index % 2 == 1
         plain = Paste(source_m=_place(source), target_m=_place(source), radius_m=self.radius_m(scene))
         if is_changed:
@@ -115,30 +101,25 @@ class TwinSuite(Suite):
         for target in targets:
             yield replace(plain, target_m=_place(np.array(target) + off_m), change=None if is_changed else change)
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """See the true place; the control has no vectors, the falsifier's do not tell the two places apart."""
-        seen = self.see(scene, site, variant, seeds)
-        if variant.role == "control":
+    def draw(self, shot: Shot) -> Draft:
+        """See the true place; the control has no vectors, the falsifier's do not distinguish the two places."""
+        seen, role = self.see(shot), shot.variant.role
+        if role == "control":
             return Draft(evidence=seen)
-        vectors = perceive_vectors(
-            scene.world,
-            site.pose if variant.role == "stress" else self._told_nothing(scene, site),
-            side_m=variant.side_m,
-            noise=VectorNoise(),
-            rng=seeds.rng("vectors", variant.view_cells),
-        )
-        return Draft(evidence=seen, vectors=vectors)
+        pose = shot.site.pose if role == "stress" else self._uninformative_pose(shot)
+        return Draft(evidence=seen, vectors=site_vectors(shot, pose))
 
-    def see(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Evidence:
+    def see(self, shot: Shot) -> Evidence:
         """Perceive the layers at the true place."""
-        return perceived(scene.world, site, variant, seeds)
+        return shot.perceived()
 
-    def _told_nothing(self, scene: Scene, site: Site) -> Pose:
-        """The site where it is the place that the falsifier's vectors are of, else its twin."""
+    def _uninformative_pose(self, shot: Shot) -> Pose:
+        """Return where the falsifier's vectors are taken: at the site or at its twin."""
+        site = shot.site
         is_changed = (self.is_swapped and site.index % 2 == 1) != site.is_copy
         if is_changed == self.falsifier_sees_change:
             return site.pose
-        easting_m, northing_m = scene.twins[site.index][0]
+        easting_m, northing_m = shot.scene.twins[site.index][0]
         return replace(site.pose, easting_m=easting_m, northing_m=northing_m)
 
 
@@ -151,25 +132,24 @@ def _place(point: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _by_lot(scene: Scene, site: Site, targets: Places, seeds: Seeds) -> tuple[Site, Places]:
-    """The true place and its twins, the original first: the site itself, or any of its copies in a block."""
+    """Draw the true place from the site and its copies in blocks; return it and its twins, the original first."""
     blocks = {target: block for target in targets for block in scene.blocks if block.holds(target)}
     lot = int(seeds.rng("lot", *_key(site)).integers(1 + len(blocks)))
     if lot == 0:
         return site, targets
     true = list(blocks)[lot - 1]
     pose = replace(site.pose, easting_m=true[0], northing_m=true[1])
-    original = (site.pose.easting_m, site.pose.northing_m)
     others = tuple(target for target in targets if target != true)
-    return replace(site, pose=pose, block=blocks[true].id, is_copy=True), (original, *others)
+    return replace(site, pose=pose, block=blocks[true].id, is_copy=True), (site.en_m, *others)
 
 
 def find_targets(
-    state: State, sites: Sequence[Site], *, clear_m: float, apart_m: float, copies: int, seeds: Seeds
+    state: State, sites: Sequence[Site], *, clear_m: float, spacing_m: float, copies: int, seeds: Seeds
 ) -> dict[int, Places]:
-    """Find free places for the copies of every site: mapped, clear of every site and copy, apart from their own.
+    """Find free places for the copies of every site: mapped, clear of every site and copy, well away from their own.
 
-    Sites are served in turn; one that does not get all its copies gets none and is left out. A copy lies a whole number
-    of cells from its site: moved by a part of one, its mask would differ at every edge, and tell it from the place.
+    Sites take turns; one without room for all its copies is dropped. The offset of a copy is a whole number of cells:
+    at a fraction of a cell its mask would differ at every edge, which would give it away.
     """
     cell_m = state.grid.cell_size_m
     step = max(1, round(LATTICE_M / cell_m))
@@ -177,20 +157,20 @@ def find_targets(
     deep = ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > clear_m / LATTICE_M + 1
     free = state.grid.to_centres_m(np.argwhere(deep) * step)
     for site in sites:
-        free = free[np.hypot(*(free - (site.pose.easting_m, site.pose.northing_m)).T) > 2 * clear_m + cell_m]
+        free = free[np.hypot(*(free - site.en_m).T) > 2 * clear_m + cell_m]
     found: dict[int, Places] = {}
     for site in sites:
         rng = seeds.rng("target", *_key(site))
-        own = np.array([site.pose.easting_m, site.pose.northing_m])
+        own = np.array(site.en_m)
         taken: list[NDArray[np.float64]] = []
         left = free
         while len(taken) < copies:
-            far = left[np.hypot(*(left - own).T) > apart_m + cell_m]
+            far = left[np.hypot(*(left - own).T) > spacing_m + cell_m]
             if len(far) == 0:
                 break
             picked = own + np.rint((far[rng.integers(len(far))] - own) / cell_m) * cell_m
             taken.append(picked)
-            left = left[np.hypot(*(left - picked).T) > apart_m + 2 * cell_m]
+            left = left[np.hypot(*(left - picked).T) > spacing_m + 2 * cell_m]
         if len(taken) == copies:
             free = left
             found[site.index] = tuple(_place(point) for point in taken)
@@ -198,11 +178,18 @@ def find_targets(
 
 
 def nodes_of(scene: Scene, kinds: Sequence[str], *, least_degree: int = 0) -> gpd.GeoDataFrame:
-    """Nodes of the map's graph of some kinds."""
+    """Return nodes of the map's graph of some kinds."""
     nodes = scene.map.graph.nodes
     return nodes[nodes["kind"].isin(list(kinds)).to_numpy() & (nodes["degree"].to_numpy() >= least_degree)]
 
 
 def places_of(nodes: gpd.GeoDataFrame) -> NDArray[np.float64]:
-    """Easting and northing of nodes, shape (N, 2)."""
+    """Return easting and northing of nodes, shape (N, 2)."""
     return np.asarray(shapely.get_coordinates(nodes.geometry.to_numpy())).reshape(-1, 2)
+
+
+def with_neighbours(places: NDArray[np.float64], *, within_m: float) -> NDArray[np.float64]:
+    """Return the places, shape (N, 2), that have another one within a distance."""
+    points = shapely.points(places)
+    hits = shapely.STRtree(points).query(points, predicate="dwithin", distance=within_m)[0]
+    return np.asarray(places[np.bincount(hits, minlength=len(places)) > 1])

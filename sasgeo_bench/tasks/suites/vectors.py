@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A detector of vectors: lines and outlines as a view shows them, with errors of its own."""
+"""A detector of vectors: lines and outlines of a view, with their own errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.suites.base import Shot, State
 from sasgeo_bench.tasks.vectors import vector_table
 
 VECTOR_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway")
@@ -25,14 +25,8 @@ _WAVELENGTHS_M: Final = (60.0, 150.0)
 class VectorNoise:
     """Errors of perceived vectors.
 
-    Parameters
-    ----------
-    missed_share : float
-        Share of objects not seen at all.
-    gap_share, gap_m : float
-        Share of lines with a gap, and its length.
-    shift_m : float
-        Root mean square of a smooth shift of all coordinates, each axis; what meets goes on meeting.
+    Fractions of missed objects and of lines with a gap of `gap_m`; root mean square `shift_m` of a smooth shift of all
+    coordinates, each axis, which keeps junctions.
     """
 
     missed_share: float = 0.10
@@ -44,25 +38,10 @@ class VectorNoise:
 def perceive_vectors(
     state: State, pose: Pose, *, side_m: float, noise: VectorNoise, rng: np.random.Generator
 ) -> gpd.GeoDataFrame:
-    """Vectors of the visible features in a view, in the view's frame.
+    """Return the vectors of the visible features in a view of a state.
 
-    Parameters
-    ----------
-    state : State
-        The world.
-    pose : Pose
-        Of the view.
-    side_m : float
-        Its side for scale 1.
-    noise : VectorNoise
-        The detector's errors.
-    rng : numpy.random.Generator
-        Their chance.
-
-    Returns
-    -------
-    geopandas.GeoDataFrame
-        Columns `class`, `level`, `is_bridge` and `geometry`: (right, up) from the middle of the view, metres.
+    Columns are `class`, `level`, `is_bridge` and `geometry`: (right, up) from the middle of the view, metres. `side_m`
+    is the side of the view for scale 1.
     """
     outline = footprint(pose, size_m=(side_m, side_m))
     features = state.features
@@ -84,8 +63,19 @@ def perceive_vectors(
     return vector_table(rows)
 
 
+def site_vectors(shot: Shot, pose: Pose | None = None) -> gpd.GeoDataFrame:
+    """Perceive the vectors of a shot, at its site unless another pose is given."""
+    return perceive_vectors(
+        shot.scene.world,
+        pose or shot.site.pose,
+        side_m=shot.variant.side_m,
+        noise=VectorNoise(),
+        rng=shot.rng("vectors"),
+    )
+
+
 def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Draw a smooth field of shifts: points of shape (N, 2), metres -> shifted points. A sum of a few plane waves."""
+    """Draw a smooth field of shifts, a sum of plane waves, as a function of points of shape (N, 2), metres."""
     turns = rng.uniform(0, 2 * np.pi, _WAVES)
     waves = (
         np.column_stack((np.cos(turns), np.sin(turns))) * (2 * np.pi / rng.uniform(*_WAVELENGTHS_M, _WAVES))[:, None]
@@ -94,7 +84,7 @@ def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np
     scale_m = rms_m * np.sqrt(2 / _WAVES)
 
     def shifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points, shape (N, 2), moved by the field."""
+        """Move points by the field."""
         angle = points @ waves.T
         return np.asarray(points + scale_m * np.column_stack([np.cos(angle + phase).sum(axis=1) for phase in phases]))
 
@@ -102,13 +92,13 @@ def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np
 
 
 def round_vectors(vectors: gpd.GeoDataFrame, shapes: NDArray[np.object_]) -> gpd.GeoDataFrame:
-    """The same vectors with other shapes, rounded."""
+    """Return the same vectors with other shapes, rounded."""
     columns = (vectors[name].to_list() for name in ("class", "level", "is_bridge"))
     return vector_table(list(zip(*columns, shapes, strict=True)))
 
 
 def _parts(shape: shapely.Geometry, *, cut_m: float, place: float) -> list[shapely.Geometry]:
-    """Lines and polygons of a shape; a gap is cut into its first line."""
+    """Return lines and polygons of a shape; cut a gap into its first line."""
     parts = [
         part for part in shapely.get_parts(shapely.get_parts(shape)) if part.geom_type in ("LineString", "Polygon")
     ]

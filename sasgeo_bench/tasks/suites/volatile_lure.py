@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Site, SuiteCard, Variant, changed_share, perceived
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite
 from sasgeo_bench.tasks.twin import mirror
 
@@ -15,17 +15,17 @@ STABLE: Final = ("road_major", "road_minor", "path_track", "railway", "water", "
 
 
 class VolatileLure(TwinSuite):
-    """The world is the map with its volatile classes mirrored at each site; a lure has both kinds mirrored.
+    """The world is the map with its volatile classes mirrored at each site; in a lure all classes are mirrored.
 
-    So the view agrees with the true place on all that is stable and on nothing volatile, and with the lure the other
-    way round; amounts are the same at both.
+    So the view agrees with the true place on all stable classes and no volatile one, and with the lure the other way
+    round; amounts are the same at both.
     """
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
         """Paste the lures into the map, and change the world at the true places.
 
-        Where the lure is the true place, by lot, the original lures: the world has the lure's roads, and all else as at
-        the original.
+        If the lure is the true place, by lot, the original is the lure: the world then has the lure's roads, and
+        everything else as at the original.
         """
         plain = super().edit(scene, sites, seeds)
         lures = [
@@ -40,15 +40,12 @@ class VolatileLure(TwinSuite):
             world.append(replace(item, target_m=target_m, change=change))
         return replace(plain, map_pastes=tuple(lures), world_pastes=tuple(world))
 
-    def draw(self, scene: Scene, site: Site, variant: Variant, seeds: Seeds) -> Draft:
-        """The control and the falsifier see the map as it is, the stress the changed world."""
-        if variant.role != "stress":
-            return Draft(evidence=perceived(scene.map, site, variant, seeds), changed_share=0.0)
-        seen = perceived(scene.world, site, variant, seeds)
-        cells, cell_m = variant.view_cells, variant.cell_size_m
-        views = (state.view(site.pose, size_cells=cells, cell_size_m=cell_m) for state in (scene.world, scene.map))
-        share = changed_share(*views)
-        return Draft(evidence=seen, changed_share=share, measured={"changed_share": share})
+    def draw(self, shot: Shot) -> Draft:
+        """Perceive the changed world for the stress, and the map for control and falsifier."""
+        mapped = shot.clean(shot.scene.map)
+        if shot.variant.role != "stress":
+            return Draft(evidence=shot.perceived(mapped), changed_share=0.0)
+        return Draft.of_change(shot.perceived(), shot.clean(), mapped)
 
 
 SUITE: Final = VolatileLure(
@@ -65,13 +62,6 @@ SUITE: Final = VolatileLure(
         group=TWIN_GROUP,
         min_density=0.04,
     ),
-    variants=(
-        Variant(role="control", kind="unchanged"),
-        Variant(role="stress", kind="S2", strength=1.0),
-        Variant(role="falsifier", kind="unchanged again"),
-    ),
-    change_of=None,
-    find=lambda scene: None,  # noqa: ARG005
-    needs="",
+    variants=pair("unchanged", "S2", "unchanged again"),
     is_swapped=False,
 )

@@ -8,15 +8,14 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates, Rates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to
 from sasgeo_bench.tasks.perturbations.resample import shifted
 from sasgeo_bench.tasks.perturbations.season import Season
 
 
-def rates(vanish=0.0, appear=0.0, places=("elsewhere",), names=("building",)):
-    rows = [{"class": name, "vanish_per_year": vanish, "appear_per_year": appear} for name in names]
-    return AgeingRates.from_rows(rows, places=places)
+def rates(vanish=0.0, appear=0.0, names=("building",)):
+    return dict.fromkeys(names, Rates(vanish_per_year=vanish, appear_per_year=appear))
 
 
 def houses(per_side=8, size=192, **others):
@@ -110,29 +109,16 @@ def test_what_is_redrawn_stays_near_and_whole():
 
 def test_a_place_is_never_aged_by_its_own_rates():
     with pytest.raises(PerturbError, match="the rates come from 'vaduz' itself, take those of other places"):
-        Ageing(years=5, rates=rates(places=("triesen", "vaduz")), place="vaduz")
+        Ageing(years=5, rates=rates(), place="vaduz", measured_in=("triesen", "vaduz"))
 
 
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        ({"class": "building", "vanish_per_year": 0.1}, "lacks appear_per_year"),
-        ({"class": "building", "vanish_per_year": -1.0, "appear_per_year": 0.0}, "vanish_per_year lies between"),
-    ],
-)
-def test_rates_that_are_none_are_refused(row, words):
-    with pytest.raises(PerturbError, match=words):
-        AgeingRates.from_rows([row], places=["a"])
-
-
-def test_a_class_named_twice_is_refused():
-    row = {"class": "building", "vanish_per_year": 0.1, "appear_per_year": 0.1}
-    with pytest.raises(PerturbError, match="a second time"):
-        AgeingRates.from_rows([row, row], places=["a"])
+def test_rates_that_are_none_are_refused():
+    with pytest.raises(PerturbError, match="vanish_per_year lies between"):
+        rates(vanish=-1.0)
 
 
 def test_the_rates_set_by_hand_are_those_of_the_taxonomy():
-    assert AgeingRates.set_by_hand().classes["building"] == Rates(vanish_per_year=0.005, appear_per_year=0.02)
+    assert rates_by_hand()["building"] == Rates(vanish_per_year=0.005, appear_per_year=0.02)
 
 
 @given(rows=st.integers(-12, 12), cols=st.integers(-12, 12))

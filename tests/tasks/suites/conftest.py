@@ -16,10 +16,10 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, AgeingRates
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.split import blocks_of
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Site, State, Suite, Variant
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite, Variant
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
 
@@ -62,7 +62,8 @@ class Carried:
 
     def draw(self, site: Site, variant: Variant) -> Draft:
         """One draft, as `draw.Drawer` asks for it."""
-        return self.suite.draw(self.scene, site, variant, self.seeds.under("site", site.index))
+        seeds = self.seeds.under("site", site.index)
+        return self.suite.draw(Shot(scene=self.scene, site=site, variant=variant, seeds=seeds))
 
     def control(self, variant: Variant) -> Variant:
         """The control whose view has the same size."""
@@ -117,7 +118,7 @@ def scene(town) -> Callable[..., Scene]:
             scenes=town(name).manifest.scenes,
             others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if name in DATED else (),
             elsewhere=State.of(town("town-riverside")),
-            ageing=Ageing(years=0.0, rates=AgeingRates.set_by_hand(), place="here", redrawn=0.2),
+            ageing=Ageing(years=0.0, rates=rates_by_hand(), place="here", redrawn=0.2),
         )
 
     return of_town

@@ -13,7 +13,7 @@ from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, PriorGroup
 from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, UNANSWERABLE, Drawer, away, make_prior
 from sasgeo_bench.tasks.split import SplitFile, make_split
-from sasgeo_bench.tasks.suites.mining import STRIDE_M, least_apart_m
+from sasgeo_bench.tasks.suites.mining import STRIDE_M, min_distance_m
 
 SITES = 3
 PLACES = ("here", "there", "beyond", "away")
@@ -122,7 +122,7 @@ def test_the_truth_is_no_lonelier_than_any_other_candidate(drawn, name):
         apart_m[np.eye(len(apart_m), dtype=bool)] = np.inf
         least_m = apart_m.min(axis=1)
         # Both ends are jittered by half a stride at most, either way.
-        assert least_m.min() >= least_apart_m(96.0) - np.sqrt(2) * STRIDE_M - 0.1
+        assert least_m.min() >= min_distance_m(96.0) - np.sqrt(2) * STRIDE_M - 0.1
         if truth.candidate >= 0:
             loneliest.append((int(np.argmax(least_m)) == truth.candidate) - 1 / len(least_m))
     assert loneliest

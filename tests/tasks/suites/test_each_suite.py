@@ -13,7 +13,7 @@ from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES
 from sasgeo_bench.tasks.suites.local_warp import bent
-from sasgeo_bench.tasks.suites.mining import least_apart_m
+from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.stable_not_distinctive import straight_places
 
@@ -255,7 +255,7 @@ def test_aliases_of_a_straight_line_run_the_same_way_far_from_it_and_from_each_o
         assert 1 <= len(twins) <= 8
         both = np.vstack((here, twins))
         apart_m = np.hypot(*(both[:, None] - both[None]).transpose(2, 0, 1))
-        assert apart_m[~np.eye(len(both), dtype=bool)].min() >= least_apart_m(96.0)
+        assert apart_m[~np.eye(len(both), dtype=bool)].min() >= min_distance_m(96.0)
         bearings = [lines[int(np.argmin(np.hypot(*(lines[:, :2] - at).T))), 2] for at in both]
         off_deg = np.abs((np.array(bearings) - bearings[0] + 90) % 180 - 90)
         assert off_deg.max() <= 12

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.tasks.suites.mining import SCORERS, STRIDE_M, candidates, describe, least_apart_m, mine
+from sasgeo_bench.tasks.suites.mining import SCORERS, STRIDE_M, candidates, describe, min_distance_m, mine
 from sasgeo_bench.tasks.twin import Paste, paste
 
 SIDE_M = 192.0
@@ -31,7 +31,7 @@ def centres(scene, count=12, where="town-suburb"):
 
 
 def test_no_decoy_is_near_the_truth_nor_two_of_them_near_each_other(scene, wide):
-    least_m = least_apart_m(SIDE_M / 2)
+    least_m = min_distance_m(SIDE_M / 2)
     for center_m in centres(scene, where="town-old-town large"):
         points = mine(wide, center_m, count=200).points_m
         assert len(points) >= 8
@@ -46,11 +46,11 @@ def test_as_many_decoys_are_taken_as_fit(scene, wide):
         points = mine(wide, center_m, count=200).points_m
         both = np.vstack(([center_m], points))
         apart_m = np.hypot(*(wide.points_m[:, None] - both[None]).transpose(2, 0, 1)).min(axis=1)
-        assert apart_m.max() < least_apart_m(SIDE_M / 2)
+        assert apart_m.max() < min_distance_m(SIDE_M / 2)
 
 
 def test_footprints_of_truth_and_decoy_never_meet():
-    assert least_apart_m(96.0) > 2 * 96.0 * np.sqrt(2)
+    assert min_distance_m(96.0) > 2 * 96.0 * np.sqrt(2)
 
 
 def test_all_four_scorers_contribute_in_turn(scene, wide):

@@ -9,8 +9,8 @@ import shapely
 
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.tasks.suites.base import Seeds, changed_share
-from sasgeo_bench.tasks.suites.mining import least_apart_m
+from sasgeo_bench.tasks.suites.base import Seeds, Shot, changed_share
+from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.topology_twins import either
 from sasgeo_bench.tasks.suites.twins import OFF_M, find_targets
@@ -82,7 +82,7 @@ def test_copies_lie_on_mapped_ground_off_every_site_and_far_from_their_own(carri
     for site in made.sites:
         own = np.array([(site.pose.easting_m, site.pose.northing_m), *made.scene.twins[site.index]])
         apart_m = np.hypot(*(own[:, None] - own[None]).transpose(2, 0, 1))
-        assert apart_m[~np.eye(len(own), dtype=bool)].min() >= least_apart_m(96.0)
+        assert apart_m[~np.eye(len(own), dtype=bool)].min() >= min_distance_m(96.0)
     for site, pose in pairs(made):
         for at in (site.pose, pose):
             assert not (view(made.plain.map, at).cells == UNKNOWN).any()
@@ -313,9 +313,10 @@ def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_i
     for site, pose in pairs(made):
         plain_at, changed_at = (pose, site.pose) if is_changed(site) else (site.pose, pose)
         wanted = changed_at if made.suite.falsifier_sees_change else plain_at
-        told = made.suite._told_nothing(made.scene, site)
-        assert (told.easting_m, told.northing_m) == (wanted.easting_m, wanted.northing_m)
-        assert told.yaw_deg == site.pose.yaw_deg
+        shot = Shot(scene=made.scene, site=site, variant=made.suite.variants[0], seeds=made.seeds)
+        taken = made.suite._uninformative_pose(shot)
+        assert (taken.easting_m, taken.northing_m) == (wanted.easting_m, wanted.northing_m)
+        assert taken.yaw_deg == site.pose.yaw_deg
 
 
 def test_vectors_of_the_instance_falsifier_follow_from_the_mask(carried):
@@ -398,8 +399,8 @@ def test_sites_without_room_for_their_copies_are_left_out(scene, carried):
     suite, town = carried("alias").suite, scene("town-suburb")
     seeds = Seeds(root=1, names=())
     sites = choose_sites(town, suite, count=99, seeds=seeds, group=suite.card.group, may_be_fewer=True)
-    clear_m, apart_m = suite.clear_m(town), least_apart_m(96.0)
-    found = find_targets(town.map, sites, clear_m=clear_m, apart_m=apart_m, copies=1, seeds=seeds)
+    clear_m, apart_m = suite.clear_m(town), min_distance_m(96.0)
+    found = find_targets(town.map, sites, clear_m=clear_m, spacing_m=apart_m, copies=1, seeds=seeds)
     assert len(found) < len(sites)
     assert {len(targets) for targets in found.values()} <= {1}
     edit = replace(suite, copies=1).edit(town, sites, seeds)

@@ -26,7 +26,7 @@ from sasgeo_bench.tasks.task_rows import pairs_from, query_from
 
 MOST_MAPS: Final = 2  # in memory while a matcher learns, as long as it keeps none itself
 # What of this package answers are made with: a change there may change them, so they are asked for anew.
-TOOLS: Final = ("regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
+TOOLS: Final = ("matching.controls", "regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 

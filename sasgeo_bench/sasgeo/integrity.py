@@ -170,7 +170,7 @@ class Modes:
     @cached_property
     def masses(self) -> NDArray[np.float64]:
         """Posterior probability of each mode and, last, of none, shape (M + 1,)."""
-        return posterior(self.scores.tolist(), temper=1.0, null_score=self.none_nats)
+        return posterior(self.scores.tolist(), null_score=self.none_nats)
 
     @cached_property
     def shares(self) -> NDArray[np.float64]:

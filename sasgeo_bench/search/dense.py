@@ -20,6 +20,7 @@ from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.search.field import Level, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Mode, Null
 from sasgeo_bench.search.space import Tile, Turns
+from sasgeo_bench.search.votes import correlated, map_spectrum
 
 _SPARE: Final = 4  # times as many peaks of one heading as modes are wanted, for neighbours are dropped
 _LOW: Final = np.float32(-1e30)  # a place that is not allowed
@@ -95,7 +96,7 @@ class _Votes:
         spectra = []
         for window in windows:
             turned = (np.rot90(window[used], quarter, (1, 2)) for quarter in range(turns.quarters))
-            spectra.append(tuple(np.conj(fft.rfft2(each, s=(size, size))) for each in turned))
+            spectra.append(tuple(map_spectrum(each, (size, size)) for each in turned))
         ratio = step_m / template.cell_size_m
         bands, frame = pooled(template, level, max(1, round(ratio / _BLUR)))
         bands = bands[used]  # what the map holds nowhere here adds nothing
@@ -110,10 +111,7 @@ class _Votes:
         spectrum = fft.rfft2(self._laid(base), s=(self.size, self.size))
         for at, (windows, (rows, cols)) in enumerate(zip(self.spectra, self.shapes, strict=True)):
             for quarter, window in enumerate(windows):
-                total = window[0] * spectrum[0]
-                for layer, band in zip(window[1:], spectrum[1:], strict=True):
-                    total += layer * band  # one by one they stay in the cache
-                score = fft.irfft2(np.conj(total, out=total), s=(self.size, self.size))
+                score = correlated(window, spectrum, (self.size, self.size))
                 valid = score[:rows, :cols] if quarter % 2 == 0 else score[:cols, :rows]
                 turn = replace(base, yaw_deg=base.yaw_deg + 90 * quarter)
                 yield at, turn, np.ascontiguousarray(np.rot90(valid, -quarter))

@@ -16,7 +16,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.search.dense import dense
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.local_refinement import Guess, Sight, Stride, climbed, polished
-from sasgeo_bench.search.plan import Found, Mode, Null, Plan
+from sasgeo_bench.search.plan import Found, Mode, Null, Plan, place_m, thinned
 from sasgeo_bench.search.space import NO_PLACE, Disc, Tile, Turns, all_around, tiles_of, turns_of
 
 _NOTHING: Final = 1e-9
@@ -138,7 +138,7 @@ class _Search:
         followed = self._followed(guesses, [disc])
         near = disc.wider(_CORNER * self.field.grid.cell_size_m)  # those left behind had the leeway of larger cells
         inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
-        return Found(modes=tuple(_thinned(inside, self.plan.apart_m)[:count]), null=null)
+        return Found(modes=tuple(thinned(inside, self.plan.apart_m)[:count]), null=null)
 
     def _proposed(self, starts: Sequence[Pose]) -> list[Guess]:
         """Score poses that are given on the coarsest level."""
@@ -207,11 +207,6 @@ class _Search:
         return kept
 
 
-def place_m(pose: Pose) -> tuple[float, float]:
-    """Easting and northing of a pose."""
-    return (pose.easting_m, pose.northing_m)
-
-
 def _ranked(guesses: Iterable[Guess]) -> list[Guess]:
     """Best first; equals keep their order. Those that left their disc are gone."""
     return sorted((guess for guess in guesses if math.isfinite(guess.mode.score)), key=lambda guess: -guess.mode.score)
@@ -224,7 +219,8 @@ def _merged(guesses: Sequence[Guess], apart_m: float, apart_deg: float) -> list[
         pose, owner = guess.mode.pose, guess.owner
         others = (other.mode.pose for other in kept if other.owner == owner)
         if not any(
-            _distance_m(pose, other) <= apart_m and abs(wrap_deg(pose.yaw_deg - other.yaw_deg)) <= apart_deg
+            math.dist(place_m(pose), place_m(other)) <= apart_m
+            and abs(wrap_deg(pose.yaw_deg - other.yaw_deg)) <= apart_deg
             for other in others
         ):
             kept.append(guess)
@@ -237,16 +233,3 @@ def _below(kept: Sequence[Guess], rest: Sequence[Guess]) -> list[Guess]:
         return []
     down = min(guess.mode.score for guess in kept) - rest[0].mode.score
     return [replace(guess, mode=replace(guess.mode, score=guess.mode.score + down)) for guess in rest[1:]]
-
-
-def _thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
-    """Without those nearer to a better one than a distance."""
-    kept: list[Mode] = []
-    for mode in modes:
-        if all(_distance_m(mode.pose, other.pose) >= apart_m for other in kept):
-            kept.append(mode)
-    return kept
-
-
-def _distance_m(one: Pose, other: Pose) -> float:
-    return math.dist(place_m(one), place_m(other))

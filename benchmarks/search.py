@@ -49,7 +49,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.find import exhaustive, score_at, search
@@ -97,7 +97,7 @@ def region_of(name: str, date: dt.date | None, given: argparse.Namespace) -> Reg
 
 def read(region: Region) -> Reader:
     """A map as the scorer reads it; the graph is no part of the search."""
-    return Reader.of(region, Learnt.by_hand(region.classes), Switches(has_graph=False))
+    return Reader.of(region, ScorerModel.by_hand(region.classes), Switches(has_graph=False))
 
 
 def resized(field: Field, side: int) -> Field:
@@ -153,7 +153,7 @@ class Look:
             prior=ANYWHERE,
             prior_group="",
         )
-        return self.reader.glance(query).template
+        return self.reader.read(query).template
 
     def templates(self, ground: Grid, count: int) -> list[tuple[Pose, Template]]:
         """Some of them; the same places for one size, whatever is made of them."""

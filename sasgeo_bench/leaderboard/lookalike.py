@@ -17,8 +17,9 @@ from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import rarity_map, weight_map, worth_of
-from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.reading import Glance, Reader
+from sasgeo_bench.sasgeo.learnt import ScorerModel as Learnt
+from sasgeo_bench.sasgeo.reading import Reader
+from sasgeo_bench.sasgeo.reading import Reading as Glance
 from sasgeo_bench.sasgeo.weight_plot import top_of
 from sasgeo_bench.search.find import rank
 from sasgeo_bench.tasks.query import Query
@@ -169,7 +170,7 @@ def find_lookalike(mapped: Region, world: Region, learnt: Learnt, arm: Switches,
         prior_group="rnone-unknown-s0",
         candidates=tuple(places),
     )
-    glance = Reader.of(mapped, learnt, arm).glance(query)
+    glance = Reader.of(mapped, learnt, arm).read(query)
     poses = best_poses(glance)
     views = tuple(on_map.view(pose, size_cells=size, cell_size_m=cell_m) for pose in poses)
     return Lookalike(
@@ -204,7 +205,7 @@ def best_poses(glance: Glance) -> tuple[Pose, ...]:
 
 def _scores(glance: Glance, poses: tuple[Pose, ...], views: tuple[Evidence, ...]) -> pd.DataFrame:
     classes = glance.reader.region.classes
-    by_class = glance.by_class(poses) * glance.reader.learnt.temper
+    by_class = glance.by_class(poses) * glance.reader.learnt.scaling
     columns = {"share view": _shares(glance.query.evidence)}
     columns |= {f"share {name}": _shares(view) for name, view in zip(NAMES, views, strict=True)}
     columns |= {f"score {name}": row for name, row in zip(NAMES, by_class, strict=True)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arms of the experiment as plugins: a card for each setting of the switches."""
+"""Ablations of the scorer as plugins: a card for each setting of the switches."""
 
 from typing import Final
 
@@ -45,7 +45,7 @@ def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -
 
 
 class SasgeoRaster(SasgeoMatcher):
-    """Raster alone, all classes alike."""
+    """Raster alone, uniform weights."""
 
     card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _BLIND)
     switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
@@ -61,7 +61,7 @@ class SasgeoGraph(SasgeoMatcher):
 
 
 class SasgeoStability(LearningMatcher):
-    """Raster and graph, classes weighed by what lasts."""
+    """Raster and graph, classes weighed by stability."""
 
     card = _card(
         "sasgeo_stability",
@@ -121,7 +121,7 @@ class SasgeoDistinct(LearningMatcher):
 
 
 class SasgeoAgeless(LearningMatcher):
-    """The whole scorer, which takes every map for one of today."""
+    """The whole scorer without the age of the map."""
 
     card = _card(
         "sasgeo_ageless",
@@ -137,7 +137,7 @@ class SasgeoAgeless(LearningMatcher):
 
 
 class SasgeoStamped(LearningMatcher):
-    """The whole scorer with each feature by its own age."""
+    """The whole scorer with edit ages of features."""
 
     card = _card(
         "sasgeo_stamped",
@@ -153,7 +153,7 @@ class SasgeoStamped(LearningMatcher):
 
 
 class OracleSasgeo(LearningMatcher):
-    """The whole scorer, learning from what it is asked: what rates known in advance would be worth."""
+    """The whole scorer, trained on the places that it is asked: an upper bound for training."""
 
     card = _card(
         "oracle_sasgeo",
@@ -169,7 +169,7 @@ class OracleSasgeo(LearningMatcher):
 
 
 class SasgeoNoGraph(LearningMatcher):
-    """The whole scorer but its graph."""
+    """The whole scorer without graph."""
 
     card = _card(
         "sasgeo_no_graph",

@@ -292,8 +292,8 @@ def test_peaks_beside_a_better_one_are_dropped():
         beside = np.maximum(abs(row[chosen] - row[at]), abs(col[chosen] - col[at])) <= 1
         if not (turned & beside).any():
             chosen.append(at)
-    assert peaks.apart(500, turns) == chosen
-    assert peaks.apart(7, turns) == chosen[:7]
+    assert peaks.separate(500, turns) == chosen
+    assert peaks.separate(7, turns) == chosen[:7]
 
 
 def test_a_posterior_sums_to_one_and_grows_with_the_score():

@@ -67,28 +67,6 @@ def proposals(
     ------
     ConfigError
         If the scales are not positive, finite and in order.
-
-    Examples
-    --------
-    Three streets of a map, seen with another heading and from elsewhere:
-
-    >>> import shapely
-    >>> from sasgeo_bench.regions.evidence import Evidence
-    >>> from sasgeo_bench.regions.graph import build_graph
-    >>> from sasgeo_bench.geometry.grid import Grid
-    >>> from sasgeo_bench.geometry.pose import inverse
-    >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
-    >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
-    >>> lines = shapely.from_wkt(ways)
-    >>> grid = Grid(epsg=32632, west_m=-96.0, north_m=96.0, cell_size_m=2.0, rows=96, cols=96)
-    >>> features = as_features(vector_table([("road_minor", 0, False, line) for line in lines]))
-    >>> known = np.ones(grid.shape, dtype=bool)
-    >>> mapped = MappedGraph.make(build_graph(features), features, known=known, grid=grid)
-    >>> local = shapely.transform(lines, inverse(Pose(easting_m=5.0, northing_m=7.0, yaw_deg=50.0)).to_map)
-    >>> view = Evidence(classes=("road_minor",), cells=np.zeros((1, 96, 96), dtype=np.uint8), cell_size_m=2.0)
-    >>> seen = ObservedGraph.make(view, vector_table([("road_minor", 0, False, line) for line in local]))
-    >>> round(proposals(seen, mapped, count=1)[0].pose.yaw_deg)
-    50
     """
     if not 0 < scales[0] <= scales[1] < math.inf:
         message = f"scales are the least and the greatest scale, both positive and finite, got {scales!r}"

@@ -84,39 +84,14 @@ def rank(
 
 
 def exhaustive(field: Field, template: Template, *, yaw_step_deg: float, threads: int = 1) -> Mode:
-    """Return the best mode over all cells and headings on the map's own cells: a slow reference.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sasgeo_bench.search.field import FULL
-    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=8.0, cell_size_m=1.0, rows=8, cols=8)
-    >>> dot = np.zeros((1, 8, 8), np.uint8)
-    >>> dot[0, 2, 5] = FULL
-    >>> field = Field(grid=grid, layers=dot, known=np.full((8, 8), FULL, np.uint8))
-    >>> view = Template(weights=np.ones((1, 1, 1), np.float32), known=np.zeros((1, 1), np.float32), cell_size_m=1.0)
-    >>> best = exhaustive(field, view, yaw_step_deg=90.0).pose
-    >>> best.easting_m, best.northing_m
-    (5.5, 5.5)
-    """
+    """Return the best mode over all cells and headings on the map's own cells: a slow reference."""
     tiles = tiles_of(field.grid, field.grid, Disc(center_m=None, radius_m=0.0))
     found, _ = dense(field.level(1), template, tiles, all_around(yaw_step_deg), most=1, threads=threads)
     return max((mode for modes in found for mode in modes), key=lambda mode: mode.score)
 
 
 def score_at(field: Field, template: Template, pose: Pose) -> float:
-    """Return the score of one pose on the map's own cells, as `Template` defines it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sasgeo_bench.search.field import FULL
-    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4.0, cell_size_m=1.0, rows=4, cols=4)
-    >>> full = Field(grid=grid, layers=np.full((1, 4, 4), FULL, np.uint8), known=np.full((4, 4), FULL, np.uint8))
-    >>> seen = Template(weights=np.ones((1, 2, 2), np.float32), known=np.zeros((2, 2), np.float32), cell_size_m=1.0)
-    >>> score_at(full, seen, Pose(easting_m=2.0, northing_m=2.0, yaw_deg=0.0))
-    4.0
-    """
+    """Return the score of one pose on the map's own cells, as `Template` defines it."""
     return LevelView.of(field, template, 1).score(pose)
 
 

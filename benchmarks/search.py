@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dense search: seconds and memory of a fix, the exhaustive search beside it, and whether both find one place.
+"""Measure the dense search: time and memory of a fix, and its agreement with the exhaustive search.
 
     .venv/bin/python benchmarks/search.py --out out                     # speed, against area and against views
-    .venv/bin/python benchmarks/search.py --out out --agree 100         # how often both agree; hours at full size
+    .venv/bin/python benchmarks/search.py --out out --agree 100         # agreement; hours at full size
     .venv/bin/python benchmarks/search.py --out out --agree 20 --size 1024 --view 128 --step 2     # much less
 
 Builds the region (for `--agree`, at two dates) where it is not in `--out`, from extracts in a folder that --extracts or
 SASGEO_EXTRACTS names. The map is searched as the scorer does: cells of 2 m, weights set by hand, all headings, all
 places, scale known. A view has `--view` cells a side of `--view-cell` metres, by default as large as the map's. Views
-lie where at least 3 % is drawn: `noise-free`, `perceived` with a detector's errors, and `aged`, perceived today and
-searched for on the old map.
+lie where at least 3 % of the cells hold a class: `noise-free`, `perceived` with the errors of a detector, and `aged`,
+perceived today and searched for on the old map.
 
 Speed: each row is a process of its own that holds the map, searches once to make the pyramid of the map ("first"), and
-then once a view; medians. Its memory is all that was resident at most, imports and map included (Linux). Beyond the
-region the map is mirrored. Exhaustive is every cell of the map at every step of heading, for one view.
+then once for each view; medians. Memory is the peak resident size, with imports and map (Linux). Beyond the region the
+map is mirrored. The exhaustive search scores every cell of the map at every step of heading, for one view.
 
-Agreement: within one cell in easting and in northing and one step of heading. Of the rest each line gives what the two
-places score on the map's own cells and why: `better` where the search's place, between cells, scores at least as much
-as the best one on them; `tie` where it is at most 0.5 % below; `not proposed` where it would have followed the place to
-the end had the coarsest level named it among its best; `left behind` where it would not even then. "right" is the share
-within 10 m and 10 degrees of where the view was taken; the last columns are medians of the search and the reference.
+Agreement: within one cell in easting and in northing and one step of heading. For the rest each line gives both scores
+on the map's own cells and the cause: `better` where the place of the search, between cells, scores at least as much as
+the best one on them; `tie` where it is at most 0.5 % below; `not proposed` where the search would refine the place if
+the coarsest level proposed it; `left behind` where it would drop it even then. "right" is the share within
+10 m and 10 degrees of where the view was taken; the last columns are medians of the search and the reference.
 """
 
 import argparse
@@ -49,7 +49,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.find import exhaustive, score_at, search
@@ -71,7 +71,7 @@ ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None,
 
 @dataclass(frozen=True)
 class Kind:
-    """How views are taken, and which map they are searched on."""
+    """A kind of views, and the map that they are searched on."""
 
     name: str
     is_noisy: bool
@@ -86,7 +86,7 @@ KINDS = (
 
 
 def region_of(name: str, date: dt.date | None, given: argparse.Namespace) -> Region:
-    """Read a region; build it first where it is not there."""
+    """Read a region, built first if it is missing."""
     folder = given.out / "regions" / (f"{name}@{date}" if date else name)
     if not folder.exists():
         spec = read_region_file(find_region_file(name))
@@ -96,12 +96,12 @@ def region_of(name: str, date: dt.date | None, given: argparse.Namespace) -> Reg
 
 
 def read(region: Region) -> Reader:
-    """A map as the scorer reads it; the graph is no part of the search."""
-    return Reader.of(region, Learnt.by_hand(region.classes), Switches(has_graph=False))
+    """Prepare a map as the scorer does, without graph."""
+    return Reader.of(region, ScorerModel.by_hand(region.classes), Switches(has_graph=False))
 
 
 def resized(field: Field, side: int) -> Field:
-    """The middle of a map; mirrored beyond its edges where it is smaller."""
+    """Return the middle of a map, mirrored beyond its edges."""
     top, left = (field.grid.rows - side) // 2, (field.grid.cols - side) // 2
     more = max(0, -top, -left)
     rows, cols = slice(top + more, top + more + side), slice(left + more, left + more + side)
@@ -114,7 +114,7 @@ def resized(field: Field, side: int) -> Field:
 
 
 def places(state: State, ground: Grid, side_m: float, rng: np.random.Generator) -> Iterator[Pose]:
-    """Poses anywhere on a part of the map where so much is drawn, the whole view on it, with any heading."""
+    """Yield random poses on a part of the map with enough content and the whole view on it."""
     west, south, east, north = ground.bounds_m
     half, reach_m = int(side_m) // 2, side_m * math.sqrt(0.5) + ground.cell_size_m
     if min(east - west, north - south) <= 2 * reach_m:
@@ -138,7 +138,7 @@ class Look:
     cell_m: float
 
     def template(self, pose: Pose, rng: np.random.Generator) -> Template:
-        """What is searched for, as the matcher makes it of its query."""
+        """Return the template of a view, as the matcher makes it of a query."""
         seen = self.world.view(pose, size_cells=self.cells, cell_size_m=self.cell_m)
         query = Query(
             query_id="",
@@ -153,17 +153,17 @@ class Look:
             prior=ANYWHERE,
             prior_group="",
         )
-        return self.reader.glance(query).template
+        return self.reader.read(query).template
 
     def templates(self, ground: Grid, count: int) -> list[tuple[Pose, Template]]:
-        """Some of them; the same places for one size, whatever is made of them."""
+        """Return poses and templates; the poses depend on the size of views alone."""
         where, rng = np.random.default_rng(0), np.random.default_rng(1)
         some = zip(range(count), places(self.world, ground, self.cells * self.cell_m, where), strict=False)
         return [(pose, self.template(pose, rng)) for _, pose in some]
 
 
 def save(path: Path, field: Field, templates: Sequence[Template]) -> None:
-    """What a process that is measured needs, and no more."""
+    """Write the input of a measured process."""
     grid = field.grid
     arrays = {f"weights{at}": template.weights for at, template in enumerate(templates)}
     arrays |= {f"known{at}": template.known for at, template in enumerate(templates)}
@@ -172,7 +172,7 @@ def save(path: Path, field: Field, templates: Sequence[Template]) -> None:
 
 
 def load(path: Path) -> tuple[Field, list[Template]]:
-    """Read it back."""
+    """Read the input of a measured process."""
     with np.load(path) as held:
         epsg, west_m, north_m, cell_m, view_cell_m = held["lattice"].tolist()
         layers, known = held["layers"], held["known"]
@@ -187,14 +187,14 @@ def load(path: Path) -> tuple[Field, list[Template]]:
 
 
 def seconds(call: Callable[[], object]) -> tuple[float, float]:
-    """Wall and processor seconds of a call."""
+    """Return wall and processor seconds of a call."""
     wall, cpu = time.perf_counter(), time.process_time()
     call()
     return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def measured(path: Path, threads: int, step_deg: float) -> dict[str, float]:
-    """What this process took for its views; for one view exhaustively where a step is given."""
+    """Return time and memory of this process for its views; with a step, of one exhaustive search."""
     field, templates = load(path)
     if step_deg:
         whole = seconds(lambda: exhaustive(field, templates[0], yaw_step_deg=step_deg, threads=threads))
@@ -211,27 +211,27 @@ def measured(path: Path, threads: int, step_deg: float) -> dict[str, float]:
 
 
 def peak_mb() -> float:
-    """Most that was resident; `getrusage` would count what the parent held when it started this process."""
+    """Return the peak resident size; `getrusage` would include that of the parent at the start."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024 / 1e6
 
 
 def in_a_process(path: Path, threads: int, step_deg: float = 0.0) -> dict[str, float]:
-    """The same in a process of its own."""
+    """Run `measured` in a process of its own."""
     command = [sys.executable, __file__, "--measure", str(path), str(threads), str(step_deg)]
     return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))  # noqa: S603
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """What is measured, of one region."""
+    """Measurements on one region."""
 
     world: State
     reader: Reader
     given: argparse.Namespace
 
     def prepared(self, folder: Path, *, side: int, view: int) -> Path:
-        """A map and views of one size, in a file."""
+        """Write a map and views of one size; return the file."""
         cell_m = self.given.view_cell
         look = Look(world=self.world, reader=self.reader, is_noisy=True, cells=view, cell_m=cell_m)
         inner = min(side, self.reader.field.grid.rows)
@@ -243,7 +243,7 @@ class Bench:
         return path
 
     def speed(self, folder: Path) -> None:
-        """Print a fix and the exhaustive search beside it."""
+        """Print the costs of a fix and of the exhaustive search."""
         path = self.prepared(folder, side=self.given.size, view=self.given.view)
         self._head(f"map {self.given.size} x {self.given.size} cells, view {self.given.view} x {self.given.view}")
         print("| | cores | s | CPU s | first, s | peak MB |")
@@ -270,7 +270,7 @@ class Bench:
             path.unlink()
 
     def agreement(self, kind: Kind, reader: Reader) -> str:
-        """Print each query in which both differ; give a line of the table."""
+        """Print each query in which both differ; return a line of the table."""
         given = self.given
         field = resized(reader.field, given.size)
         look = Look(world=self.world, reader=reader, is_noisy=kind.is_noisy, cells=given.view, cell_m=given.view_cell)
@@ -323,13 +323,13 @@ class Bench:
 
 
 def is_near(one: Pose, other: Pose, near_m: float, near_deg: float) -> bool:
-    """Within some metres along both axes, and some degrees."""
+    """Tell if two poses lie within a distance along both axes and an angle."""
     apart_m = max(abs(one.easting_m - other.easting_m), abs(one.northing_m - other.northing_m))
     return bool(apart_m <= near_m and abs(wrap_deg(one.yaw_deg - other.yaw_deg)) <= near_deg)
 
 
 def cause(field: Field, template: Template, found: Mode, best: Mode) -> str:
-    """Why the search found another place."""
+    """Return why the search found another place."""
     mine, theirs = (score_at(field, template, one.pose) for one in (found, best))
     if mine >= theirs:
         return "better"

@@ -49,7 +49,7 @@ from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.running.testing import TinyPlace
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel as Learnt
 from sasgeo_bench.scoring.entries import find_entries
 from sasgeo_bench.scoring.submission_files import read_card, read_submission, write_submission
 from sasgeo_bench.tasks import task_files

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's graph descriptor: how many things of each kind there are, and how far they lie from each other."""
+"""Graph descriptor of the paper: numbers of objects of each kind, and their distances from each other."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-BINS: Final = 16  # of distances, from 0 to the longest there may be
-LEAST_M2: Final = 9.0  # a smaller patch is a speck of perception
-MOST_THINGS: Final = 1000  # of a kind, the largest first: a view of noise has no end of pairs
+BINS: Final = 16  # of distances, from 0 to the longest possible
+LEAST_M2: Final = 9.0  # smaller patches are noise
+MOST_THINGS: Final = 1000  # of a kind, the largest: bounds the number of pairs
 _CENTRE: Final = 0.5  # of a cell: OpenCV counts from the middle of the first one
 
 
 @dataclass(frozen=True, kw_only=True)
 class Descriptor:
-    """Counts of things by kind, and histograms of the distances of their pairs; a turn changes neither.
+    """Counts of objects by kind, shape (K,), and histograms of the distances of their pairs; invariant to rotation.
 
-    `counts` has shape (K,); `spread` has shape (K, BINS), each row of sum 1, or 0 where there is no pair.
+    `spread` has shape (K, BINS); each row sums to 1, or is 0 where there is no pair.
     """
 
     counts: NDArray[np.float64]
@@ -28,14 +28,7 @@ class Descriptor:
 
     @classmethod
     def of(cls, things_m: Sequence[NDArray[np.float64]], *, reach_m: float) -> Self:
-        """Describe things by their places.
-
-        Parameters
-        ----------
-        things_m : sequence of ndarray, shape (N, 2) each
-            Places of the things of each kind, metres, in any frame.
-        reach_m : float
-            The longest distance there may be.
+        """Describe places of objects of each kind, shape (N, 2) each, metres; `reach_m` is the longest distance.
 
         Examples
         --------
@@ -49,14 +42,14 @@ class Descriptor:
         return cls(counts=counts, spread=np.array(spread, dtype=np.float64).reshape(-1, BINS))
 
     def scaled(self, shares: NDArray[np.float64]) -> Self:
-        """Return the same with counts multiplied, kind by kind: what would be left of them in parts of the area."""
+        """Return the descriptor with counts scaled to shares of the area, kind by kind."""
         return replace(self, counts=self.counts * shares)
 
     def distance(self, other: Self) -> float:
-        """How unlike two descriptors are, 0..1: the mean over kinds, and within each of counts and distances.
+        """Return the distance of two descriptors, 0..1: the mean over kinds of counts and histograms.
 
-        Counts n and m differ by |n - m| / (n + m + 1), so that one more or less of few says little; histograms by half
-        the sum of their absolute differences.
+        Counts n and m differ by |n - m| / (n + m + 1), so that one of few counts little; histograms by half their L1
+        distance.
 
         Examples
         --------
@@ -72,9 +65,9 @@ class Descriptor:
 
 
 def distances(places_m: NDArray[np.float64], *, reach_m: float) -> NDArray[np.float64]:
-    """Histogram of the distances of all pairs, shape (BINS,), of sum 1; zeros where there is no pair.
+    """Return the histogram of the distances of all pairs, shape (BINS,), of sum 1; zeros where there is no pair.
 
-    A distance is shared by the two bins whose middles it lies between, so a small move is a small difference.
+    Each distance is split between its two nearest bins, so that small moves make small differences.
 
     Examples
     --------
@@ -93,17 +86,10 @@ def distances(places_m: NDArray[np.float64], *, reach_m: float) -> NDArray[np.fl
 
 
 def components(present: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.float64]:
-    """Centroids of the connected patches of a layer, metres right and down from its corner, shape (N, 2).
+    """Return centroids of the connected patches of a layer, metres right and down from its corner, shape (N, 2).
 
-    Cells that touch at a corner are connected. Patches under `LEAST_M2` are left out; of more than `MOST_THINGS` the
-    largest are kept.
-
-    Parameters
-    ----------
-    present : ndarray of uint8, shape (rows, cols)
-        Not 0 where the class is.
-    cell_size_m : float
-        Side of a cell.
+    Cells that touch at a corner are connected. Patches under `LEAST_M2` are dropped; at most `MOST_THINGS` are kept,
+    the largest.
 
     Examples
     --------

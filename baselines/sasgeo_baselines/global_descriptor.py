@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`global_descriptor`: how much of each class there is, blind to where it lies."""
+"""`global_descriptor`: shares of classes, blind to their places."""
 
 import math
 from typing import Final
@@ -7,9 +7,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.answers import is_blind, ranked_candidates
-from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
-from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, Match, MatcherCard, Query, Region
+from sasgeo_baselines.places import Sums, first_apart, lattice_m
+from sasgeo_bench import (
+    PRESENT,
+    UNKNOWN,
+    WITHHELD,
+    Match,
+    MatcherCard,
+    Query,
+    Region,
+    at_place,
+    is_blind,
+    points_of,
+    ranked_candidates,
+)
 
 STEP_M: Final = 32.0  # no place is further than 23 m from one of the lattice
 APART_M: Final = 25.0
@@ -36,32 +47,32 @@ class GlobalDescriptor:
         self._sums: Sums | None = None
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Sum the map once."""
+        """Sum the layers of the map."""
         del learned
         self._sums = Sums.of(region)
         self._region = region.grid
         self._classes = region.classes
 
     def match(self, query: Query, *, top_k: int) -> Match:
-        """Rank candidates, or places of a lattice, by how near their shares are to the view's."""
+        """Rank candidates, or places of a lattice, by the distance of their shares from those of the view."""
         if self._sums is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
         if is_blind(query):
             return WITHHELD
-        said = {"known_share": 1.0 - query.evidence.unknown_share}
+        diagnostics = {"known_share": 1.0 - query.evidence.unknown_share}
         if query.track == "retrieval":
             scores = self._scores(self._sums, query, points_of(query.candidates)).tolist()
             kept = [score if math.isfinite(score) else None for score in scores]
-            return ranked_candidates(query, kept, top_k=top_k, diagnostics=said)
+            return ranked_candidates(query, kept, top_k=top_k, diagnostics=diagnostics)
         points_m = lattice_m(query.prior, self._region, step_m=STEP_M)
         scores = self._scores(self._sums, query, points_m)
         chosen = first_apart(points_m, scores, apart_m=APART_M, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
-        return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=said)
+        return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=diagnostics)
 
     def _scores(self, sums: Sums, query: Query, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Minus the distance of shares at each place; minus infinity where the map knows nothing, shape (N,)."""
+        """Return minus the distance of shares, shape (N,); minus infinity where the map is unknown."""
         counts = sums.squares(points_m, max(query.evidence.size_m))
         seen = shares(query.evidence.cells)
         squared = np.zeros(len(points_m))
@@ -73,7 +84,7 @@ class GlobalDescriptor:
 
 
 def shares(cells: NDArray[np.uint8]) -> list[float]:
-    """Share of the known cells of each class in which it is present; nan where none is known.
+    """Return the share of the known cells in which each class is present; NaN where none is known.
 
     Examples
     --------

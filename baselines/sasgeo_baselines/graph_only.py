@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`graph_only`: how many things there are and how far from each other, and no overlap of rasters."""
+"""`graph_only`: numbers of objects and their distances from each other, without overlap of rasters."""
 
 import math
 from dataclasses import dataclass
@@ -9,17 +9,31 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.answers import is_blind, ranked_candidates
-from sasgeo_baselines.chart import Chart, largest
-from sasgeo_baselines.dense import Disc
 from sasgeo_baselines.descriptor import Descriptor, components
 from sasgeo_baselines.nodes import Nodes
-from sasgeo_baselines.places import at_place, first_apart, lattice_m, points_of
-from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, Evidence, Match, MatcherCard, Prior, Query, Region
+from sasgeo_baselines.places import first_apart, lattice_m
+from sasgeo_bench import (
+    PRESENT,
+    UNKNOWN,
+    WITHHELD,
+    Chart,
+    Disc,
+    Evidence,
+    Match,
+    MatcherCard,
+    Prior,
+    Query,
+    Region,
+    at_place,
+    block_max,
+    is_blind,
+    points_of,
+    ranked_candidates,
+)
 
-CELL_M: Final = 2.0  # finer patches cost more and tell no more
+CELL_M: Final = 2.0  # finer patches cost more and add nothing
 STEP_M: Final = 32.0
-NEAR_M: Final = 16.0  # how far a candidate may be moved, east and north
+NEAR_M: Final = 16.0  # a candidate may be moved so far, east and north
 APART_M: Final = 25.0
 MOST_TRIED: Final = 1000  # places of a lattice; a larger prior has a wider one
 REFINED: Final = 24
@@ -61,30 +75,30 @@ class GraphOnly:
         self._nodes = Nodes.of(region.graph)
 
     def match(self, query: Query, *, top_k: int) -> Match:
-        """Rank candidates, or places of a lattice, by how alike their descriptors are."""
+        """Rank candidates, or places of a lattice, by the distance of descriptors."""
         if self._chart is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
         if is_blind(query) and (query.vectors is None or query.vectors.empty):
             return WITHHELD
-        glance = _Glance.of(query, self._chart, self._nodes, used=self._used)
-        said = {"known_share": 1.0 - query.evidence.unknown_share}
+        view = _ViewOnMap.of(query, self._chart, self._nodes, used=self._used)
+        diagnostics = {"known_share": 1.0 - query.evidence.unknown_share}
         if query.track == "retrieval":
-            best = [glance.scores(place_m + NEAR_M * _AROUND).max() for place_m in points_of(query.candidates)]
+            best = [view.scores(place_m + NEAR_M * _AROUND).max() for place_m in points_of(query.candidates)]
             kept = [float(score) if math.isfinite(score) else None for score in best]
-            return ranked_candidates(query, kept, top_k=top_k, diagnostics=said)
-        points_m, scores = _searched(glance, query.prior)
+            return ranked_candidates(query, kept, top_k=top_k, diagnostics=diagnostics)
+        points_m, scores = _searched(view, query.prior)
         chosen = first_apart(points_m, scores, apart_m=APART_M, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
-        return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=said)
+        return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=diagnostics)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Glance:
-    """What a view holds within the largest disc in it, and the map to hold it against.
+class _ViewOnMap:
+    """Descriptors of a view within its largest disc, and the map to compare with.
 
-    `things` is the descriptor of its layers, for the classes in `bands`, of which some is known, `shares` how much of
-    each; `seen_nodes` that of its vectors, None without.
+    `things` describes the layers of the classes in `bands`, of which the shares `shares` are known; `seen_nodes`
+    describes the perceived vectors, None without.
     """
 
     chart: Chart
@@ -97,7 +111,7 @@ class _Glance:
 
     @classmethod
     def of(cls, query: Query, chart: Chart, nodes: Nodes, *, used: NDArray[np.bool_]) -> Self:
-        """Look at a view once; classes that the map holds nowhere, by `used`, say the same of every place."""
+        """Describe a view; classes that the map holds nowhere, by `used`, are ignored."""
         view, radius_m = query.evidence, min(query.evidence.size_m) / 2
         inside = _disc(view.shape)
         known = np.array([(layer != UNKNOWN)[inside].mean() for layer in view.cells])
@@ -117,7 +131,7 @@ class _Glance:
         )
 
     def scores(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Minus the unlikeness of each place, shape (N,); minus infinity where the map knows nothing."""
+        """Return minus the distance of each place, shape (N,); minus infinity where the map is unknown."""
         return np.array([self._score(place_m) for place_m in points_m])
 
     def _score(self, place_m: NDArray[np.float64]) -> float:
@@ -142,14 +156,14 @@ class _Glance:
         return -sum(found) / len(found) if found else 0.0
 
 
-def _searched(glance: _Glance, prior: Prior) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places within the prior, shape (N, 2), and their scores: a lattice, then around the best of it."""
-    grid, step_m = glance.chart.grid, STEP_M
+def _searched(view: _ViewOnMap, prior: Prior) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places within the prior, shape (N, 2), and scores: of a lattice, then around its best places."""
+    grid, step_m = view.chart.grid, STEP_M
     points_m = lattice_m(prior, grid, step_m=step_m)
     if len(points_m) > MOST_TRIED:
         step_m *= math.ceil(math.sqrt(len(points_m) / MOST_TRIED))
         points_m = lattice_m(prior, grid, step_m=step_m)
-    scores = glance.scores(points_m)
+    scores = view.scores(points_m)
     west_m, south_m, east_m, north_m = grid.bounds_m
     disc = Disc(center_m=prior.center_m, radius_m=prior.radius_m or 0.0)
     while step_m > NEAR_M:
@@ -158,14 +172,14 @@ def _searched(glance: _Glance, prior: Prior) -> tuple[NDArray[np.float64], NDArr
         near = (best[:, None] + step_m * _AROUND[_AROUND.any(axis=1)]).reshape(-1, 2)
         on_map = ((near >= (west_m, south_m)) & (near <= (east_m, north_m))).all(axis=1)
         near = near[on_map & disc.holds(near)]
-        points_m, scores = np.concatenate((points_m, near)), np.concatenate((scores, glance.scores(near)))
+        points_m, scores = np.concatenate((points_m, near)), np.concatenate((scores, view.scores(near)))
     return points_m, scores
 
 
 def _things_of(view: Evidence, chosen: list[int], radius_m: float) -> Descriptor:
-    """Describe some classes of a view, on coarse cells."""
+    """Describe classes of a view on coarse cells."""
     factor = _factor(view.cell_size_m)
-    layers = [largest((view.cells[at] == PRESENT).astype(np.uint8), factor) for at in chosen]
+    layers = [block_max((view.cells[at] == PRESENT).astype(np.uint8), factor) for at in chosen]
     return _described([layer * _disc(layer.shape) for layer in layers], view.cell_size_m * factor, radius_m)
 
 
@@ -174,13 +188,13 @@ def _described(layers: list[NDArray[np.uint8]], cell_size_m: float, radius_m: fl
 
 
 def _factor(cell_size_m: float) -> int:
-    """Cells a side of a coarse one."""
+    """Return cells a side of a coarse cell."""
     return max(1, round(CELL_M / cell_size_m))
 
 
 @lru_cache(maxsize=16)
 def _disc(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Cells whose middles lie in the largest disc around the middle of a raster."""
+    """Return cells whose centres lie in the largest disc around the centre of a raster."""
     rows, cols = (np.arange(count) + 0.5 - count / 2 for count in shape)
     found = np.asarray(np.hypot(*np.meshgrid(rows, cols, indexing="ij")) <= min(shape) / 2)
     found.flags.writeable = False

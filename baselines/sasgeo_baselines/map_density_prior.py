@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`map_density_prior`: the control that knows where on the map there is most to see, and does not look at the view."""
+"""`map_density_prior`: control that answers with the fullest places of the map and ignores the view."""
 
 from typing import Final
 
 import numpy as np
 
-from sasgeo_baselines.answers import is_blind, ranked_candidates
-from sasgeo_baselines.places import Sums, at_place, first_apart, lattice_m, points_of
-from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region
+from sasgeo_baselines.places import Sums, first_apart, lattice_m
+from sasgeo_bench import (
+    WITHHELD,
+    Match,
+    MatcherCard,
+    Query,
+    Region,
+    at_place,
+    is_blind,
+    points_of,
+    ranked_candidates,
+)
 
 DRAWN: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 STEP_M: Final = 16.0
@@ -15,7 +24,7 @@ APART_M: Final = 25.0
 
 
 class MapDensityPrior:
-    """The places of the map with most roads, buildings, railways, streams and boundaries within the prior."""
+    """Ranks places within the prior by cells of roads, buildings, railways, streams and boundaries."""
 
     card = MatcherCard(
         name="map_density_prior",
@@ -35,13 +44,13 @@ class MapDensityPrior:
         self._sums: Sums | None = None
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Sum the drawn classes of the map once."""
+        """Sum the drawn classes of the map."""
         del learned
         self._sums = Sums.of(region, DRAWN)
         self._grid = region.grid
 
     def match(self, query: Query, *, top_k: int) -> Match:
-        """Answer without looking at the view."""
+        """Return the fullest places."""
         if self._sums is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of a map graph, or of the graph of perceived vectors, by what they are: junctions, crossings, buildings."""
+"""Nodes of a map graph, or of the graph of perceived vectors, by kind: junctions, crossings, buildings."""
 
 from dataclasses import dataclass
 from typing import Final, Self
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from sasgeo_baselines.descriptor import Descriptor
 from sasgeo_bench import MapGraph, build_graph, make_features
 
-# A crossing connects nothing: one road is above the other. Dead ends are left out: gaps in what is seen make more.
+# A crossing connects nothing: one road is above the other. Dead ends are ignored: gaps in perception make more.
 KINDS: Final = (
     *("intersection", "large intersection", "crossing", "level_crossing"),
     *("road_rail_crossing", "road_water_crossing", "building"),
@@ -22,10 +22,7 @@ _LARGE: Final = 4  # road ends that meet: a crossroads, not a fork
 
 @dataclass(frozen=True, kw_only=True)
 class Nodes:
-    """Places and kinds of nodes, made ready for being asked what lies around a place.
-
-    `places_m` has shape (N, 2), `kind`, of shape (N,), counts through `KINDS`.
-    """
+    """Places, shape (N, 2), and kinds of nodes, shape (N,), as indices into `KINDS`, with a tree for look-up."""
 
     places_m: NDArray[np.float64]
     kind: NDArray[np.int64]
@@ -33,7 +30,7 @@ class Nodes:
 
     @classmethod
     def of(cls, graph: MapGraph) -> Self:
-        """Take the nodes of the kinds that are looked at."""
+        """Return the nodes of a graph that are of `KINDS`."""
         names = graph.nodes["kind"].to_numpy(dtype=object)
         is_large = (names == "intersection") & (graph.nodes["degree"].to_numpy() >= _LARGE)
         names = np.where(is_large, "large intersection", names)
@@ -45,7 +42,7 @@ class Nodes:
 
     @classmethod
     def seen(cls, vectors: gpd.GeoDataFrame, *, epsg: int) -> Self:
-        """Derive the graph of perceived vectors as that of the map is derived; places are (right, up), metres."""
+        """Derive the nodes of perceived vectors as those of the map are derived; places are (right, up), metres."""
         count = len(vectors)
         columns = {
             "osm_type": ["way"] * count,
@@ -63,7 +60,7 @@ class Nodes:
         return cls.of(build_graph(make_features(columns, epsg=epsg)))
 
     def around(self, place_m: tuple[float, float], radius_m: float) -> Descriptor:
-        """Describe what lies within a distance of a place, kind by kind."""
+        """Describe the nodes within a distance of a place, kind by kind."""
         near = np.array(sorted(self.tree.query_ball_point(place_m, radius_m)), dtype=np.int64)
         kind, places_m = self.kind[near], self.places_m[near]
         return Descriptor.of([places_m[kind == at] for at in range(len(KINDS))], reach_m=2 * radius_m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a view may lie, as plain places: lattices within a prior, its middle, and sums over squares of the map."""
+"""Lattices of places within a prior, their best, and sums over squares of the map."""
 
 from dataclasses import dataclass
 from typing import Final, Self
@@ -7,36 +7,15 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.answers import offsets_m
-from sasgeo_bench import PRESENT, Grid, Pose, Prior, Region
+from sasgeo_bench import PRESENT, Grid, Prior, Region, middle_m, offsets_m
 
-_POOLED_M: Final = 4.0  # a cell of the sums; finer ones take memory and tell no more
-
-
-def middle_m(prior: Prior, grid: Grid) -> tuple[float, float]:
-    """Middle of the prior's disc, or of the map.
-
-    Examples
-    --------
-    >>> nowhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
-    >>> middle_m(nowhere, Grid(epsg=32632, west_m=0.0, north_m=8.0, cell_size_m=1.0, rows=8, cols=4))
-    (2.0, 4.0)
-    """
-    if prior.center_m is not None:
-        return prior.center_m
-    west_m, south_m, east_m, north_m = grid.bounds_m
-    return (west_m + east_m) / 2, (south_m + north_m) / 2
-
-
-def at_place(point_m: NDArray[np.float64] | tuple[float, float], prior: Prior) -> Pose:
-    """Pose at a place with the prior's heading, north where there is none."""
-    return Pose(easting_m=float(point_m[0]), northing_m=float(point_m[1]), yaw_deg=prior.yaw_deg or 0.0)
+_POOLED_M: Final = 4.0  # a cell of the sums; finer ones take memory and add nothing
 
 
 def lattice_m(prior: Prior, grid: Grid, *, step_m: float) -> NDArray[np.float64]:
-    """Places on the map within the prior's disc, on whole multiples of a step, north to south, shape (N, 2).
+    """Return places on the map within the disc of a prior, on multiples of a step, north to south, shape (N, 2).
 
-    The middle of the disc, moved onto the map, if there is none.
+    The centre of the disc if there is none.
 
     Examples
     --------
@@ -60,10 +39,9 @@ def lattice_m(prior: Prior, grid: Grid, *, step_m: float) -> NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Sums:
-    """Sums over squares of the map: how many cells of each class, and how many are known.
+    """Summed-area table of a map: cells of each class and, last, known cells.
 
-    `below` is int64 of shape (C + 1, rows + 1, cols + 1): the sum over all coarse cells above and left; the last band
-    counts the known cells.
+    `below` is int64 of shape (C + 1, rows + 1, cols + 1): sums over all coarse cells above and left.
     """
 
     grid: Grid
@@ -71,7 +49,7 @@ class Sums:
 
     @classmethod
     def of(cls, region: Region, classes: tuple[str, ...] | None = None) -> Self:
-        """Sum a region's layers, or those of some classes it has."""
+        """Sum the layers of a region, or of some of its classes."""
         factor = max(1, round(_POOLED_M / region.grid.cell_size_m))
         bands = [band for band, name in enumerate(region.classes) if classes is None or name in classes]
         known = np.ones(region.grid.shape, dtype=bool)
@@ -89,7 +67,7 @@ class Sums:
         return cls(grid=grid, below=below)
 
     def squares(self, points_m: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:
-        """Cells of each class, then the known ones, in upright squares around places, shape (C + 1, N)."""
+        """Return cells of each class and, last, known cells in upright squares around places, shape (C + 1, N)."""
         corners = (points_m - side_m / 2, points_m + side_m / 2)
         (left, bottom), (right, top) = (np.rint(self.grid.to_uv(corner)).astype(np.int64).T for corner in corners)
         left, right = (np.clip(edge, 0, self.grid.cols) for edge in (left, right))
@@ -98,13 +76,8 @@ class Sums:
         return np.asarray(sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left])
 
 
-def points_of(poses: tuple[Pose, ...]) -> NDArray[np.float64]:
-    """Easting and northing of poses, shape (N, 2)."""
-    return np.array([(pose.easting_m, pose.northing_m) for pose in poses], dtype=np.float64).reshape(-1, 2)
-
-
 def first_apart(points_m: NDArray[np.float64], scores: NDArray[np.float64], *, apart_m: float, most: int) -> list[int]:
-    """Best places, none nearer to a better one than a distance; equals in their order.
+    """Return indices of the best places, none nearer to a better one than a distance; ties keep their order.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's variants 2 to 5 as one matcher with switches; a file beside it for each card."""
+"""Variants 2 to 5 of the paper as one matcher with switches; each card has a file of its own."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -7,19 +7,30 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.chart import Chart, fade
-from sasgeo_baselines.dense import Mode, Plan
-from sasgeo_baselines.dense_matcher import DenseMatcher
-from sasgeo_baselines.verification import Verifier, blended
-from sasgeo_baselines.voting import Gains, make_template
-from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Evidence, Region, load_taxonomy
+from sasgeo_baselines.verification import GraphCheck, blended
+from sasgeo_bench import (
+    ABSENT,
+    PRESENT,
+    UNKNOWN,
+    Chart,
+    DenseMatcher,
+    Evidence,
+    Mode,
+    PoseCheck,
+    Region,
+    VoteGains,
+    VotePlan,
+    fade,
+    load_taxonomy,
+    make_template,
+)
 
 THIN: Final = (
     *("road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"),
 )
 REACH_M: Final = 4.0
 
-# What the cards share.
+# Texts that the cards share.
 SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), Eqs. 7-8 and variant {variant} of its Section VI"
 OURS: Final = (
     "Distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for the classes drawn as lines, on the map, and in the "
@@ -50,16 +61,16 @@ LIMITS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Switches:
-    """What the variants differ in; with all off it is the second.
+    """Settings in which the variants differ; all are off in variant 2.
 
     Parameters
     ----------
     has_graph : bool
-        The graph descriptor has a say in the score of each mode: see `verification.blended`.
+        Add the graph descriptor to the score of each mode: see `verification.blended`.
     is_stable : bool
-        Each class weighs as much as `stability` says, else 1.
+        Weigh each class by `stability`, else by 1.
     is_unknown_silent : bool
-        What is unknown in the view says nothing; else it is taken for absent.
+        Ignore unknown cells of the view; else they count as absent.
     """
 
     has_graph: bool = False
@@ -68,57 +79,59 @@ class Switches:
 
 
 class RasterMatcher(DenseMatcher):
-    """Eqs. (7)-(8) with gains of 1; lines agree by nearness.
+    """Eqs. (7)-(8) with gains of 1; lines agree by proximity.
 
     Parameters
     ----------
     reach_m : float
         The tau of exp(-D^2 / 2 tau^2) for lines, metres.
-    plan : Plan, optional
-        How the search is done.
+    plan : VotePlan, optional
+        Settings of the search.
     """
 
     switches: ClassVar[Switches] = Switches()
 
-    def __init__(self, *, reach_m: float = REACH_M, plan: Plan | None = None) -> None:
+    def __init__(self, *, reach_m: float = REACH_M, plan: VotePlan | None = None) -> None:
         super().__init__(plan)
         self.reach_m = reach_m
 
     def read(self, region: Region) -> Chart:
-        """Let the lines of the map fade."""
+        """Return the map with the proximity of its lines."""
         return Chart.of(region, thin=THIN, reach_m=self.reach_m)
 
     def seen(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Take what is unknown for absent, unless this variant handles it."""
+        """Return unknown cells as absent, unless this variant ignores them."""
         if self.switches.is_unknown_silent:
             return cells
         return np.where(cells == UNKNOWN, ABSENT, cells).astype(np.uint8)
 
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
-        """One vote each; a line that is mapped beside one that was seen is not missed."""
+        """Return the template; a line mapped near a seen one is not missed."""
         near = np.zeros(evidence.cells.shape, dtype=np.float32)
         for name, layer, into in zip(evidence.classes, evidence.cells, near, strict=True):
             if name in THIN:
                 into[:] = fade(layer == PRESENT, reach_cells=self.reach_m / evidence.cell_size_m)
         weights = stability(evidence.classes) if self.switches.is_stable else np.ones(len(evidence.classes))
-        return make_template(evidence.cells, Gains(agree=weights, extra=weights, missed=weights), near=near)
+        return make_template(evidence.cells, VoteGains(agree=weights, extra=weights, missed=weights), near=near)
 
-    def rescored(self, modes: list[Mode], verifier: Verifier) -> list[Mode]:
-        """Let the graph descriptor have its say."""
+    def rescored(self, modes: list[Mode], check: PoseCheck) -> list[Mode]:
+        """Return the modes with scores of raster and graph."""
         if not self.switches.has_graph:
             return modes
-        distances = np.array([verifier.distance(mode.pose) for mode in modes])
+        graph = GraphCheck(check=check)
+        distances = np.array([graph.distance(mode.pose) for mode in modes])
         scores = blended(np.array([mode.score for mode in modes]), distances)
         return [replace(mode, score=float(score)) for mode, score in zip(modes, scores, strict=True)]
 
-    def told(self, best: Mode, verifier: Verifier) -> dict[str, float]:
-        """Diagnostics of the best mode; that of the graph only where the graph is looked at."""
-        said = super().told(best, verifier)
-        return said | {"graph_distance": verifier.distance(best.pose)} if self.switches.has_graph else said
+    def diagnose(self, best: Mode, check: PoseCheck) -> dict[str, float]:
+        """Return diagnostics of the best mode, that of the graph only if the variant has one."""
+        found = super().diagnose(best, check)
+        graph = {"graph_distance": GraphCheck(check=check).distance(best.pose)} if self.switches.has_graph else {}
+        return found | graph
 
 
 def stability(classes: tuple[str, ...]) -> NDArray[np.float64]:
-    """Prior p_c of each class, shape (C,): Eq. (5) of the SASGeo paper with all its other factors 1.
+    """Return the prior p_c of each class, shape (C,): Eq. (5) of the SASGeo paper with all other factors 1.
 
     Examples
     --------

@@ -33,7 +33,7 @@ from sasgeo_bench.sasgeo.class_weights import (
     worth_of,
     worth_table,
 )
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
@@ -73,7 +73,7 @@ def weights_command(
     learnt = read_learnt(learned)
     place = None if region is None else find_region(region, out=out)
     classes = load_taxonomy().names if place is None else place.classes
-    arms: dict[str, tuple[Learnt, Switches]] = {"hand": (Learnt.by_hand(classes), HAND)}
+    arms: dict[str, tuple[ScorerModel, Switches]] = {"hand": (ScorerModel.by_hand(classes), HAND)}
     if learnt is not None:
         arms["fitted"] = (check_classes(learnt, () if place is None else place.classes), FITTED)
     tables = {
@@ -102,7 +102,7 @@ def lookalike_command(
     mapped = find_region(region, out=out)
     seen = mapped if world is None else find_region(world, out=out)
     arm = HAND if learnt is None else FITTED
-    known = check_classes(learnt or Learnt.by_hand(mapped.classes), mapped.classes)
+    known = check_classes(learnt or ScorerModel.by_hand(mapped.classes), mapped.classes)
     found = find_lookalike(mapped, seen, known, arm, side_m=side_m)
     for table in (_numbers(found.scores), _numbers(found.terms)):
         print_table(table)
@@ -112,7 +112,7 @@ def lookalike_command(
     say(f"lookalike: {path}")
 
 
-def read_learnt(path: Path | None) -> Learnt | None:
+def read_learnt(path: Path | None) -> ScorerModel | None:
     """What was learnt, of classes that this program knows; None where no file is named."""
     if path is None:
         return None
@@ -121,7 +121,7 @@ def read_learnt(path: Path | None) -> Learnt | None:
         message = f"there is no file {path}: name a .json of out/runs/<matcher>/<hash>/learned/"
         raise ConfigError(message)
     try:
-        return check_classes(Learnt.from_text(text))
+        return check_classes(ScorerModel.from_text(text))
     except ConfigError as error:
         message = f"{path} is nothing that a sasgeo matcher has learnt: {error}"
         raise ConfigError(message) from error
@@ -164,7 +164,7 @@ def _numbers(frame: pd.DataFrame) -> Table:
 
 
 def _drawn(
-    region: Region, learnt: Learnt, arm: Switches, *, ages: Sequence[float], season: str, out: Path
+    region: Region, learnt: ScorerModel, arm: Switches, *, ages: Sequence[float], season: str, out: Path
 ) -> list[Path]:
     """Draw a map of weights for each age, all by one scale of colours."""
     rarity = rarity_map(region)

@@ -17,8 +17,8 @@ from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import rarity_map, weight_map, worth_of
-from sasgeo_bench.sasgeo.learnt import Learnt
-from sasgeo_bench.sasgeo.reading import Glance, Reader
+from sasgeo_bench.sasgeo.learnt import ScorerModel
+from sasgeo_bench.sasgeo.reading import Reader, Reading
 from sasgeo_bench.sasgeo.weight_plot import top_of
 from sasgeo_bench.search.find import rank
 from sasgeo_bench.tasks.query import Query
@@ -130,14 +130,14 @@ def _place(point_m: NDArray[np.float64]) -> tuple[float, float]:
     return (float(point_m[0]), float(point_m[1]))
 
 
-def find_lookalike(mapped: Region, world: Region, learnt: Learnt, arm: Switches, *, side_m: float) -> Lookalike:
+def find_lookalike(mapped: Region, world: Region, learnt: ScorerModel, arm: Switches, *, side_m: float) -> Lookalike:
     """Show a place as it is on the day of `world`, and score it and its lookalike on an older map.
 
     Parameters
     ----------
     mapped, world : Region
         One region at two dates, or the same twice.
-    learnt : Learnt
+    learnt : ScorerModel
         What is known of classes.
     arm : Switches
         Which scorer.
@@ -169,7 +169,7 @@ def find_lookalike(mapped: Region, world: Region, learnt: Learnt, arm: Switches,
         prior_group="rnone-unknown-s0",
         candidates=tuple(places),
     )
-    glance = Reader.of(mapped, learnt, arm).glance(query)
+    glance = Reader.of(mapped, learnt, arm).read(query)
     poses = best_poses(glance)
     views = tuple(on_map.view(pose, size_cells=size, cell_size_m=cell_m) for pose in poses)
     return Lookalike(
@@ -194,7 +194,7 @@ def check_dates(mapped: Region, world: Region) -> None:
         raise ConfigError(message)
 
 
-def best_poses(glance: Glance) -> tuple[Pose, ...]:
+def best_poses(glance: Reading) -> tuple[Pose, ...]:
     """The best pose near each candidate of a view, whatever its heading."""
     found, _ = rank(glance.reader.field, glance.template, glance.query.prior, glance.query.candidates)
     return tuple(
@@ -202,9 +202,9 @@ def best_poses(glance: Glance) -> tuple[Pose, ...]:
     )
 
 
-def _scores(glance: Glance, poses: tuple[Pose, ...], views: tuple[Evidence, ...]) -> pd.DataFrame:
+def _scores(glance: Reading, poses: tuple[Pose, ...], views: tuple[Evidence, ...]) -> pd.DataFrame:
     classes = glance.reader.region.classes
-    by_class = glance.by_class(poses) * glance.reader.learnt.temper
+    by_class = glance.by_class(poses) * glance.reader.learnt.scaling
     columns = {"share view": _shares(glance.query.evidence)}
     columns |= {f"share {name}": _shares(view) for name, view in zip(NAMES, views, strict=True)}
     columns |= {f"score {name}": row for name, row in zip(NAMES, by_class, strict=True)}
@@ -215,7 +215,7 @@ def _shares(view: Evidence) -> NDArray[np.float64]:
     return np.asarray((view.cells == PRESENT).mean(axis=(1, 2)))
 
 
-def _terms(glance: Glance, poses: tuple[Pose, ...]) -> pd.DataFrame:
+def _terms(glance: Reading, poses: tuple[Pose, ...]) -> pd.DataFrame:
     """Return raster, graph, contradiction and their sum; the first alone for a variant without a graph."""
     terms = glance.terms(poses, glance.verified(poses))
     classes = len(glance.reader.region.classes)
@@ -225,7 +225,7 @@ def _terms(glance: Glance, poses: tuple[Pose, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, index=list(NAMES)).T
 
 
-def sheet_of(found: Lookalike, mapped: Region, learnt: Learnt, arm: Switches) -> LookalikeSheet:
+def sheet_of(found: Lookalike, mapped: Region, learnt: ScorerModel, arm: Switches) -> LookalikeSheet:
     """Put what was found into words and pictures."""
     about, side_m = mapped.manifest, found.query.evidence.size_m[0]
     worth = worth_of(learnt, arm, age_years=found.age_years)

@@ -26,7 +26,7 @@ from sasgeo_bench.tasks.task_rows import pairs_from, query_from
 
 MOST_MAPS: Final = 2  # in memory while a matcher learns, as long as it keeps none itself
 # What of this package answers are made with: a change there may change them, so they are asked for anew.
-TOOLS: Final = ("regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
+TOOLS: Final = ("matching.controls", "regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
@@ -57,7 +57,10 @@ class Server:
                 answer = wire.packed(said | {"status": status, "message": message_of(error)})
             except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
                 answer = wire.packed(said | {"status": "crash", "message": message_of(error)})
-            wire.put(self.channel, answer)
+            try:
+                wire.put(self.channel, answer)
+            except wire.Closed:  # the runner waited no longer
+                return
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
         if message["kind"] == "load":

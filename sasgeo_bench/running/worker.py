@@ -38,6 +38,7 @@ _KEEPER_S: Final = 5.0  # for the process that keeps a matcher's to end all that
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
 _KEPT_BYTES: Final = 4000  # of what a matcher prints
 _START_S: Final = 120.0
+_DRAIN_S: Final = 10.0  # for the rest of what a process printed, once it is dead
 _SLACK_S: Final = 0.1  # of processor seconds beyond those of all processors: clocks tick
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
@@ -99,6 +100,7 @@ class Worker:
     _process: subprocess.Popen[bytes] | None = None
     _channel: socket.socket | None = None
     _printed: deque[bytes] = field(default_factory=deque)
+    _drain: threading.Thread | None = None
     _scratch: Path | None = None
     _region: Path | None = None
     _learned: str | None = None
@@ -197,7 +199,8 @@ class Worker:
         theirs.close()
         self._begin_watch(self._process, self._scratch)
         self._printed = deque()
-        threading.Thread(target=_drain, args=(self._process.stdout, self._printed), daemon=True).start()
+        self._drain = threading.Thread(target=_drain, args=(self._process.stdout, self._printed), daemon=True)
+        self._drain.start()
         self._channel = ours
         self.starts += 1
         if self.reach.is_shut_in:
@@ -266,6 +269,9 @@ class Worker:
         how = closed
         if code is not None:
             how = f"died by {_signal_name(-code)}" if code < 0 else f"ended with exit status {code}"
+        if self._process is not None and self._drain is not None:
+            _kill_family(self._process)  # nobody is left who could keep what it printed from ending
+            self._drain.join(timeout=_DRAIN_S)
         lines = b"".join(self._printed).decode(errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "")
         return one_line(f"{how}: {last}" if last else how)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The switches of the scorer: its ablations are settings of one matcher, not copies of it."""
+"""Switches of the scorer: its ablations are settings of one matcher."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.raster import doubted
 from sasgeo_bench.sasgeo.seasons import by_hand
 from sasgeo_bench.sasgeo.weights import Gains, even_gains, hand_gains, likelihood_gains
@@ -17,28 +17,23 @@ Weights = Literal["even", "hand", "fitted"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Switches:
-    """What an arm of the experiment differs in; the full scorer has all of them.
+    """Settings in which the ablations differ; defaults are those of the full scorer.
 
     Parameters
     ----------
     weights : {"even", "hand", "fitted"}
-        All classes alike; Eqs. 5 and 7 with the taxonomy's numbers; likelihood ratios of learnt rates, each class with
-        a learnt exponent.
+        Equal weights; Eqs. 5 and 7 with the numbers of the taxonomy; likelihood ratios of fitted rates, each class
+        with a fitted scale of its evidence.
     is_unknown_silent : bool
-        What is unknown in the view says nothing; else it is taken for absent.
+        Ignore unknown cells of the view; else they count as absent.
     has_graph : bool
-        Eq. 9 has a say in the order of the modes.
+        Rank modes with Eq. 9, too.
     is_distinctive : bool
-        Eq. 6: what is rare on the map weighs more.
+        Eq. 6: give rare configurations more weight.
     is_stamped : bool
-        Eq. 5 feature by feature: what nobody has edited for years is worth what it was learnt to be worth.
+        Eq. 5 for each feature: weigh features by the time since their last edit, with fitted weights.
     knows_age : bool
-        Else every map is taken for one of today: what of fitted weights is not stability.
-
-    Examples
-    --------
-    >>> Switches(weights="even").learns
-    False
+        Use the age of the map; else every map counts as new, which separates stability from fitted weights.
     """
 
     weights: Weights = "fitted"
@@ -50,22 +45,22 @@ class Switches:
 
     @property
     def learns(self) -> bool:
-        """Whether train places change anything."""
+        """Tell if the scorer is fitted to training places."""
         return self.weights == "fitted"
 
     def seen(self, evidence: Evidence) -> Evidence:
-        """Read a view as this arm does."""
+        """Return a view as this ablation reads it."""
         if not self.is_unknown_silent:
             cells = np.where(evidence.cells == UNKNOWN, ABSENT, evidence.cells).astype(np.uint8)
             evidence = Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
         return doubted(evidence)
 
-    def gains(self, learnt: Learnt, *, age_years: float, season: str = "") -> Gains:
-        """Gains of Eq. 7 for a map of an age and a season, for classes in the order of what was learnt."""
+    def gains(self, model: ScorerModel, *, age_years: float, season: str = "") -> Gains:
+        """Return the gains of Eq. 7 for the age of a map and a season, in the order of the classes of the model."""
         if self.weights == "even":
-            return even_gains(learnt.classes)
+            return even_gains(model.classes)
         age_years = age_years if self.knows_age else 0.0
         if self.weights == "hand":
-            return hand_gains(learnt.classes, age_years=age_years, persists=by_hand(season, learnt.classes).tolist())
-        persists = learnt.persists(season).tolist()
-        return likelihood_gains(learnt.rates, age_years=age_years, persists=persists).softened(learnt.missed_share)
+            return hand_gains(model.classes, age_years=age_years, persists=by_hand(season, model.classes).tolist())
+        persists = model.persists(season).tolist()
+        return likelihood_gains(model.rates, age_years=age_years, persists=persists).softened(model.missed_share)

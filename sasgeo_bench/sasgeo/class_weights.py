@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each class is worth to the scorer as a map ages, and where on a map that lies: Eqs. 5-7 of the SASGeo paper.
+"""Weights of classes as a map ages, and maps of these weights: Eqs. 5-7 of the SASGeo paper.
 
-Gains are told as the arms have them, nats a cell; what classes are worth beside each other comes after the exponent,
-nats for 100 m2 that are mapped and seen. By hand that is sigma of Eq. 5, since the exponent is one cell in a hundred.
+Gains are nats a cell. Weights include the scale of the evidence and are nats for 100 m2 that are mapped and seen; by
+hand that is sigma of Eq. 5, since the scale is one cell in a hundred.
 """
 
 import difflib
@@ -20,7 +20,7 @@ from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.distinct import Rarity
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.seasons import SEASONS
 from sasgeo_bench.sasgeo.weights import information
 
@@ -32,13 +32,7 @@ GAINS: Final = ("agree", "extra", "missed", "quiet")
 
 
 def check_age(age_years: float) -> float:
-    """Refuse what is no age of a map.
-
-    Examples
-    --------
-    >>> check_age(2.5)
-    2.5
-    """
+    """Return the age of a map, or raise ConfigError if it is negative or not finite."""
     if not (math.isfinite(age_years) and age_years >= 0):
         message = f"the age of a map is at least 0 years and finite, got {age_years!r}"
         raise ConfigError(message)
@@ -46,7 +40,7 @@ def check_age(age_years: float) -> float:
 
 
 def check_season(season: str) -> str:
-    """Refuse what is no season; "" is for none.
+    """Return the name of a season, "" for none, or raise ConfigError.
 
     Examples
     --------
@@ -63,59 +57,59 @@ def check_season(season: str) -> str:
     return season
 
 
-def check_classes(learnt: Learnt, classes: Sequence[str] = ()) -> Learnt:
-    """Take what was learnt in the order of the classes of a map, all of which it must know; else in its own.
+def check_classes(model: ScorerModel, classes: Sequence[str] = ()) -> ScorerModel:
+    """Return a model in the order of the classes of a map, or in its own order without a map.
 
     Raises
     ------
     ConfigError
-        If a class is none of ours, or nothing was learnt of one of the map's.
+        If the taxonomy lacks a class of the model, or the model a class of the map.
 
     Examples
     --------
-    >>> check_classes(Learnt.by_hand(["water", "railway"]), ["railway"]).classes
+    >>> check_classes(ScorerModel.by_hand(["water", "railway"]), ["railway"]).classes
     ('railway',)
     """
-    strange = [name for name in (*learnt.classes, *classes) if name not in load_taxonomy().names]
+    strange = [name for name in (*model.classes, *classes) if name not in load_taxonomy().names]
     if strange:
         message = f"this version has no class {strange[0]!r}: use one taxonomy for map, learning and program"
         raise ConfigError(message)
-    lacking = [name for name in classes if name not in learnt.classes]
+    lacking = [name for name in classes if name not in model.classes]
     if lacking:
-        message = f"nothing was learnt of the map's class {lacking[0]!r}: learn on maps that have it"
+        message = f"the model lacks the map's class {lacking[0]!r}: train it on maps that have it"
         raise ConfigError(message)
-    return learnt.of_classes(classes) if classes else learnt
+    return model.of_classes(classes) if classes else model
 
 
-def worth_of(learnt: Learnt, arm: Switches, *, age_years: float, season: str = "") -> NDArray[np.float64]:
-    """What it is worth that 100 m2 of each class are mapped and seen, after the exponent: nats, shape (C,).
+def worth_of(model: ScorerModel, arm: Switches, *, age_years: float, season: str = "") -> NDArray[np.float64]:
+    """Return the weight of each class in nats for 100 m2 that are mapped and seen, shape (C,).
 
     Examples
     --------
-    By hand it is sigma of Eq. 5, here a prior of 0.97 and half a life of 231 years:
+    By hand it is sigma of Eq. 5, here a prior of 0.97 at the half-life of 231 years:
 
-    >>> worth_of(Learnt.by_hand(["railway"]), HAND, age_years=231.0).round(3).tolist()
+    >>> worth_of(ScorerModel.by_hand(["railway"]), HAND, age_years=231.0).round(3).tolist()
     [0.485]
     """
-    agree = arm.gains(learnt, age_years=age_years, season=season).agree
-    return np.asarray(AREA_M2 * learnt.temper * agree)
+    agree = arm.gains(model, age_years=age_years, season=season).agree
+    return np.asarray(AREA_M2 * model.scaling * agree)
 
 
 def worth_table(
-    learnt: Learnt, arm: Switches, *, ages_years: Sequence[float] = AGES_YEARS, season: str = ""
+    model: ScorerModel, arm: Switches, *, ages_years: Sequence[float] = AGES_YEARS, season: str = ""
 ) -> pd.DataFrame:
-    """What each class is worth as the map ages: worth, gains and information, a row for each class and age.
+    """Return weights, gains and information of each class as the map ages, a row for each class and age.
 
     Parameters
     ----------
-    learnt : Learnt
-        What is known of the classes.
+    model : ScorerModel
+        Rates of the classes.
     arm : Switches
-        Which weights: by hand or fitted.
+        Weights by hand or fitted.
     ages_years : sequence of float
         Of the map.
     season : str
-        Of the view, "" where none is told.
+        Season of the view, "" if unknown.
 
     Returns
     -------
@@ -125,22 +119,23 @@ def worth_table(
 
     Examples
     --------
-    >>> worth_table(Learnt.by_hand(["railway"]), HAND, ages_years=[0.0]).loc[0, ["worth", "agree", "missed"]].tolist()
+    >>> table = worth_table(ScorerModel.by_hand(["railway"]), HAND, ages_years=[0.0])
+    >>> table.loc[0, ["worth", "agree", "missed"]].tolist()
     [0.97, 0.97, -0.97]
     """
-    persists = learnt.persists(season)
+    persists = model.persists(season)
     parts = []
     for age in ages_years:
-        gains = arm.gains(learnt, age_years=age, season=season)
-        told = [
+        gains = arm.gains(model, age_years=age, season=season)
+        nats = [
             information(rates, age_years=age, persists=float(factor))
-            for rates, factor in zip(learnt.rates, persists, strict=True)
+            for rates, factor in zip(model.rates, persists, strict=True)
         ]
-        about = {"class": learnt.classes, "age_years": float(age), "order": range(len(learnt.classes))}
-        worth = worth_of(learnt, arm, age_years=age, season=season)
+        about = {"class": model.classes, "age_years": float(age), "order": range(len(model.classes))}
+        worth = worth_of(model, arm, age_years=age, season=season)
         parts.append(
             pd.DataFrame(
-                about | {"worth": worth} | {name: getattr(gains, name) for name in GAINS} | {"information": told}
+                about | {"worth": worth} | {name: getattr(gains, name) for name in GAINS} | {"information": nats}
             )
         )
     rows = pd.concat(parts).sort_values(["order", "age_years"], kind="stable", ignore_index=True)
@@ -148,7 +143,7 @@ def worth_table(
 
 
 def rarity_map(region: Region) -> NDArray[np.float32]:
-    """How rare what lies around each cell of a map is, nu of Eq. 6 over its mean on the map, shape (rows, cols)."""
+    """Return the rarity of the surroundings of each cell, nu of Eq. 6 over its mean on the map, shape (rows, cols)."""
     cell_m = region.grid.cell_size_m
     rarity = Rarity.of(region.layers, region.classes, cell_size_m=cell_m)
     return rarity.weights(region.layers, region.classes, cell_size_m=cell_m)
@@ -157,7 +152,7 @@ def rarity_map(region: Region) -> NDArray[np.float32]:
 def weight_map(
     layers: NDArray[np.uint8], worth: NDArray[np.float64], rarity: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Weigh every cell of a map: w = sigma nu, summed over the classes it holds, as Eq. 8 sums them.
+    """Return the weight of every cell of a map: w = sigma nu, summed over its classes as in Eq. 8.
 
     Parameters
     ----------
@@ -188,11 +183,11 @@ def weight_map(
 
 
 def side_by_side(tables: Mapping[str, pd.DataFrame], column: str) -> pd.DataFrame:
-    """One column of some tables: a row for each class, a column for each table and age.
+    """Join one column of several tables: a row for each class, a column for each table and age.
 
     Examples
     --------
-    >>> table = worth_table(Learnt.by_hand(["railway"]), HAND, ages_years=[0.0])
+    >>> table = worth_table(ScorerModel.by_hand(["railway"]), HAND, ages_years=[0.0])
     >>> side_by_side({"hand": table}, "worth").columns.tolist()
     [('hand', 0.0)]
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How rare a local configuration is: Eq. 6 of the SASGeo paper, from how often a map holds one like it."""
+"""Rarity of local configurations, Eq. 6 of the SASGeo paper: from their frequency on a map."""
 
 import warnings
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from scipy.cluster import vq
 
 from sasgeo_bench.regions.evidence import PRESENT
 
-CELL_M: Final = 4.0  # of a configuration: rings hold a handful of cells in each sector
+CELL_M: Final = 4.0  # of a configuration: each sector of a ring holds some cells
 RINGS_M: Final = (16.0, 48.0)  # a junction; a junction and the next houses
 SECTORS: Final = 8
-# What a configuration is made of; classes that stand for each other are one.
+# Classes of a configuration; interchangeable classes form one group.
 GROUPS: Final = (
     ("road_major", "road_minor"),
     ("path_track",),
@@ -27,7 +27,7 @@ GROUPS: Final = (
     ("farmland", "field_boundary"),
     ("bridge",),
 )
-WORDS: Final = 64  # kinds of configurations that are told apart
+WORDS: Final = 64  # kinds of configurations
 EPSILON: Final = 1e-3  # of Eq. 6
 LEAST: Final = 0.25  # of a weight, in means of the map
 MOST: Final = 4.0
@@ -38,18 +38,17 @@ _NOTHING: Final = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Rarity:
-    """Kinds of local configurations of a map, and how rare each is.
+    """Kinds of local configurations of a map and their rarity.
 
     A configuration is the share of each group of classes in the sectors of two rings around a cell, as magnitudes of
-    its Fourier series around the circle, so that turning changes nothing. Kinds are found by k-means; a configuration
-    is similar to those of its kind.
+    its Fourier series around the circle, which are invariant to rotation. Kinds are the clusters of k-means.
 
     Parameters
     ----------
     middle, spread : ndarray of float, shape (D,)
-        What configurations are standardised with.
+        Mean and standard deviation of configurations.
     words : ndarray of float, shape (W, D)
-        Middle of each kind.
+        Centre of each kind.
     weight : ndarray of float, shape (W,)
         -log(share of the kind + epsilon), Eq. 6, over its mean on the map.
     """
@@ -61,7 +60,7 @@ class Rarity:
 
     @classmethod
     def of(cls, layers: NDArray[np.uint8], classes: Sequence[str], *, cell_size_m: float) -> Self:
-        """Find the kinds of configurations of a map where anything is drawn.
+        """Find the kinds of configurations of a map around cells with any class.
 
         Parameters
         ----------
@@ -98,7 +97,7 @@ class Rarity:
         rng = np.random.default_rng(0)
         starts = starts[np.sort(rng.permutation(len(starts))[:WORDS])]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that a kind has lost its last configuration: it is left as it was
+            warnings.simplefilter("ignore")  # an empty cluster keeps its centre
             words = vq.kmeans2(few, starts, iter=_ROUNDS, minit="matrix")[0].astype(np.float32)
         word = _nearest(standard, words)
         share = np.bincount(word, minlength=len(words)) / len(word)
@@ -108,9 +107,9 @@ class Rarity:
         return cls(middle=middle, spread=spread, words=words, weight=relative.astype(np.float32))
 
     def weights(self, layers: NDArray[np.uint8], classes: Sequence[str], *, cell_size_m: float) -> NDArray[np.float32]:
-        """How rare what is around each cell of a map or a view is, shape (rows, cols); the map's mean is 1.
+        """Return the rarity around each cell of a map or a view, shape (rows, cols); the mean of the map is 1.
 
-        Where nothing is drawn within reach it is 1: nothing there is anything's configuration.
+        Cells without any class have rarity 1.
         """
         found, drawn = _configurations(layers, classes, cell_size_m=cell_size_m)
         nu = np.ones(drawn.shape, dtype=np.float32)
@@ -121,7 +120,7 @@ class Rarity:
 
 
 def _nearest(rows: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Index of the nearest word of each row."""
+    """Return the index of the nearest word of each row."""
     far = (words**2).sum(axis=1) - 2 * rows @ words.T
     return np.asarray(far.argmin(axis=1))
 
@@ -129,7 +128,7 @@ def _nearest(rows: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[n
 def _configurations(
     layers: NDArray[np.uint8], classes: Sequence[str], *, cell_size_m: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What is around each cell of `CELL_M`, shape (rows, cols, D), and where anything is drawn."""
+    """Return configurations around cells of `CELL_M`, shape (rows, cols, D), and which cells hold any class."""
     factor = max(1, round(CELL_M / cell_size_m))
     size = (-(-layers.shape[2] // factor), -(-layers.shape[1] // factor))
     kernels = _sectors(cell_size_m * factor)
@@ -146,7 +145,7 @@ def _configurations(
 
 
 def _sectors(cell_m: float) -> list[list[NDArray[np.float32]]]:
-    """Kernels of mean, one for each sector of each ring."""
+    """Return a mean kernel for each sector of each ring."""
     reach = int(np.ceil(RINGS_M[-1] / cell_m))
     down, right = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     far_m, turn = np.hypot(down, right) * cell_m, np.arctan2(-down, right)

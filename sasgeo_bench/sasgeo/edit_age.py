@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each feature by its own age: how much what nobody has touched for years is worth, from OSM timestamps (Eq. 5)."""
+"""Weights of features by the time since their last edit, from OSM timestamps (Eq. 5)."""
 
 import datetime as dt
 from collections.abc import Sequence
@@ -14,21 +14,21 @@ from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 
-IDLE_YEARS: Final = (1.0, 3.0, 6.0)  # since the last edit, at the date of the map
+IDLE_YEARS: Final = (1.0, 3.0, 6.0)  # from the last edit to the date of the map
 STRATA: Final = len(IDLE_YEARS) + 1
 NEVER: Final = STRATA  # no feature of the class
 
 _DAYS_PER_YEAR: Final = 365.25
-_CELLS_PER_WITNESS: Final = 200.0  # as of rates
-_WITNESSES: Final = 20.0  # what a stratum weighs against all of its class, before it is trusted
+_CELLS_PER_WITNESS: Final = 200.0  # as for rates
+_WITNESSES: Final = 20.0  # weight of the class mean in the estimate of a stratum
 _EDGE: Final = 1e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampTally:
-    """Cells of one view at its true place that the map gives each class, by stratum; shape (C, STRATA) each.
+    """Counts of cells of one view on each class of the map at the true place, by stratum; shape (C, STRATA) each.
 
-    `far_seen` and `far_missed`, shape (C,), count those far from the class.
+    `far_seen` and `far_missed`, shape (C,), count cells far from the class.
     """
 
     seen: NDArray[np.int64]
@@ -38,7 +38,7 @@ class StampTally:
 
 
 def idle_years(edited: pd.Series, date: dt.date) -> NDArray[np.float64]:
-    """Years from the last edit of each feature to a map's date, shape (N,); 0 where OSM tells no time.
+    """Return years from the last edit of each feature to the date of a map, shape (N,); 0 without a timestamp.
 
     Examples
     --------
@@ -51,12 +51,7 @@ def idle_years(edited: pd.Series, date: dt.date) -> NDArray[np.float64]:
 
 
 def strata(region: Region) -> NDArray[np.uint8]:
-    """Stratum of the feature that a class has in each cell, that touched last where there are several.
-
-    Parameters
-    ----------
-    region : Region
-        The map.
+    """Return the stratum of the feature of each class in each cell, of several the last edited.
 
     Returns
     -------
@@ -74,10 +69,10 @@ def strata(region: Region) -> NDArray[np.uint8]:
 
 
 def fit_trust(tallies: Sequence[StampTally]) -> NDArray[np.float64]:
-    """How much a cell of each stratum is like one that was edited lately, 0..1, shape (C, STRATA).
+    """Return the trust in each stratum relative to recent edits, 0..1, shape (C, STRATA).
 
-    As `rates.likeness` does it for distance: logarithms of the share that was seen, between those of the stratum that
-    is seen most and those far from the class. Strata with few cells are as their class.
+    Like `rates.likeness` for distance: logarithms of the share of cells seen, scaled between the stratum seen most and
+    cells far from the class. Strata with few cells are drawn to the mean of their class.
 
     Examples
     --------
@@ -101,7 +96,7 @@ def fit_trust(tallies: Sequence[StampTally]) -> NDArray[np.float64]:
 
 
 def stamp_tally(seen: NDArray[np.uint8], under: NDArray[np.uint8], stratum: NDArray[np.uint8], far: int) -> StampTally:
-    """Count the cells of a view by the stratum of what the map has under it.
+    """Count the cells of a view by the stratum of the map under it.
 
     Parameters
     ----------
@@ -112,7 +107,7 @@ def stamp_tally(seen: NDArray[np.uint8], under: NDArray[np.uint8], stratum: NDAr
     stratum : ndarray of uint8, shape (C, rows, cols)
         `strata` of the map, likewise.
     far : int
-        The ring that is far away.
+        Index of the ring for cells far from a class.
 
     Examples
     --------
@@ -122,7 +117,7 @@ def stamp_tally(seen: NDArray[np.uint8], under: NDArray[np.uint8], stratum: NDAr
     """
 
     def count(state: int, where: NDArray[np.uint8], index: int) -> NDArray[np.int64]:
-        """Cells of one state in one stratum, by class."""
+        """Count cells of one state in one stratum, by class."""
         return np.asarray(((seen == state) & (where == index)).sum(axis=(1, 2)), dtype=np.int64)
 
     on = np.where(under == 0, stratum, np.uint8(NEVER))

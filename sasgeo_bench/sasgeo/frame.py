@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers -> rows without gaps: what `sasgeo_logistic` and `sasgeo_boosted` are fitted on."""
+"""Features of answers, without gaps: the input of `sasgeo_logistic` and `sasgeo_boosted`."""
 
 import math
 from collections.abc import Sequence
@@ -15,27 +15,21 @@ from sasgeo_bench.sasgeo.integrity import APART_M, EVIDENCE
 
 Rows = NDArray[np.float64]
 
-_MOST: Final = 1e100  # larger numbers are taken for this one, so that squares and differences stay finite
-_FAR: Final = 10.0  # standard deviations: beyond what calibration has seen, farther is no more
-_NEAR: Final = 1e-12  # a smaller spread is none
-_SURE: Final = 1e-6  # a confidence is no nearer to 0 or 1
+_MOST: Final = 1e100  # numbers are clipped to it, so that squares and differences stay finite
+_FAR: Final = 10.0  # standard deviations: features are clipped to it
+_NEAR: Final = 1e-12  # a smaller spread is zero
+_SURE: Final = 1e-6  # least distance of a confidence from 0 and 1
 
 
 def is_none(prediction: Prediction) -> bool:
-    """Whether there is no answer that could be right by more than luck: none at all, or one to a view wholly unknown.
-
-    Examples
-    --------
-    >>> is_none(Prediction(query_id="a"))
-    True
-    """
+    """Tell if an answer has no candidate, or its view was wholly unknown."""
     return not prediction.candidates or 1.0 <= prediction.diagnostics.get("unknown_share", 0.0) < math.inf
 
 
 def lead(prediction: Prediction) -> float:
-    """Score of the first candidate less that of the best one outside the suppression radius, in the matcher's units.
+    """Return the score of the first candidate less that of the best one outside the suppression radius.
 
-    Less that of the last one where none lies outside: a rival that is not given is no better.
+    Without one outside, less that of the last candidate: a rival that was not returned scores no better.
 
     Examples
     --------
@@ -61,31 +55,25 @@ def _clipped(value: float) -> float:
 
 
 def features(answers: Sequence[Prediction]) -> Rows:
-    """What answers tell, shape (N, 2 + evidence): lead, confidence, then `EVIDENCE`; NaN where it is not told.
-
-    Examples
-    --------
-    >>> features([]).shape[1] == 2 + len(EVIDENCE)
-    True
-    """
+    """Return features of answers, shape (N, 2 + evidence): lead, confidence, then `EVIDENCE`; NaN where missing."""
     return np.array([_row(item) for item in answers], dtype=np.float64).reshape(-1, 2 + len(EVIDENCE))
 
 
 def _row(answer: Prediction) -> list[float]:
-    told = [answer.diagnostics.get(item.name, math.nan) for item in EVIDENCE]
+    given = [answer.diagnostics.get(item.name, math.nan) for item in EVIDENCE]
     scaled = [
         math.asinh(_clipped(value)) if item.is_wide else _clipped(value)
-        for item, value in zip(EVIDENCE, told, strict=True)
+        for item, value in zip(EVIDENCE, given, strict=True)
     ]
-    gaps = [math.nan if not math.isfinite(raw) else value for raw, value in zip(told, scaled, strict=True)]
+    gaps = [math.nan if not math.isfinite(raw) else value for raw, value in zip(given, scaled, strict=True)]
     sure = math.nan if answer.confidence is None else min(max(answer.confidence, _SURE), 1.0 - _SURE)
-    is_told = answer.confidence is not None and math.isfinite(answer.confidence)
-    return [math.asinh(lead(answer)), float(special.logit(sure)) if is_told else math.nan, *gaps]
+    is_given = answer.confidence is not None and math.isfinite(answer.confidence)
+    return [math.asinh(lead(answer)), float(special.logit(sure)) if is_given else math.nan, *gaps]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """How raw features become rows without gaps: medians, flags, means and spreads of calibration."""
+    """Medians, flags, means and spreads of calibration, which turn raw features into rows without gaps."""
 
     medians: NDArray[np.float64]
     is_flagged: NDArray[np.bool_]
@@ -94,20 +82,20 @@ class Frame:
 
     @classmethod
     def of(cls, raw: Rows) -> Self:
-        """Learn them; a feature that no answer tells is 0 for all, and so says nothing."""
+        """Fit to raw features; a feature that all answers lack is 0."""
         gap = np.isnan(raw)
-        is_told = np.asarray(~gap.all(axis=0))
+        is_given = np.asarray(~gap.all(axis=0))
         medians = np.zeros(raw.shape[1])
-        medians[is_told] = np.nanmedian(raw[:, is_told], axis=0)
-        is_flagged = np.asarray(gap.any(axis=0) & is_told)
+        medians[is_given] = np.nanmedian(raw[:, is_given], axis=0)
+        is_flagged = np.asarray(gap.any(axis=0) & is_given)
         rows = cls._with_flags(raw, medians, is_flagged)
         spreads = rows.std(axis=0)
-        # Of what never varied in calibration nothing was learnt: were it 1 here, a new value would count.
+        # A feature that is constant in calibration must not count later: its spread is infinite.
         spreads = np.where((spreads > _NEAR * np.maximum(1.0, np.abs(rows).max(axis=0))), spreads, np.inf)
         return cls(medians=medians, is_flagged=is_flagged, means=rows.mean(axis=0), spreads=spreads)
 
     def filled(self, raw: Rows) -> Rows:
-        """Standardised features and flags, shape (N, features + flags)."""
+        """Return standardised features and flags, shape (N, features + flags)."""
         rows = self._with_flags(raw, self.medians, self.is_flagged)
         return np.asarray(np.clip((rows - self.means) / self.spreads, -_FAR, _FAR))
 

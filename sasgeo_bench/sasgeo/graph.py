@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph score of the SASGeo paper, Eq. 9: which nodes of a view are which of the map, and how they relate.
+"""Graph score of the SASGeo paper, Eq. 9: correspondences of nodes of a view and a map, and their relations.
 
-Every term is the logarithm of a likelihood ratio: a view taken here against one taken somewhere like it. A node seen
-where one is mapped says log(hit p(offset) / density), one that is not mapped log(extra), one that is not seen
-log(1 - hit), and neighbours that are moved alike, or not, come on top. Chances are set by hand (`kinds.KINDS`,
-`ratios.GraphRules`) and can be replaced by fitted ones.
+Every term is a log-likelihood ratio of a view from here against one from a similar place. A seen node that is mapped
+adds log(hit p(offset) / density), one that is not mapped log(extra), a mapped one that is not seen log(1 - hit);
+relations of neighbours add to this. Probabilities are set by hand (`kinds.KINDS`, `ratios.GraphRules`).
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,6 @@ from typing import Final, Self
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.sasgeo.kinds import KINDS
 from sasgeo_bench.sasgeo.mapped import MappedGraph
@@ -27,27 +25,23 @@ _EXTRA: Final = np.array([kind.extra for kind in KINDS])
 _SPREAD_M: Final = np.array([kind.spread_m for kind in KINDS])
 _NONE: Final[frozenset[int]] = frozenset()
 _SLACK_M: Final = 1.0
-_LEAST_MATCHED: Final = 3  # that tell how the ground is moved around a node
-
-
-DEFAULT_RULES: Final = GraphRules()
+_LEAST_MATCHED: Final = 3  # nodes needed to estimate a local shift
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphScore:
-    """What the graph says of one pose.
+    """Graph score of one pose, and its counts.
 
     Parameters
     ----------
     score : float
-        Natural logarithm of a likelihood ratio; 0 where nothing can be said.
+        Log-likelihood ratio, nats; 0 without evidence.
     matched, unmatched_seen, unmatched_mapped : int
-        Nodes of the view found on the map; those not found where the map is known; those of the map not seen where the
-        view is.
+        Matched nodes; nodes of the view without a match on known map; visible nodes of the map without a match.
     agreeing, contradicting : int
-        Edges between matched nodes that are alike on both sides, and that are not.
+        Edges between matched nodes that agree on both sides, and that contradict.
     consistency : float
-        Share of what agrees in all that was judged, 0..1; 0 where nothing was.
+        Share of agreeing nodes and edges among all judged ones, 0..1; 0 without any.
     rms_m : float
         Root mean square offset of matched nodes; 0 without any.
     """
@@ -66,12 +60,8 @@ def verify(
     seen: ObservedGraph,
     mapped: MappedGraph,
     poses: Sequence[Pose],
-    *,
-    rules: GraphRules = DEFAULT_RULES,
-    seen_weights: Floats | None = None,
-    mapped_weights: Floats | None = None,
 ) -> list[GraphScore]:
-    """Score poses by Eq. 9 of the paper, each with its best correspondences.
+    """Return the score of Eq. 9 of each pose, with its best correspondences.
 
     Parameters
     ----------
@@ -80,21 +70,12 @@ def verify(
     mapped : MappedGraph
         The map.
     poses : sequence of Pose
-        Where the view may have been taken.
-    rules : GraphRules
-        Tolerances and likelihood ratios.
-    seen_weights, mapped_weights : ndarray of float, shapes (N,) and (M,), optional
-        The paper's w_i: what each node counts, 1 unless given. A pair counts the product of both.
+        Hypotheses.
 
     Returns
     -------
     list of GraphScore
         One for each pose.
-
-    Raises
-    ------
-    ShapeError
-        If weights are not one for each node, or negative.
 
     Examples
     --------
@@ -117,28 +98,13 @@ def verify(
     >>> here.score > turned.score
     True
     """
-    judge = _Judge(
-        seen=seen,
-        mapped=mapped,
-        rules=rules,
-        seen_weights=_checked(seen_weights, len(seen.nodes), "seen_weights"),
-        mapped_weights=_checked(mapped_weights, len(mapped.nodes), "mapped_weights"),
-        pull=_pull(seen.nodes.places_m, rules.stretch_m),
-    )
+    rules = GraphRules()
+    judge = _Judge(seen=seen, mapped=mapped, rules=rules, pull=_pull(seen.nodes.places_m, rules.stretch_m))
     return [judge.score(pose) for pose in poses]
 
 
-def _checked(weights: Floats | None, count: int, name: str) -> Floats:
-    if weights is None:
-        return np.ones(count)
-    if weights.shape != (count,) or not (np.isfinite(weights) & (weights >= 0)).all():
-        message = f"{name} is one finite weight of at least 0 for each of {count} nodes, got shape {weights.shape}"
-        raise ShapeError(message)
-    return weights
-
-
 def _pull(places_m: Floats, stretch_m: float) -> Floats:
-    """How much each node follows each other one, shape (N, N); none follows itself."""
+    """Return the influence of each node on the shift of others, shape (N, N), 0 on the diagonal."""
     apart_2 = ((places_m[:, None] - places_m[None]) ** 2).sum(axis=2)
     pull = np.exp(-apart_2 / (2 * stretch_m**2))
     np.fill_diagonal(pull, 0.0)
@@ -147,9 +113,9 @@ def _pull(places_m: Floats, stretch_m: float) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Stage:
-    """A view at a pose: its nodes on the map, the nodes of the map around, and what they are worth unmatched.
+    """A view at a pose: its nodes on the map, map nodes around, and the (negative) scores of unmatched nodes.
 
-    `around` are rows of the map's nodes; `lost_seen` and `lost_mapped` the (negative) worth of nodes left unmatched.
+    `around` are rows of the map nodes.
     """
 
     pose: Pose
@@ -161,30 +127,28 @@ class _Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pairs:
-    """Nodes that may be the same: rows of the view's and of the stage's, and what each pair is worth."""
+    """Candidate correspondences: rows of nodes of the view and of `_Stage.around`, and the score of each pair."""
 
     seen: Ints
     mapped: Ints
-    worth: Floats
+    score: Floats
 
     def some(self, keep: Bools) -> Self:
-        """Those that are kept."""
-        return type(self)(seen=self.seen[keep], mapped=self.mapped[keep], worth=self.worth[keep])
+        """Return selected pairs."""
+        return type(self)(seen=self.seen[keep], mapped=self.mapped[keep], score=self.score[keep])
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Judge:
-    """A view and a map, to be held against each other pose by pose."""
+    """A view and a map, to be compared pose by pose."""
 
     seen: ObservedGraph
     mapped: MappedGraph
     rules: GraphRules
-    seen_weights: Floats
-    mapped_weights: Floats
     pull: Floats
 
     def score(self, pose: Pose) -> GraphScore:
-        """Assign, let each node follow its neighbours, assign again and add up."""
+        """Assign, shift each node with its neighbours, assign again and sum up."""
         stage = self._stage(pose)
         pairs = self._assigned(stage, np.zeros_like(stage.places_m))
         if len(pairs.seen) >= _LEAST_MATCHED:
@@ -208,16 +172,16 @@ class _Judge:
             pose=pose,
             places_m=places_m,
             around=around,
-            lost_seen=np.where(counts, np.log(_EXTRA[ours.kind]), 0.0) * self.seen_weights,
-            lost_mapped=np.where(is_due, np.log1p(-_HIT[kind]), 0.0) * self.mapped_weights[around],
+            lost_seen=np.where(counts, np.log(_EXTRA[ours.kind]), 0.0),
+            lost_mapped=np.where(is_due, np.log1p(-_HIT[kind]), 0.0),
         )
 
     def _assigned(self, stage: _Stage, shift_m: Floats) -> _Pairs:
-        """Best one-to-one correspondences within the gate around where nodes are, moved by a shift."""
+        """Return the best one-to-one correspondences within the gate around shifted nodes."""
         pairs = self._near(stage, shift_m)
-        gain = pairs.worth - stage.lost_seen[pairs.seen] - stage.lost_mapped[pairs.mapped]
+        gain = pairs.score - stage.lost_seen[pairs.seen] - stage.lost_mapped[pairs.mapped]
         off_m = self._offsets_m(stage, pairs) - shift_m[pairs.seen]
-        if shift_m.any():  # what goes with its neighbours is preferred
+        if shift_m.any():  # prefer offsets like those of neighbours
             gain -= (off_m**2).sum(axis=1) / (2 * self.rules.place_sigma_m**2)
         table = np.zeros((len(stage.places_m), len(stage.around)))
         table[pairs.seen, pairs.mapped] = np.maximum(gain, 0.0)
@@ -228,31 +192,31 @@ class _Judge:
         return pairs.some(chosen[pairs.seen, pairs.mapped] & (gain > 0))
 
     def _near(self, stage: _Stage, shift_m: Floats) -> _Pairs:
-        """Pairs of one kind within the gate, and what each is worth."""
+        """Return pairs of one kind within the gate and their scores."""
         ours, theirs, rules = self.seen.nodes, self.mapped.nodes, self.rules
         at_m = stage.places_m + shift_m
         gate_m = rules.gate_m + _SPREAD_M[ours.kind]
         row, there = self.mapped.like(at_m, ours.kind, gate_m)
         col = np.searchsorted(stage.around, there)
         kind = ours.kind[row]
-        pairs = _Pairs(seen=row, mapped=col, worth=np.zeros(len(row)))
+        pairs = _Pairs(seen=row, mapped=col, score=np.zeros(len(row)))
         sigma_m = np.hypot(rules.place_sigma_m, _SPREAD_M[kind])
         apart_2 = (self._offsets_m(stage, pairs) ** 2).sum(axis=1)
         dense = np.exp(-apart_2 / (2 * sigma_m**2)) / (2 * np.pi * sigma_m**2)
         flat = 1 / (np.pi * gate_m[row] ** 2)
         place = np.log((1 - rules.wander) * dense + rules.wander * flat) - np.log(self.mapped.density_per_m2[kind])
-        worth = np.log(_HIT[kind]) + place
-        worth += by_degree(ours.degree[row], theirs.degree[there], rules)
-        worth += by_area(ours.area_m2[row] * stage.pose.scale**2, theirs.area_m2[there], rules)
-        worth += by_arms(ours.arms_deg[row] + stage.pose.yaw_deg, theirs.arms_deg[there], rules)
-        return _Pairs(seen=row, mapped=col, worth=worth * self.seen_weights[row] * self.mapped_weights[there])
+        score = np.log(_HIT[kind]) + place
+        score += by_degree(ours.degree[row], theirs.degree[there], rules)
+        score += by_area(ours.area_m2[row] * stage.pose.scale**2, theirs.area_m2[there], rules)
+        score += by_arms(ours.arms_deg[row] + stage.pose.yaw_deg, theirs.arms_deg[there], rules)
+        return _Pairs(seen=row, mapped=col, score=score)
 
     def _offsets_m(self, stage: _Stage, pairs: _Pairs) -> Floats:
-        """From where the pose puts a node to where the map has it, shape (P, 2)."""
+        """Return offsets from nodes of the view to those of the map, shape (P, 2)."""
         return np.asarray(self.mapped.nodes.places_m[stage.around[pairs.mapped]] - stage.places_m[pairs.seen])
 
     def _shift_m(self, stage: _Stage, pairs: _Pairs) -> Floats:
-        """How the neighbours of each node are moved, itself left out, drawn towards not at all."""
+        """Return the mean offset of the neighbours of each node, without itself, shrunk towards 0."""
         follows = self.pull[:, pairs.seen]
         shift_m = (follows @ self._offsets_m(stage, pairs)) / (follows.sum(axis=1, keepdims=True) + 1.0)
         length_m = np.hypot(*shift_m.T)[:, None]
@@ -268,7 +232,7 @@ class _Judge:
         fine = 2 * len(pairs.seen) + good
         judged = fine + sum(missing) + bad
         return GraphScore(
-            score=float(pairs.worth.sum() + lost_seen.sum() + lost_mapped.sum() + edges.sum()),
+            score=float(pairs.score.sum() + lost_seen.sum() + lost_mapped.sum() + edges.sum()),
             matched=len(pairs.seen),
             unmatched_seen=missing[0],
             unmatched_mapped=missing[1],
@@ -279,7 +243,7 @@ class _Judge:
         )
 
     def _by_neighbours(self, stage: _Stage, pairs: _Pairs, off_m: Floats) -> Floats:
-        """Worth of the relative place of neighbours that are both matched."""
+        """Return scores of the relative places of matched neighbours."""
         at = np.full(len(stage.places_m), -1)
         at[pairs.seen] = np.arange(len(pairs.seen))
         ends = at[self.seen.near]
@@ -289,45 +253,37 @@ class _Judge:
         spread_2 = (_SPREAD_M[self.seen.nodes.kind[near]] ** 2).sum(axis=1)
         sigma_2 = rules.edge_sigma_m**2 + (rules.edge_strain * length_m) ** 2 + spread_2
         apart_2 = ((off_m[ends[:, 0]] - off_m[ends[:, 1]]) ** 2).sum(axis=1)
-        chance_2 = 2 * rules.place_sigma_m**2 + spread_2  # two offsets that have nothing to do with each other
+        chance_2 = 2 * rules.place_sigma_m**2 + spread_2  # of two independent offsets
         ratio = np.log(chance_2 / sigma_2) - apart_2 / 2 * (1 / sigma_2 - 1 / chance_2)
         ratio = np.where(sigma_2 < chance_2, np.maximum(ratio, np.log(rules.wander)), 0.0)
-        return np.asarray(rules.edge_weight * ratio * self._edge_weights(stage, pairs, ends))
+        return np.asarray(rules.edge_weight * ratio)
 
     def _by_links(self, stage: _Stage, pairs: _Pairs) -> Floats:
-        """Worth of ways between matched nodes, on both sides or on one of them alone.
+        """Return scores of ways between matched nodes, on both sides or on one.
 
-        A way that runs past a node unmatched on the other side is no contradiction: that node was counted.
+        A way past an unmatched node is no contradiction: that node is counted already.
         """
         ours, theirs, rules = self.seen.links, self.mapped.links, self.rules
         to_map = dict(zip(pairs.seen.tolist(), stage.around[pairs.mapped].tolist(), strict=True))
         to_view = {there: here for here, there in to_map.items()}
-        row = {here: at for at, here in enumerate(to_map)}
-        found: list[tuple[float, int, int]] = []
+        found: list[float] = []
         for one, there in to_map.items():
             for two in ours.get(one, _NONE):
                 if one < two and two in to_map:
                     if to_map[two] in theirs.get(there, _NONE):
-                        found.append((rules.link, row[one], row[two]))
+                        found.append(rules.link)
                     elif not _passes(theirs, there, to_map[two], matched=to_view):
-                        found.append((rules.false_link, row[one], row[two]))
+                        found.append(rules.false_link)
         for one, here in to_view.items():
             for two in theirs.get(one, _NONE):
                 if one < two and two in to_view:
                     other = to_view[two]
                     if other not in ours.get(here, _NONE) and not _passes(ours, here, other, matched=to_map):
-                        found.append((rules.lost_link, row[here], row[other]))
-        worth = np.array([item[0] for item in found])
-        ends = np.array([item[1:] for item in found], dtype=np.int64).reshape(-1, 2)
-        return np.asarray(worth * self._edge_weights(stage, pairs, ends))
-
-    def _edge_weights(self, stage: _Stage, pairs: _Pairs, ends: Ints) -> Floats:
-        """The paper's w_ik: geometric mean of those of the ends."""
-        mine = self.seen_weights[pairs.seen] * self.mapped_weights[stage.around[pairs.mapped]]
-        return np.asarray(np.sqrt(mine[ends[:, 0]] * mine[ends[:, 1]]))
+                        found.append(rules.lost_link)
+        return np.array(found, dtype=np.float64)
 
 
 def _passes(links: dict[int, set[int]], one: int, two: int, *, matched: dict[int, int]) -> bool:
-    """Whether a way leads from one node to another past one that is not matched."""
+    """Tell if a way leads from one node to another past an unmatched one."""
     between = links.get(one, _NONE) & links.get(two, _NONE)
     return any(node not in matched for node in between)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an answer tells of its own soundness: the evidence E of Eqs. 12-14 of the SASGeo paper, by frozen names.
+"""Integrity evidence of an answer: E of Eqs. 12-14 of the SASGeo paper, by fixed names.
 
-A matcher puts these into the diagnostics of its answers; rejectors read them there. All say the same of any map: none
-is in the units of one matcher's score.
+A matcher adds these to the diagnostics of its answers; rejectors read them there. None depends on the units of a
+matcher's score.
 """
 
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from scipy import special
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.search.plan import Null, posterior
 
-APART_M: Final = 25.0  # the widest tolerance of the benchmark: what lies nearer is the same answer
-RIVAL_SHARE: Final = 0.05  # of the chosen mode's mass, from which on another one counts as a rival
+APART_M: Final = 25.0  # the widest tolerance of the benchmark: nearer modes are one answer
+RIVAL_SHARE: Final = 0.05  # least mass of a rival, relative to the chosen mode
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnostic:
-    """A number that an answer may tell.
+    """A diagnostic of an answer.
 
     Parameters
     ----------
@@ -31,9 +31,9 @@ class Diagnostic:
     unit : str
         As in "m", "nat"; "1" where there is none.
     meaning : str
-        What it is, in one line.
+        Description in one line.
     is_wide : bool
-        Whether it spans orders of magnitude, so that a model takes its inverse hyperbolic sine.
+        It spans orders of magnitude, so models use its inverse hyperbolic sine.
     """
 
     name: str
@@ -104,24 +104,23 @@ EVIDENCE: Final = (
     ),
 )
 EVIDENCE_NAMES: Final = tuple(item.name for item in EVIDENCE)
-_TOLD: Final = frozenset(
+_FROM_MATCHER: Final = frozenset(
     {"graph_consistency", "unknown_share", "information_nats", "map_age_years", "vio_mahalanobis"}
-)  # no function of the modes: the matcher has to say them
+)  # not computed from the modes: the matcher supplies them
 
 
 @dataclass(frozen=True, kw_only=True)
 class Modes:
-    """Modes of one search, the chosen one first, and what each class says of each.
+    """Modes of one search, the chosen one first, with scores by class.
 
     Parameters
     ----------
     positions_m : ndarray of float, shape (M, 2)
         Easting and northing.
     by_class : ndarray of float, shape (M, C)
-        Tempered scores in nats, whose sum over classes is the score of the mode; whatever else makes up the score, as
-        a graph does, is one more class.
+        Scaled scores in nats, which sum to the score of the mode; other terms, such as the graph, count as classes.
     none_nats : float
-        Score of none of them being right.
+        Score of no mode being right.
     sigma_m : float
         Standard deviation of a refined position along either axis, from the curvature of the score or measured on
         training blocks.
@@ -144,7 +143,7 @@ class Modes:
     none_nats: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no list of modes."""
+        """Check shapes and numbers."""
         count = len(self.positions_m)
         shapes = (np.shape(self.positions_m), np.shape(self.by_class)[:1])
         if not count or shapes != ((count, 2), (count,)) or np.ndim(self.by_class) != 2:  # noqa: PLR2004 - (M, C)
@@ -170,7 +169,7 @@ class Modes:
     @cached_property
     def masses(self) -> NDArray[np.float64]:
         """Posterior probability of each mode and, last, of none, shape (M + 1,)."""
-        return posterior(self.scores.tolist(), temper=1.0, null_score=self.none_nats)
+        return posterior(self.scores.tolist(), null_score=self.none_nats)
 
     @cached_property
     def shares(self) -> NDArray[np.float64]:
@@ -183,8 +182,8 @@ class Modes:
         return np.asarray(np.hypot(*(self.positions_m - self.positions_m[0]).T))
 
 
-def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None) -> dict[str, float]:
-    """Everything of `EVIDENCE` that can be said of an answer; what cannot is left out.
+def evidence_of(modes: Modes, *, null: Null | None = None, **given: float | None) -> dict[str, float]:
+    """Return the `EVIDENCE` of an answer that is available.
 
     Parameters
     ----------
@@ -192,9 +191,9 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None)
         Of the search.
     null : Null, optional
         Coarse scores of all places.
-    told : float or None
-        What is no function of the modes: `graph_consistency`, `unknown_share`, `information_nats`, `map_age_years`,
-        `vio_mahalanobis`. None and NaN are left out.
+    given : float or None
+        Evidence not computed from the modes: `graph_consistency`, `unknown_share`, `information_nats`, `map_age_years`,
+        `vio_mahalanobis`. None and NaN are dropped.
 
     Returns
     -------
@@ -204,7 +203,7 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None)
     Raises
     ------
     ShapeError
-        If something is told that has no name there.
+        If a name is unknown.
 
     Examples
     --------
@@ -219,9 +218,9 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None)
     >>> found["margin_nats"], found["class_agreement"], found["modes_above"], found["unknown_share"]
     (3.0, 0.8, 1.0, 0.25)
     """
-    foreign = next((name for name in told if name not in _TOLD), None)
+    foreign = next((name for name in given if name not in _FROM_MATCHER), None)
     if foreign is not None:
-        message = f"{foreign!r} is nothing a matcher may tell besides its modes, known are {', '.join(sorted(_TOLD))}"
+        message = f"{foreign!r} is no evidence that a matcher supplies, known are {', '.join(sorted(_FROM_MATCHER))}"
         raise ShapeError(message)
     rivals = np.flatnonzero(modes.away_m >= APART_M)
     rival = rivals[np.argmax(modes.scores[rivals])] if len(rivals) else None
@@ -234,13 +233,13 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **told: float | None)
         "spread_m": np.sqrt(modes.shares @ ((modes.positions_m - middle_m) ** 2).sum(axis=1)),
         "null_z": None if null is None or not null.deviation > 0 else (null.best - null.mean) / null.deviation,
         "class_agreement": _agreement(modes.by_class[0] - (0.0 if rival is None else modes.by_class[rival])),
-        **told,
+        **given,
     }
     known = {name: found.get(name) for name in EVIDENCE_NAMES}
     return {name: float(value) for name, value in known.items() if value is not None and np.isfinite(value)}
 
 
 def _agreement(leads: NDArray[np.float64]) -> float | None:
-    """Share of what is said that speaks for; None where nothing is said."""
-    said = np.abs(leads).sum()
-    return float(leads[leads > 0].sum() / said) if said > 0 else None
+    """Return the fraction of the evidence that supports the chosen mode; None without evidence."""
+    total = np.abs(leads).sum()
+    return float(leads[leads > 0].sum() / total) if total > 0 else None

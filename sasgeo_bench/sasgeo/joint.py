@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph, and what speaks against."""
+"""Joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph and contradiction."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -9,31 +9,26 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
 
-SIGHT: Final = 6.0  # nodes: a graph of so many has half its say
+HALF_NODES: Final = 6.0  # a graph of so many nodes has half its weight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Blend:
-    """Weights of Eq. 11 where all there is to see is seen; of odometry (gamma) there is none in single views.
+    """Weights of Eq. 11 for a graph with many nodes; single views have no odometry term (gamma).
 
     Parameters
     ----------
     alpha : float
-        Of the raster's score.
+        Weight of the raster.
     beta : float
-        Of the graph's score.
+        Weight of the graph.
     eta : float
-        Of the contradiction.
+        Weight of the contradiction.
 
     Raises
     ------
     ConfigError
         If one is negative or not finite.
-
-    Examples
-    --------
-    >>> Blend().beta
-    0.5
     """
 
     alpha: float = 1.0
@@ -41,7 +36,7 @@ class Blend:
     eta: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse what would turn a term around."""
+        """Refuse weights that are negative or not finite."""
         for name in ("alpha", "beta", "eta"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
@@ -50,9 +45,9 @@ class Blend:
 
 
 def contradiction(by_class: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the classes that speak against a mode say in sum, nats, shape (M,), of scores by class, shape (M, C).
+    """Return the sum of negative class scores of each mode, nats, shape (M,), from scores of shape (M, C).
 
-    The raster's sum lets a class that agrees much cover up another that contradicts; this does not.
+    In the raster score a class that agrees can hide one that contradicts; here it cannot.
 
     Examples
     --------
@@ -65,18 +60,18 @@ def contradiction(by_class: NDArray[np.float64]) -> NDArray[np.float64]:
 def columns(
     by_class: NDArray[np.float64], graph: NDArray[np.float64] | None, blend: Blend, *, nodes: int
 ) -> NDArray[np.float64]:
-    """Terms of Eq. 11 for each mode, whose sum over columns is the joint score: classes, graph, contradiction.
+    """Return the terms of Eq. 11 for each mode, whose sum is the joint score: classes, graph, contradiction.
 
     Parameters
     ----------
     by_class : ndarray of float, shape (M, C)
-        Tempered raster scores, nats.
+        Scaled raster scores, nats.
     graph : ndarray of float, shape (M,), optional
-        Scores by Eq. 9; without them the raster decides alone.
+        Scores of Eq. 9; without them the raster decides alone.
     blend : Blend
         Weights.
     nodes : int
-        Nodes that were seen: what there is of a graph decides what it may say.
+        Number of nodes seen, which sets the weight of the graph.
 
     Returns
     -------
@@ -91,5 +86,5 @@ def columns(
     raster = blend.alpha * by_class
     if graph is None:
         return raster
-    share = nodes / (nodes + SIGHT)
+    share = nodes / (nodes + HALF_NODES)
     return np.column_stack((raster, blend.beta * share * graph, -blend.eta * contradiction(by_class)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinds of nodes, what draws them, and how they are seen."""
+"""Kinds of nodes, their sources, and probabilities of seeing them."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -13,10 +13,10 @@ ROADS: Final = tuple(name for name, layer in LAYERS.items() if layer == ROAD)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeKind:
-    """What a node is, what drew it, and how it is seen: chances set by hand, to be replaced by fitted ones.
+    """A kind of node, its source, and probabilities set by hand.
 
-    `classes` must be known where such a node is to be missed; `hit` is the chance that a node of the map is seen, where
-    it can be; `extra` the share of nodes seen that no map has; `spread_m` how far its middle moves by itself.
+    A node can be missed only where `classes` are known; `hit` is the probability that a visible map node is seen,
+    `extra` the share of seen nodes that no map has, `spread_m` the standard deviation of its centre.
     """
 
     name: str
@@ -34,8 +34,8 @@ def _kind(name: str, drawing: Drawing, classes: tuple[str, ...], *chances: float
 
 _RAIL: Final = (*ROADS, "railway")
 _WATER: Final = (*ROADS, "waterway")
-# Vectors come with what they connect and how houses are parted; a mask shows neither, so its nodes are kinds apart. A
-# detector misses a tenth of the ways; where one of two is missed there is no junction, and new ends are made.
+# Vectors show connections and separate houses; a mask shows neither, so its nodes have kinds of their own. A detector
+# misses a tenth of the ways; where it misses one of two, there is no junction, and new ends appear.
 KINDS: Final = (
     _kind("intersection", "vectors", ROADS, 0.75, 0.08),
     _kind("dead_end", "vectors", ROADS, 0.7, 0.5),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the scorer has learnt of classes: rates, likeness, exponents; from train places, as text that can be read."""
+"""Model of the scorer: rates, likeness and scales of evidence of each class, stored as JSON."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,34 +23,34 @@ _DIGITS: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Learnt:
-    """What is known of each class, shape (C, ...) where an array.
+class ScorerModel:
+    """Fitted numbers of each class, shape (C, ...) where an array.
 
     Parameters
     ----------
     classes : tuple of str
         The classes.
     rates : tuple of ClassRates
-        How each is seen, mapped and outlived.
+        Rates of seeing, mapping and ageing.
     likeness : ndarray of float, shape (C, FAR + 1)
-        How much being near a class on the map is like being on it.
+        Likeness of cells near a class on the map to cells on it.
     missed_share : ndarray of float, shape (C,)
-        How much of `Gains.missed` one degree of that likeness is worth.
-    temper : ndarray of float, shape (C,)
-        What the score of each is multiplied with: neighbouring cells say the same.
+        Share of `Gains.missed` for one degree of that likeness.
+    scaling : ndarray of float, shape (C,)
+        Scale of the score of each class, since neighbouring cells are not independent; `temper` in the file.
     trust : ndarray of float, shape (C, STRATA)
-        How much a feature is worth by its own age: see `edit_age.fit_trust`.
+        Trust in features by edit age: see `edit_age.fit_trust`.
     seasons : mapping of str to ndarray of float, shape (C,)
-        By season, what share of a mapped class can still be seen.
+        Visible share of a mapped class, by season.
     blend : Blend
         Weights of raster, graph and contradiction in the joint score.
     views, blocks : int
-        How much it was learnt from; 0 for what was set by hand.
+        Size of the training data; 0 for a model set by hand.
 
     Examples
     --------
-    >>> said = Learnt.by_hand(["railway", "water"])
-    >>> Learnt.from_text(said.to_text()) == said
+    >>> model = ScorerModel.by_hand(["railway", "water"])
+    >>> ScorerModel.from_text(model.to_text()) == model
     True
     """
 
@@ -58,7 +58,7 @@ class Learnt:
     rates: tuple[ClassRates, ...]
     likeness: NDArray[np.float64]
     missed_share: NDArray[np.float64]
-    temper: NDArray[np.float64]
+    scaling: NDArray[np.float64]
     trust: NDArray[np.float64]
     seasons: Mapping[str, NDArray[np.float64]]
     blend: Blend = DEFAULT_BLEND
@@ -66,34 +66,34 @@ class Learnt:
     blocks: int = 0
 
     def __eq__(self, other: object) -> bool:
-        """Whether both say the same, number for number."""
-        return isinstance(other, Learnt) and self.to_text() == other.to_text()
+        """Compare all numbers."""
+        return isinstance(other, ScorerModel) and self.to_text() == other.to_text()
 
     def __hash__(self) -> int:
-        """Hash of what it says."""
+        """Hash all numbers."""
         return hash(self.to_text())
 
     @classmethod
     def by_hand(cls, classes: Sequence[str]) -> Self:
-        """What is set where nothing was measured."""
+        """Return the model set by hand."""
         return cls(
             classes=tuple(classes),
             rates=tuple(hand_rates(name) for name in classes),
             likeness=likeness_by_hand(classes),
             missed_share=np.ones(len(classes)),
-            temper=np.full(len(classes), START),
+            scaling=np.full(len(classes), START),
             trust=np.ones((len(classes), STRATA)),
             seasons={season: by_hand(season, classes) for season in SEASONS},
         )
 
     @classmethod
     def of(cls, tallies: Mapping[str, Sequence[Tally]]) -> Self:
-        """Learn rates, likeness and seasons; exponents are learnt afterwards, from searches made with these.
+        """Fit rates, likeness and seasons; scales of evidence are fitted later, to searches with this model.
 
         Parameters
         ----------
         tallies : mapping of str to sequence of Tally
-            By season; "" for views that tell none, from which rates and likeness come.
+            By season; rates and likeness are fitted to views without one, "".
 
         Raises
         ------
@@ -102,7 +102,7 @@ class Learnt:
         """
         plain = tallies.get("", ())
         fitted = fit_rates(plain)
-        near, rates = likeness(plain), tuple(one.best for one in fitted.values())
+        near, rates = likeness(plain), tuple(fitted.values())
         classes = plain[0].classes
         seasons = {
             season: fit_season(season, tallies[season], rates) if tallies.get(season) else by_hand(season, classes)
@@ -113,7 +113,7 @@ class Learnt:
             rates=rates,
             likeness=near,
             missed_share=missed_share(plain, near),
-            temper=np.full(len(near), START),
+            scaling=np.full(len(near), START),
             trust=np.ones((len(near), STRATA)),
             seasons=seasons,
             views=len(plain),
@@ -121,11 +121,11 @@ class Learnt:
         )
 
     def persists(self, season: str) -> NDArray[np.float64]:
-        """Factors of a season, shape (C,); all 1 where a view tells none."""
+        """Return the factors of a season, shape (C,); 1 for an unknown season."""
         return self.seasons.get(season, np.ones(len(self.classes)))
 
     def of_classes(self, classes: Sequence[str]) -> Self:
-        """The same for other classes in another order; what was not learnt is as by hand."""
+        """Return the model for other classes, in their order; numbers by hand for classes that it lacks."""
         hand = self.by_hand([name for name in classes if name not in self.classes])
         both = self.classes + hand.classes
         at = [both.index(name) for name in classes]
@@ -136,17 +136,17 @@ class Learnt:
             rates=tuple(rates[index] for index in at),
             likeness=np.concatenate((self.likeness, hand.likeness))[at],
             missed_share=np.concatenate((self.missed_share, hand.missed_share))[at],
-            temper=np.concatenate((self.temper, hand.temper))[at],
+            scaling=np.concatenate((self.scaling, hand.scaling))[at],
             trust=np.concatenate((self.trust, hand.trust))[at],
             seasons={name: np.concatenate((self.seasons[name], hand.seasons[name]))[at] for name in SEASONS},
         )
 
     def to_text(self) -> str:
-        """As JSON, a class a line.
+        """Return the model as JSON, one class a line.
 
         Examples
         --------
-        >>> Learnt.by_hand(["water"]).to_text().splitlines()[0]
+        >>> ScorerModel.by_hand(["water"]).to_text().splitlines()[0]
         '{"version": 1, "views": 0, "blocks": 0, "blend": {"alpha": 1.0, "beta": 0.5, "eta": 0.1}, "classes": {'
         """
         rows = [
@@ -162,61 +162,55 @@ class Learnt:
         return {
             "likeness": self.likeness[at].tolist(),
             "missed_share": float(self.missed_share[at]),
-            "temper": float(self.temper[at]),
+            "temper": float(self.scaling[at]),
             "trust": self.trust[at].tolist(),
             "seasons": [float(self.seasons[season][at]) for season in SEASONS],
         }
 
     @classmethod
     def from_text(cls, text: str) -> Self:
-        """Read it back.
-
-        Raises
-        ------
-        ConfigError
-            If it is not what `to_text` gives.
-        """
+        """Read a model from JSON, or raise ConfigError."""
         try:
-            said = json.loads(text)
-            if said["version"] != VERSION:
-                message = f"it is of version {said['version']}, this program reads {VERSION}"
+            stored = json.loads(text)
+            if stored["version"] != VERSION:
+                message = f"it is of version {stored['version']}, this program reads {VERSION}"
                 raise ConfigError(message)
-            rows: dict[str, dict[str, Any]] = said["classes"]
+            rows: dict[str, dict[str, Any]] = stored["classes"]
             shapes = [
                 [row.pop(name) for name in ("likeness", "missed_share", "temper", "seasons", "trust")]
                 for row in rows.values()
             ]
             near = np.array([shape[0] for shape in shapes], dtype=np.float64).reshape(-1, FAR + 1)
-            shares, temper = (np.array([shape[at] for shape in shapes], dtype=np.float64) for at in (1, 2))
+            shares, scaling = (np.array([shape[at] for shape in shapes], dtype=np.float64) for at in (1, 2))
             seasons = np.array([shape[3] for shape in shapes], dtype=np.float64).reshape(-1, len(SEASONS))
             trust = np.array([shape[4] for shape in shapes], dtype=np.float64).reshape(-1, STRATA)
-            _check(near, shares, temper, seasons, trust)
+            _check(near, shares, scaling, seasons, trust)
             return cls(
                 classes=tuple(rows),
                 rates=tuple(ClassRates(**row) for row in rows.values()),
                 likeness=near,
                 missed_share=shares,
-                temper=temper,
+                scaling=scaling,
                 trust=trust,
                 seasons=dict(zip(SEASONS, seasons.T, strict=True)),
-                blend=Blend(**said["blend"]),
-                views=int(said["views"]),
-                blocks=int(said["blocks"]),
+                blend=Blend(**stored["blend"]),
+                views=int(stored["views"]),
+                blocks=int(stored["blocks"]),
             )
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
-            message = f"what was learnt cannot be read ({error}): learn it again"
+            message = f"the trained model cannot be read ({error}): train it again"
             raise ConfigError(message) from error
 
 
 def _check(
     near: NDArray[np.float64],
     shares: NDArray[np.float64],
-    temper: NDArray[np.float64],
+    scaling: NDArray[np.float64],
     seasons: NDArray[np.float64],
     trust: NDArray[np.float64],
 ) -> None:
-    """Refuse numbers that no class can have."""
-    if not (np.isfinite(temper).all() and (temper >= 0).all()):
+    """Raise ValueError for numbers out of range."""
+    if not (np.isfinite(scaling).all() and (scaling >= 0).all()):
         message = "an exponent is negative or not finite"
         raise ValueError(message)
     for name, values in (("likeness", near), ("missed_share", shares), ("a season", seasons), ("trust", trust)):
@@ -226,7 +220,7 @@ def _check(
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:
-    """Six significant digits: more would say more than was measured."""
+    """Round to six significant digits."""
     return {name: _short(value) for name, value in values.items()}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a map made ready for being asked what lies around a pose."""
+"""Graph of a map, prepared for queries around a pose."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +24,7 @@ _APART_M: Final = 1e4  # much more than any gate
 
 @dataclass(frozen=True, kw_only=True)
 class MappedGraph:
-    """The nodes of a map as vectors and as masks would show them.
+    """Nodes of a map as vectors and as masks show them.
 
     Parameters
     ----------
@@ -33,10 +33,10 @@ class MappedGraph:
     tree : cKDTree
         Of easting, northing and kind, a kind lying `_APART_M` from the next one.
     density_per_m2 : ndarray of float64, shape (K,)
-        How thick nodes of a kind stand around one of them, on average: how likely one lies anywhere by chance; 0 for
-        kinds that the map does not hold.
+        Mean density of nodes of a kind around one of them, for the chance of a random match; 0 for kinds that the map
+        lacks.
     known : ndarray of bool, shape (rows, cols)
-        Where the map says anything.
+        Cells known to the map.
     grid : Grid
         Its lattice.
     """
@@ -49,13 +49,13 @@ class MappedGraph:
 
     @classmethod
     def of(cls, region: Region) -> Self:
-        """Make a region's graph ready."""
+        """Prepare the graph of a region."""
         known = np.asarray((region.layers <= PRESENT).all(axis=0))
         return cls.make(region.graph, region.features, known=known, grid=region.grid)
 
     @classmethod
     def make(cls, graph: MapGraph, features: gpd.GeoDataFrame, *, known: Bools, grid: Grid) -> Self:
-        """Make a graph ready that was derived from features.
+        """Prepare a graph that was derived from features.
 
         Examples
         --------
@@ -81,39 +81,39 @@ class MappedGraph:
 
     @cached_property
     def links(self) -> dict[int, set[int]]:
-        """Nodes to which a way leads from each node."""
+        """Return the nodes that ways connect with each node."""
         return self.nodes.links()
 
     @cached_property
     def plan(self) -> cKDTree:
-        """The places alone."""
+        """Return a tree of the places."""
         return cKDTree(self.nodes.places_m)
 
     @cached_property
     def junction_pairs(self) -> dict[int, tuple[JunctionPairs, JunctionPairs]]:
-        """Pairs of junctions of each kind, once from either end."""
-        found = {kind: JunctionPairs.of(self.nodes, kind, apart_m=PAIRED_M) for kind in JUNCTIONS}
+        """Return pairs of junctions of each kind, once from either end."""
+        found = {kind: JunctionPairs.of(self.nodes, kind, range_m=PAIRED_M) for kind in JUNCTIONS}
         return {kind: (pairs, pairs.turned()) for kind, pairs in found.items()}
 
     def around(self, place_m: Floats, radius_m: float) -> Ints:
-        """Nodes within a distance of a place, in order."""
+        """Return sorted rows of nodes within a distance of a place."""
         return np.array(self.plan.query_ball_point(place_m, radius_m, return_sorted=True), dtype=np.int64)
 
     def like(self, places_m: Floats, kind: Ints, radius_m: Floats) -> tuple[Ints, Ints]:
-        """Rows of places and of nodes of the same kind within a distance of them, shape (P,) each."""
+        """Return rows of places, and of nodes of the same kind within a distance of them, shape (P,) each."""
         lists = self.tree.query_ball_point(_raised(places_m, kind), radius_m)
         rows = np.repeat(np.arange(len(places_m)), [len(item) for item in lists])
         return rows, np.array([node for item in lists for node in item], dtype=np.int64)
 
     def knows(self, places_m: Floats) -> Bools:
-        """Whether the map says anything about places of shape (N, 2)."""
+        """Return which places, shape (N, 2), the map knows."""
         row, col = self.grid.to_cells(places_m).T
         inside = (row >= 0) & (row < self.grid.rows) & (col >= 0) & (col < self.grid.cols)
         return np.asarray(inside & self.known[np.where(inside, row, 0), np.where(inside, col, 0)])
 
 
 def _raised(places_m: Floats, kind: Ints) -> Floats:
-    """Places with their kind as a height."""
+    """Return places with their kind as a third coordinate."""
     return np.column_stack((places_m, kind * _APART_M))
 
 

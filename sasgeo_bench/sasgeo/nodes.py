@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of a map or a view made comparable: kinds by what drew them, places, arms, areas, and what relates them."""
+"""Comparable nodes of a map or a view: kinds by source, places, arms, areas and relations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 MOST_ARMS: Final = 6
-ARM_M: Final = 12.0  # how far along a road its direction is taken: past the curbs of a junction
+ARM_M: Final = 12.0  # along a road to where its direction is measured: past the curbs of a junction
 BLUR_M: Final = 8.0  # junctions nearer than this are one in a mask: a road's width
 TOUCH_M: Final = 0.5  # outlines nearer than this are one patch in a mask
 _ALONG_WAYS: Final = [RELATIONS.index(name) for name in ("connectivity", "crossing")]
@@ -46,7 +46,7 @@ _IN_A_MASK: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nodes:
-    """Nodes and what relates them.
+    """Nodes and their relations.
 
     Parameters
     ----------
@@ -61,9 +61,9 @@ class Nodes:
     arms_deg : ndarray of float64, shape (N, MOST_ARMS)
         Bearings of the roads that leave a junction or an end, NaN behind the last one.
     pairs, relation : ndarray of int64, shapes (E, 2) and (E,)
-        Edges between nodes, and what they are: index into `graph.RELATIONS`.
+        Edges between nodes, and their index into `graph.RELATIONS`.
     feature : ndarray of int64, shape (N,)
-        The `osm_id` of what a node is, -1 where that is several things.
+        The `osm_id` of the feature of a node, -1 for several features.
     """
 
     places_m: Floats
@@ -76,16 +76,16 @@ class Nodes:
     feature: Ints
 
     def __len__(self) -> int:
-        """How many nodes there are."""
+        """Return the number of nodes."""
         return len(self.kind)
 
     @property
     def radius_m(self) -> Floats:
-        """Of a disc as large as each node, 0 for those without an area; shape (N,)."""
+        """Radius of a disc of the area of each node, 0 without an area; shape (N,)."""
         return np.asarray(np.nan_to_num(np.sqrt(self.area_m2 / np.pi)))
 
     def links(self) -> dict[int, set[int]]:
-        """Nodes to which a way leads from each node, by connection or crossing."""
+        """Return the nodes that ways connect with each node, or cross there."""
         found: dict[int, set[int]] = {}
         for one, two in self.pairs[np.isin(self.relation, _ALONG_WAYS)].tolist():
             found.setdefault(one, set()).add(two)
@@ -93,7 +93,7 @@ class Nodes:
         return found
 
     def taken(self, keep: Bools) -> Self:
-        """Some of the nodes, and the edges between them."""
+        """Return selected nodes and the edges between them."""
         new = np.where(keep, np.cumsum(keep) - 1, -1)
         pairs = new[self.pairs]
         stays = (pairs >= 0).all(axis=1)
@@ -110,13 +110,7 @@ class Nodes:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """All nodes of several sets; no edge runs between two of them.
-
-        Examples
-        --------
-        >>> len(Nodes.joined([nothing(), nothing()]))
-        0
-        """
+        """Join sets of nodes, with no edge between two sets."""
         starts = np.cumsum([0, *(len(part) for part in parts)])
         pairs = [part.pairs + start for part, start in zip(parts, starts[:-1], strict=True)]
         return cls(
@@ -132,13 +126,7 @@ class Nodes:
 
 
 def nothing() -> Nodes:
-    """No nodes.
-
-    Examples
-    --------
-    >>> nothing().places_m.shape
-    (0, 2)
-    """
+    """Return an empty set of nodes."""
     none = np.zeros(0, dtype=np.int64)
     return Nodes(
         places_m=np.zeros((0, 2)),
@@ -153,23 +141,23 @@ def nothing() -> Nodes:
 
 
 def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> Nodes:
-    """Nodes of a graph as vectors show them, or as a mask would.
+    """Return the nodes of a graph as vectors or as a mask show them.
 
-    In a mask roads that cross meet, junctions a road's width apart are one, and houses come as `patches_of`.
+    In a mask, crossing roads meet, junctions within a road's width merge, and buildings come from `patches_of`.
 
     Parameters
     ----------
     graph : MapGraph
         Derived from the features.
     features : geopandas.GeoDataFrame
-        A feature table: its roads say where the arms of a junction lead.
+        A feature table, for the arms of junctions.
     drawing : {"vectors", "mask"}
-        Which of the two.
+        Source of the nodes.
     """
     table = graph.nodes
     names = table["kind"].to_numpy(dtype=object)
     on_road = table["class"].isin(ROADS).to_numpy()
-    names = np.where((names == "crossing") & ~on_road, "", names)  # a railway over a river says little
+    names = np.where((names == "crossing") & ~on_road, "", names)  # a railway over a river is no landmark
     renamed = _IN_A_MASK if drawing == "mask" else {kind.name: kind.name for kind in KINDS if kind.drawing == drawing}
     kind = np.array([INDEX[renamed[name]] if name in renamed else -1 for name in names], dtype=np.int64)
     places_m = np.asarray(shapely.get_coordinates(table.geometry.to_numpy())).reshape(-1, 2)
@@ -190,7 +178,7 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
 
 
 def _blurred(nodes: Nodes) -> Nodes:
-    """Make one node of those of one kind that lie within a road's width."""
+    """Merge nodes of one kind within a road's width."""
     near = cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
     near = near[nodes.kind[near[:, 0]] == nodes.kind[near[:, 1]]]
     links = coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
@@ -201,7 +189,7 @@ def _blurred(nodes: Nodes) -> Nodes:
     first = np.full(len(size), len(nodes))
     np.minimum.at(first, group, np.arange(len(nodes)))
     pairs = group[nodes.pairs]
-    apart = pairs[:, 0] != pairs[:, 1]
+    is_edge = pairs[:, 0] != pairs[:, 1]
     middle = [np.bincount(group, weights=part) / size for part in nodes.places_m.T]
     arms_deg = _outer_arms(nodes, near)
     row, arm = np.nonzero(np.isfinite(arms_deg))
@@ -214,14 +202,14 @@ def _blurred(nodes: Nodes) -> Nodes:
         degree=np.where(size == 1, nodes.degree[first], count),
         area_m2=nodes.area_m2[first],
         arms_deg=np.where(has_arms[:, None], outer, np.nan),
-        pairs=pairs[apart],
-        relation=nodes.relation[apart],
+        pairs=pairs[is_edge],
+        relation=nodes.relation[is_edge],
         feature=np.where(size == 1, nodes.feature[first], -1),
     )
 
 
 def _outer_arms(nodes: Nodes, near: Ints) -> Floats:
-    """Arms of nodes but those that lead to one of the other nodes near them."""
+    """Return arms of nodes without those that lead to another node near them."""
     arms_deg = nodes.arms_deg.copy()
     for one, two in (near.T, near[:, ::-1].T):
         towards_deg = bearing_deg(*(nodes.places_m[two] - nodes.places_m[one]).T)
@@ -232,7 +220,7 @@ def _outer_arms(nodes: Nodes, near: Ints) -> Floats:
 
 
 def _by_row(row: Ints, bearing: Floats, count: int) -> Floats:
-    """Bearings of each row side by side, shape (count, MOST_ARMS), NaN behind the last one."""
+    """Return the bearings of each row, shape (count, MOST_ARMS), NaN behind the last one."""
     order = np.argsort(row, kind="stable")
     row, bearing = row[order], bearing[order]
     turn = np.arange(len(row)) - np.searchsorted(row, row)
@@ -242,7 +230,7 @@ def _by_row(row: Ints, bearing: Floats, count: int) -> Floats:
 
 
 def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
-    """Bearings of the roads that leave places where a road begins, ends or forks.
+    """Return bearings of the roads that leave places where a road begins, ends or forks.
 
     Parameters
     ----------
@@ -287,7 +275,7 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
 
 
 def patches_of(features: gpd.GeoDataFrame) -> Nodes:
-    """Buildings and areas as a mask shows them: what touches and is of one class is one.
+    """Return buildings and areas as a mask shows them: touching areas of one class merge.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a view, from perceived vectors where there are some and from thinned masks elsewhere."""
+"""Graph of a view, from perceived vectors, or from thinned masks where there are none."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +8,6 @@ from typing import Final, Self
 import cv2
 import geopandas as gpd
 import numpy as np
-import pandas as pd
 import shapely
 from scipy.spatial import cKDTree
 
@@ -18,16 +17,16 @@ from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.network import LAYERS, ROAD, make_network
 from sasgeo_bench.regions.shapes import delaunay_pairs
-from sasgeo_bench.sasgeo.kinds import INDEX, KINDS, PATCHES, ROADS, Drawing
+from sasgeo_bench.sasgeo.kinds import INDEX, KINDS, PATCHES, ROADS
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes, arms_of, nodes_of, nothing, patches_of
 from sasgeo_bench.sasgeo.skeleton import lines_of_mask
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_table
 
-MARGIN_M: Final = 8.0  # of what is known, where a thing may have slipped out of it
-NEAR_M: Final = 80.0  # neighbours whose relative place is looked at
-BRIDGED_M: Final = 7.0  # ends of a road that face each other so near are a detector's gap
-LEAST_M2: Final = 12.0  # smaller patches are specks
+MARGIN_M: Final = 8.0  # along the border of known cells, where objects may be cut
+NEAR_M: Final = 80.0  # neighbours whose relative places are compared
+BRIDGED_M: Final = 7.0  # facing ends of a road within this distance are a gap of the detector
+LEAST_M2: Final = 12.0  # smaller patches are noise
 _FACING_DEG: Final = 30.0
 _MOSTLY: Final = 0.9  # of the cells around a place
 _FAMILIES: Final = (ROADS, ("railway",), ("waterway",), ("building",))
@@ -38,20 +37,20 @@ _FREE: Final = (INDEX["dead_end"], INDEX["mask dead_end"])
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedGraph:
-    """What a view shows, in its own frame.
+    """Nodes and relations in a view, in its own frame.
 
     Parameters
     ----------
     nodes : Nodes
         Places are (right, up) from the middle of the view, metres.
     is_cut : ndarray of bool, shape (N,)
-        Whether a node lies so near to the border of what is known that a part of it may be missing.
+        Nodes near the border of known cells, of which a part may be missing.
     near : ndarray of int64, shape (P, 2)
-        Neighbours: pairs of the Delaunay triangulation at most `NEAR_M` apart.
+        Neighbours: pairs of the Delaunay triangulation within `NEAR_M`.
     asked : ndarray of bool, shape (K,)
-        Kinds that the view was searched for: where nothing of a family is seen, that is left to the raster score.
+        Kinds that are judged: a family of which nothing is seen is left to the raster score.
     sight : ndarray of bool, shape (S, rows, cols)
-        Where a view would show a node, for each set of classes that nodes are made of.
+        Cells where nodes are visible, for each set of classes of a kind of node.
     cell_size_m : float
         Side of its cells.
     """
@@ -65,22 +64,15 @@ class ObservedGraph:
 
     @classmethod
     def of(cls, query: Query) -> Self:
-        """The graph of what a query shows."""
+        """Return the graph of the view of a query."""
         return cls.make(query.evidence, query.vectors)
 
     @classmethod
     def make(cls, evidence: Evidence, vectors: gpd.GeoDataFrame | None = None) -> Self:
         """Derive the graph of a view.
 
-        Each family of things (roads, railways, waterways, buildings) is taken from the vectors if they hold any of it,
-        else from the masks; areas always from the masks.
-
-        Parameters
-        ----------
-        evidence : Evidence
-            The view.
-        vectors : geopandas.GeoDataFrame, optional
-            As `Query.vectors`.
+        Each family (roads, railways, waterways, buildings) comes from the vectors if they hold any of it, else from the
+        masks; areas always from the masks.
 
         Examples
         --------
@@ -112,40 +104,19 @@ class ObservedGraph:
         )
 
     def shows(self, places_m: Floats, kind: Ints) -> Bools:
-        """Whether the view would show a node of a kind at (right, up)."""
+        """Return which nodes of some kinds at (right, up) are visible."""
         return self.asked[kind] & _looked_up(self.sight, places_m, kind, self.cell_size_m)
 
     @cached_property
     def links(self) -> dict[int, set[int]]:
-        """Nodes to which a way leads from each node."""
+        """Return the nodes that ways connect with each node."""
         return self.nodes.links()
-
-    @property
-    def source(self) -> list[Drawing]:
-        """What drew each node."""
-        return [KINDS[kind].drawing for kind in self.nodes.kind]
-
-    def edges(self) -> pd.DataFrame:
-        """Edges with `source`, `target`, `relation`, `distance_m` and `bearing_deg` (clockwise from up).
-
-        The relation is an index into `graph.RELATIONS`, -1 for mere neighbours.
-        """
-        pairs = np.concatenate((self.nodes.pairs, self.near))
-        along_m = self.nodes.places_m[pairs[:, 1]] - self.nodes.places_m[pairs[:, 0]]
-        columns = {
-            "source": pairs[:, 0],
-            "target": pairs[:, 1],
-            "relation": np.concatenate((self.nodes.relation, np.full(len(self.near), -1))),
-            "distance_m": np.hypot(*along_m.T),
-            "bearing_deg": bearing_deg(*along_m.T),
-        }
-        return pd.DataFrame(columns)
 
 
 def _from_vectors(vectors: gpd.GeoDataFrame, evidence: Evidence) -> Nodes:
     features = as_features(bridged(vectors))
     nodes = nodes_of(build_graph(features), features, "vectors")
-    # A building that the view cuts has another middle and another area than the map's.
+    # A building that the view cuts differs from the map in centre and area.
     half_m = np.array(evidence.size_m) / 2 - 2.0
     is_whole = (np.abs(shapely.bounds(features.geometry.to_numpy())) < [*half_m, *half_m]).all(axis=1)
     is_house = nodes.kind == INDEX["building"]
@@ -167,7 +138,7 @@ def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
 
 
 def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Vectors with the gaps of a detector closed: ends of two lines of a class that face each other within 7 m.
+    """Return vectors with gaps of the detector closed: between facing ends of roads within 7 m.
 
     Examples
     --------
@@ -194,7 +165,7 @@ def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 def _asked(evidence: Evidence, names: set[str], drawn: set[str]) -> Bools:
-    """Kinds that are looked for: those of which the vectors, or else the masks, hold a class."""
+    """Return the kinds to judge: those with all families in the vectors, or else in the masks."""
     present = {
         name for name, layer in zip(evidence.classes, evidence.cells, strict=True) if (layer == PRESENT).any()
     } - drawn
@@ -208,7 +179,7 @@ def _asked(evidence: Evidence, names: set[str], drawn: set[str]) -> Bools:
 
 
 def _sight(evidence: Evidence) -> Bools:
-    """Where nearly all cells around are known in every class of a set; a class that a view lacks is known nowhere."""
+    """Return where nearly all cells around are known in each set of classes; absent sets are known nowhere."""
     sights = np.zeros((len(_SIGHTS), *evidence.shape), dtype=bool)
     size = 2 * max(1, round(MARGIN_M / evidence.cell_size_m)) + 1
     for into, classes in zip(sights, _SIGHTS, strict=True):
@@ -235,6 +206,6 @@ def _looked_up(sight: Bools, places_m: Floats, kind: Ints, cell_size_m: float) -
 
 
 def _reaches_out(nodes: Nodes, evidence: Evidence) -> Bools:
-    """Whether a patch is so large that it may go on beyond the view."""
+    """Return which patches may extend beyond the view."""
     half_m = np.array(evidence.size_m) / 2 - 1.0
     return np.asarray((np.abs(nodes.places_m) + nodes.radius_m[:, None] > half_m).any(axis=1))

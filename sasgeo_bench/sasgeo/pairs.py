@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of junctions, to be looked up by how far apart they lie and where their arms lead."""
+"""Pairs of junctions, indexed by distance and directions of their arms."""
 
 from dataclasses import dataclass
 from typing import Final, Self
@@ -15,7 +15,7 @@ from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 Bits = NDArray[np.uint64]
 
 JUNCTIONS: Final = (INDEX["intersection"], INDEX["mask intersection"])
-SECTORS: Final = 36  # of 10 degrees, that an arm may lead to
+SECTORS: Final = 36  # of 10 degrees, for directions of arms
 _ARMS: Final = 3
 _ONE: Final = np.uint64(1)
 _LAST: Final = np.uint64(SECTORS - 1)
@@ -34,7 +34,7 @@ class JunctionPairs:
     length_m, bearing_deg : ndarray of float64, shape (T,)
         From the first to the second.
     arms : ndarray of uint64, shape (T, 2)
-        Of either end, one bit for each of `SECTORS` that an arm leads to, counted from that bearing.
+        Of either end, one bit for each of `SECTORS` with an arm, counted from that bearing.
     """
 
     ends: Ints
@@ -43,30 +43,23 @@ class JunctionPairs:
     arms: Bits
 
     @classmethod
-    def of(cls, nodes: Nodes, kind: int, *, apart_m: tuple[float, float]) -> Self:
-        """Pairs of the junctions with three arms and more that lie so far apart.
-
-        Examples
-        --------
-        >>> from sasgeo_bench.sasgeo.nodes import nothing
-        >>> len(JunctionPairs.of(nothing(), JUNCTIONS[0], apart_m=(30.0, 90.0)).length_m)
-        0
-        """
+    def of(cls, nodes: Nodes, kind: int, *, range_m: tuple[float, float]) -> Self:
+        """Return pairs of junctions with at least three arms within a range of distances, metres."""
         chosen = np.flatnonzero((nodes.kind == kind) & (np.isfinite(nodes.arms_deg).sum(axis=1) >= _ARMS))
         places_m = nodes.places_m[chosen]
         pairs = np.zeros((0, 2), dtype=np.int64)
         if len(chosen):
-            pairs = cKDTree(places_m).query_pairs(apart_m[1], output_type="ndarray").astype(np.int64)
+            pairs = cKDTree(places_m).query_pairs(range_m[1], output_type="ndarray").astype(np.int64)
         along_m = places_m[pairs[:, 1]] - places_m[pairs[:, 0]]
         length_m = np.hypot(*along_m.T)
         order = np.lexsort((pairs[:, 1], pairs[:, 0], length_m))
-        order = order[length_m[order] >= apart_m[0]]
+        order = order[length_m[order] >= range_m[0]]
         ends, bearing = chosen[pairs[order]], bearing_deg(*along_m[order].T)
         arms = _sectors(nodes.arms_deg[ends] - bearing[:, None, None])
         return cls(ends=ends, length_m=length_m[order], bearing_deg=bearing, arms=arms)
 
     def turned(self) -> Self:
-        """The same pairs, each from its other end."""
+        """Return the pairs from their other ends."""
         arms = self.arms[:, ::-1]
         return type(self)(
             ends=self.ends[:, ::-1],
@@ -76,15 +69,7 @@ class JunctionPairs:
         )
 
     def like(self, arms: Bits, first: int, last: int) -> Ints:
-        """Rows between two whose arms agree at both ends, but for one arm too many or too few at each.
-
-        Parameters
-        ----------
-        arms : ndarray of uint64, shape (2,)
-            Of the other pair.
-        first, last : int
-            Where to look: lengths are in order.
-        """
+        """Return rows from `first` to `last` whose arms, shape (2,), agree but for one more or less at each end."""
         theirs = self.arms[first:last]
         common = np.bitwise_count(theirs & _widened(arms))
         count = np.bitwise_count(theirs).astype(np.int64)
@@ -94,7 +79,7 @@ class JunctionPairs:
 
 
 def _sectors(turned_deg: Floats) -> Bits:
-    """Bits of the sectors that angles of shape (..., A) lie in, shape (...); NaN lies in none."""
+    """Return bits of the sectors of angles of shape (..., A), shape (...); NaN has none."""
     finite = np.isfinite(turned_deg)
     share = np.mod(np.where(finite, turned_deg, 0.0), 360.0) / 360.0
     sector = np.minimum((share * SECTORS).astype(np.uint64), _LAST)
@@ -102,5 +87,5 @@ def _sectors(turned_deg: Floats) -> Bits:
 
 
 def _widened(arms: Bits) -> Bits:
-    """Sectors and their neighbours."""
+    """Return sectors and their neighbours."""
     return np.asarray((arms | (arms << _ONE) | (arms >> _LAST) | (arms >> _ONE) | (arms << _LAST)) & _ALL)

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Horizontal protection levels: what the error of an answer is said not to exceed, but for a stated risk.
+"""Horizontal protection levels: bounds of the position error, exceeded with a stated risk.
 
-Four ways, the first the method's own, the others what it is held against: by leaving out one class at a time, by the
-spread of the posterior, by the radius that holds its mass, and (fitted by the scorer on calibration answers, see
-`metrics.protection`) by a conformal multiple of `sigma_m`.
+The method's own leaves out one class at a time. It is compared with the spread of the posterior, the radius that holds
+its mass, and a conformal multiple of `sigma_m`, which `scoring.protection` fits to calibration answers.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -16,7 +14,7 @@ from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.sasgeo.integrity import Diagnostic, Modes
 
 RISKS: Final = (1e-2, 1e-3)
-SCALE: Final = "sigma_m"  # the diagnostic that a conformal level is a multiple of
+SCALE: Final = "sigma_m"  # the diagnostic that conformal levels scale
 METHODS: Final = {
     "separation": "how far the best mode moves if one class is left out, the worst of them, and what the refined "
     "position is uncertain by",
@@ -26,7 +24,7 @@ METHODS: Final = {
 
 
 def level_name(method: str, risk: float) -> str:
-    """Name of the diagnostic that holds a protection level, metres.
+    """Return the name of the diagnostic of a protection level, metres.
 
     Examples
     --------
@@ -49,12 +47,12 @@ PROTECTION: Final = (
 
 
 def sigmas(risk: float) -> float:
-    """How many standard deviations along an axis a round Gaussian exceeds with some probability: sqrt(-2 ln risk).
+    """Return the radius of a round Gaussian exceeded with a probability, in standard deviations: sqrt(-2 ln risk).
 
     Raises
     ------
     ShapeError
-        If the risk is none.
+        If the risk is not within (0, 1).
 
     Examples
     --------
@@ -68,10 +66,10 @@ def sigmas(risk: float) -> float:
 
 
 def posterior_sigma_m(modes: Modes) -> float:
-    """Standard deviation of the posterior about the chosen mode along its longer axis, metres.
+    """Return the standard deviation of the posterior about the chosen mode along its longer axis, metres.
 
-    About the chosen mode and not about the mean, for it is the chosen one whose error is to be bounded. That none of
-    the modes may be right is left out.
+    It is taken about the chosen mode, whose error is bounded, not about the mean. The mass of no mode being right is
+    ignored.
 
     Examples
     --------
@@ -84,7 +82,7 @@ def posterior_sigma_m(modes: Modes) -> float:
 
 
 def gauss_level(modes: Modes, risk: float) -> float:
-    """Protection level of the posterior taken for one Gaussian, metres.
+    """Return the protection level of the posterior as one Gaussian, metres.
 
     Examples
     --------
@@ -96,10 +94,10 @@ def gauss_level(modes: Modes, risk: float) -> float:
 
 
 def density_level(modes: Modes, risk: float) -> float:
-    """Radius around the chosen mode beyond which less than the risk of the posterior lies, metres.
+    """Return the radius around the chosen mode that holds the posterior but for the risk, metres.
 
-    Half of the risk goes to modes beyond it, half to positions within a mode. Infinite where none of the modes being
-    right is as likely as that: no radius holds what lies nowhere.
+    Half of the risk goes to modes beyond it, half to positions within a mode. It is infinite where the mass of no mode
+    being right exceeds that.
 
     Examples
     --------
@@ -116,20 +114,20 @@ def density_level(modes: Modes, risk: float) -> float:
 
 
 def separation_level(modes: Modes, risk: float) -> float:
-    """Protection level by leaving out one class at a time, metres: how far the best mode moves, and some sigmas.
+    """Return the protection level by leaving out one class at a time: shift of the best mode and some sigmas, metres.
 
-    Infinite where nothing is left that could disagree: one mode alone, or one class that says all.
+    It is infinite where nothing can disagree: with one mode, or one class that holds all evidence.
 
     Notes
     -----
     After solution separation in receiver autonomous integrity monitoring (Brown and McBurney, NAVIGATION 1988; Blanch
-    et al., IEEE TAES 2015), which holds against one fault at a time: that one class misleads. Moves are among the modes
-    of one list, found with all classes, so a place that only the other classes would find is not seen; and the refined
-    position is taken to be as good without a class as with it.
+    et al., IEEE TAES 2015), for one fault at a time: one misleading class. The best mode moves within one list, found
+    with all classes, so places that only the other classes would find are missed; and the refined position is assumed
+    to be as good without a class as with it.
 
     Examples
     --------
-    The first class alone holds the first mode up: without it the answer would lie 50 m away.
+    Only the first class supports the first mode: without it the answer lies 50 m away.
 
     >>> two = Modes(
     ...     positions_m=np.array([[0.0, 0.0], [50.0, 0.0]]), by_class=np.array([[9.0, 1.0], [2.0, 3.0]]), sigma_m=2.0
@@ -139,7 +137,7 @@ def separation_level(modes: Modes, risk: float) -> float:
     """
     without = modes.scores[:, None] - modes.by_class
     highest = without.max(axis=0)
-    near = 1e-9 * (1.0 + np.abs(modes.by_class).max())  # rounding parts what is equal
+    near = 1e-9 * (1.0 + np.abs(modes.by_class).max())  # ties may differ by rounding
     is_mute = highest - without.min(axis=0) <= near
     if is_mute.any():
         return math.inf
@@ -147,27 +145,15 @@ def separation_level(modes: Modes, risk: float) -> float:
     return float(moved_m + sigmas(risk) * modes.sigma_m)
 
 
-def levels_of(modes: Modes, *, risks: Sequence[float] = RISKS) -> dict[str, float]:
-    """Everything of `PROTECTION` that can be said of an answer; a level that is infinite is left out.
-
-    Parameters
-    ----------
-    modes : Modes
-        Of the search.
-    risks : sequence of float
-        How often a level may be exceeded.
-
-    Returns
-    -------
-    dict of str to float
-        Metres.
+def levels_of(modes: Modes) -> dict[str, float]:
+    """Return the `PROTECTION` of an answer by name, metres, without infinite levels.
 
     Examples
     --------
-    >>> list(levels_of(Modes(positions_m=np.zeros((1, 2)), by_class=np.array([[9.0]]), sigma_m=2.0), risks=(1e-2,)))
-    ['sigma_m', 'hpl_gauss_0.01_m', 'hpl_density_0.01_m']
+    >>> list(levels_of(Modes(positions_m=np.zeros((1, 2)), by_class=np.array([[9.0]]), sigma_m=2.0)))[:2]
+    ['sigma_m', 'hpl_gauss_0.01_m']
     """
     ways = {"separation": separation_level, "gauss": gauss_level, "density": density_level}
-    found = {level_name(method, risk): way(modes, risk) for method, way in ways.items() for risk in risks}
+    found = {level_name(method, risk): way(modes, risk) for method, way in ways.items() for risk in RISKS}
     found = {SCALE: posterior_sigma_m(modes), **found}
     return {name: value for name, value in found.items() if math.isfinite(value)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The raster score of the SASGeo paper, Eqs. 7 and 8: a map and a view made ready for the search, class by class."""
+"""Raster score of the SASGeo paper, Eqs. 7 and 8: map and view prepared for the search, class by class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,12 +22,12 @@ THIN: Final = frozenset(
     {"road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"}
 )
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
-DOUBT_M: Final = 8.0  # beside a seen line: what is mapped there may be the same line
+DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
 def likeness_by_hand(classes: Sequence[str], *, reach_m: float = REACH_M) -> NDArray[np.float64]:
-    """Likeness of being near to being on a class, shape (C, FAR + 1): exp(-D^2 / 2 tau^2) for lines, nothing for areas.
+    """Return the likeness of cells near a class to cells on it, shape (C, FAR + 1): exp(-D^2 / 2 tau^2) for lines.
 
     Examples
     --------
@@ -50,23 +50,23 @@ def read_field(
     trust: NDArray[np.float64] | None = None,
     cell_size_m: float = CELL_M,
 ) -> Field:
-    """Make a map ready for the search: each class to the degree that a cell is on it or near it.
+    """Return a map for the search: the degree to which each cell is on a class or near it.
 
     Parameters
     ----------
     region : Region
         The map.
     likeness : ndarray of float, shape (C, FAR + 1)
-        Of its classes: see `rates.likeness` and `likeness_by_hand`.
+        See `rates.likeness` and `likeness_by_hand`.
     trust : ndarray of float, shape (C, STRATA), optional
-        Of features by their own age: see `edit_age.fit_trust`; all alike without it.
+        Trust in features by edit age: see `edit_age.fit_trust`; 1 without it.
     cell_size_m : float
         Least side of a cell of the search, metres.
 
     Returns
     -------
     Field
-        In cells of a whole number of the map's own.
+        Its cells are a whole number of map cells a side.
     """
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
@@ -75,41 +75,41 @@ def read_field(
     stamped = None if trust is None else strata(region)
     layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
     for at, (layer, into) in enumerate(zip(region.layers, layers, strict=True)):
-        parts, worth = [layer == PRESENT], np.ones(1)
+        parts, weights = [layer == PRESENT], np.ones(1)
         if trust is not None and stamped is not None:
-            parts, worth = [stamped[at] == index for index in range(STRATA)], trust[at]
-        into[:] = _degree([_share(part, around, grid) for part in parts], worth, likeness[at], grid)
+            parts, weights = [stamped[at] == index for index in range(STRATA)], trust[at]
+        into[:] = _degree([_share(part, around, grid) for part in parts], weights, likeness[at], grid)
         into[~known] = 0
     return Field(grid=grid, layers=layers, known=np.where(known, np.uint8(FULL), np.uint8(0)))
 
 
 def _degree(
-    shares: Sequence[NDArray[np.uint8]], worth: NDArray[np.float64], likeness: NDArray[np.float64], grid: Grid
+    shares: Sequence[NDArray[np.uint8]], weights: NDArray[np.float64], likeness: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.uint8]:
-    """To what degree each cell is on a class or near it, 0..FULL, of the share that each part of the class covers."""
+    """Return the degree to which each cell is on a class or near it, 0..FULL, from shares covered by its parts."""
     on, near = (np.zeros(grid.shape, dtype=np.float32) for _ in range(2))
     rest = np.full(grid.shape, FULL, dtype=np.float32)
-    beside = np.concatenate((likeness[1:2], likeness[1:])).astype(np.float32)  # a cell that is covered in part
-    for share, factor in zip(shares, worth.astype(np.float32), strict=True):
+    nearby = np.concatenate((likeness[1:2], likeness[1:])).astype(np.float32)  # ring 0: partly covered cells
+    for share, factor in zip(shares, weights.astype(np.float32), strict=True):
         if share.any():
             on += factor * np.float32(likeness[0]) * share
             rest -= share
-            np.maximum(near, factor * beside[ring_of(share > 0, cell_size_m=grid.cell_size_m)], out=near)
+            np.maximum(near, factor * nearby[ring_of(share > 0, cell_size_m=grid.cell_size_m)], out=near)
     return np.asarray(np.clip(np.rint(on + near * rest), 0, FULL), dtype=np.uint8)
 
 
 def _share(
     is_there: NDArray[np.bool_], around: tuple[tuple[int, int], tuple[int, int]], grid: Grid
 ) -> NDArray[np.uint8]:
-    """How much of each cell is marked, 0..FULL."""
+    """Return the marked share of each cell, 0..FULL."""
     marked = np.pad(is_there.view(np.uint8) * np.uint8(FULL), around)
     return np.asarray(cv2.resize(marked, (grid.cols, grid.rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def doubted(evidence: Evidence) -> Evidence:
-    """Leave open what lies beside a seen line: a line of the map that runs there may be the same, some metres off.
+    """Return a view with absent cells near a seen line as unknown: a line mapped there may be the same.
 
-    The view's side of the distance-transform compatibility that `likeness_by_hand` gives the map.
+    This complements the distance transform of the map in `likeness_by_hand`.
 
     Examples
     --------
@@ -128,10 +128,7 @@ def doubted(evidence: Evidence) -> Evidence:
 
 @dataclass(frozen=True, kw_only=True)
 class RasterView:
-    """A view weighed by gains, in the classes of a map.
-
-    `parts` is the linear form of each class apart: weights and what knowing is worth, both of shape (C, rows, cols).
-    """
+    """A view weighed by gains, in the classes of a map: factors of layers and of known cells, shape (C, rows, cols)."""
 
     weights: NDArray[np.float32]
     known: NDArray[np.float32]
@@ -139,7 +136,7 @@ class RasterView:
 
     @classmethod
     def of(cls, evidence: Evidence, classes: Sequence[str], gains: Gains) -> Self:
-        """Weigh what a view says of the classes of a map; what either does not know is left out.
+        """Weigh the classes that a view shares with a map.
 
         Examples
         --------
@@ -153,39 +150,34 @@ class RasterView:
         weights, known = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         for at, name in enumerate(classes):
             if name in evidence.classes:
-                mine = gains.only(at)
-                found, knowing = weigh(evidence.layer(name)[None], mine)
-                weights[at], known[at] = found[0], knowing
+                found, known[at] = weigh(evidence.layer(name)[None], gains.only(at))
+                weights[at] = found[0]
         return cls(weights=weights, known=known, cell_size_m=evidence.cell_size_m)
 
     def template(self) -> Template:
-        """All classes in one, for the search."""
+        """Return the template of all classes, for the search."""
         return Template(weights=self.weights, known=self.known.sum(axis=0), cell_size_m=self.cell_size_m)
 
     def by_class(self, field: Field, poses: Sequence[Pose]) -> NDArray[np.float64]:
-        """Score of each class at each pose, shape (M, C); the sum of a row is `search.find.score_at` of the template.
-
-        The map is read in the middle of each square of cells of the view that is as large as its own, as the search
-        does.
-        """
+        """Return the score of each class at each pose, shape (M, C); a row sums to `search.find.score_at`."""
         pool = max(1, round(field.grid.cell_size_m / self.cell_size_m))
-        speaking = np.flatnonzero(self.weights.any(axis=(1, 2)) | self.known.any(axis=(1, 2)))
-        bands = np.concatenate((self.weights[speaking], self.known[speaking]))
+        active = np.flatnonzero(self.weights.any(axis=(1, 2)) | self.known.any(axis=(1, 2)))
+        bands = np.concatenate((self.weights[active], self.known[active]))
         summed, frame = squares(bands, pool, cell_size_m=self.cell_size_m)
-        weights, known = summed[: len(speaking)], summed[len(speaking) :]
+        weights, known = summed[: len(active)], summed[len(active) :]
         total = np.zeros((len(poses), len(self.weights)))
         for row, pose in zip(total, poses, strict=True):
             to_map = between(frame, pose, field.grid)
-            row[speaking] = np.einsum("cij,ij->c", known, warped(field.known, to_map, frame.shape).astype(np.float32))
-            for at, mine in zip(speaking.tolist(), weights, strict=True):
-                row[at] += np.vdot(mine, warped(field.layers[at], to_map, frame.shape).astype(np.float32))
+            row[active] = np.einsum("cij,ij->c", known, warped(field.known, to_map, frame.shape).astype(np.float32))
+            for at, layer in zip(active.tolist(), weights, strict=True):
+                row[at] += np.vdot(layer, warped(field.layers[at], to_map, frame.shape).astype(np.float32))
         return total / FULL
 
-    def tempered(self, temper: NDArray[np.float64]) -> Self:
-        """The same, the score of each class times its exponent."""
-        scale = temper.astype(np.float32)[:, None, None]
+    def scaled(self, scaling: NDArray[np.float64]) -> Self:
+        """Return the view with the score of each class scaled."""
+        scale = scaling.astype(np.float32)[:, None, None]
         return replace(self, weights=self.weights * scale, known=self.known * scale)
 
     def times(self, weight: NDArray[np.float32] | np.float32) -> Self:
-        """The same, all cells times a weight, or each times its own, shape (rows, cols): the w of Eq. 8."""
+        """Return the view with cells times a weight, or times weights of shape (rows, cols): w of Eq. 8."""
         return replace(self, weights=self.weights * weight, known=self.known * weight)

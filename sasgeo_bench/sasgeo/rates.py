@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How classes are seen, mapped and outlived: estimated from views whose places are known, on train blocks alone."""
+"""Rates of seeing, mapping and ageing of classes, fitted to training views of known place."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,34 +14,32 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 
-RINGS_M: Final = (4.0, 8.0, 12.0)  # around a class: OSM lies a few metres off, masks of views another few
+RINGS_M: Final = (4.0, 8.0, 12.0)  # around a class: OSM and masks of views are off by some metres each
 FAR: Final = len(RINGS_M) + 1
 NOWHERE: Final = FAR + 1
 
-_SLACK_M: Final = 1e-3  # a distance this much beyond a ring is in it
+_SLACK_M: Final = 1e-3  # tolerance of a distance at the edge of a ring
 _SHARES: Final = ("hit", "false_alarm", "missing", "mapped")
 _YEARLY: Final = ("vanish_per_year", "appear_per_year")
-_CELLS_PER_WITNESS: Final = 200.0  # a house, or a road's width of road: cells that are right or wrong together
+_CELLS_PER_WITNESS: Final = 200.0  # a house or a piece of road is right or wrong as a whole
 _PRIOR_WIDTH: Final = 1.5  # of logits of shares and logarithms of rates
-_STEP: Final = 1e-3  # of a numerical slope
-_Z: Final = 1.96
-_EDGE: Final = 1e-5  # chances are no nearer to 0 or 1
+_EDGE: Final = 1e-5  # least distance of probabilities from 0 and 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassRates:
-    """How one class is seen, mapped and outlived.
+    """Rates of seeing, mapping and ageing of one class.
 
     Parameters
     ----------
     hit, false_alarm : float
-        Chance that a cell is seen as the class where the class is, and where it is not.
+        Probability that a cell is seen as the class where the class is, and where it is not.
     missing : float
-        Chance that the class stands on a cell that a map of age 0 does not give it.
+        Probability that the class is on a cell where a map of age 0 lacks it.
     vanish_per_year, appear_per_year : float
-        Yearly rates at which what is mapped goes, and comes where nothing is mapped.
+        Yearly rates at which mapped cells vanish, and unmapped ones appear.
     mapped : float
-        Share of the cells that maps give the class.
+        Share of cells on which the class is mapped.
 
     Raises
     ------
@@ -65,7 +63,7 @@ class ClassRates:
     mapped: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no rate."""
+        """Check ranges."""
         for name in _SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 message = f"{name} is a share within 0..1, got {getattr(self, name)!r}"
@@ -80,21 +78,21 @@ class ClassRates:
             raise ConfigError(message)
 
     def survival(self, age_years: float) -> float:
-        """Chance that what is mapped still stands."""
+        """Return the probability that a mapped cell still holds the class."""
         return float(np.exp(-self.vanish_per_year * max(age_years, 0.0)))
 
     def unmapped(self, age_years: float) -> float:
-        """Chance that the class stands where the map does not give it."""
+        """Return the probability that an unmapped cell holds the class."""
         return float(1 - (1 - self.missing) * np.exp(-self.appear_per_year * max(age_years, 0.0)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tally:
-    """Cells of one view at its true place, by what was seen and how far away the map has the class.
+    """Counts of cells of one view at its true place, by state and distance from the mapped class.
 
-    `seen` and `missed`, shape (C, FAR + 1), count cells seen present and seen to be absent: first where the map has the
-    class, then within each of `RINGS_M` of it, last farther away. What either side does not know is in none.
-    `block` is where the view lies, `age_years` how old the map was.
+    `seen` and `missed`, shape (C, FAR + 1), count cells seen present and absent: first on the mapped class, then
+    within each of `RINGS_M` of it, last farther away. Unknown cells of either side are not counted.
+    `block` names the place of the view, `age_years` is the age of the map.
     """
 
     classes: tuple[str, ...]
@@ -105,7 +103,7 @@ class Tally:
 
 
 def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]:
-    """How far each cell is from the nearest of its class, as the index of a ring.
+    """Return the distance of each cell from its class, as the index of a ring.
 
     Parameters
     ----------
@@ -132,7 +130,7 @@ def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]
 
 
 def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.uint8]:
-    """How far each cell is from the nearest that is marked, as `rings` has it, shape (rows, cols).
+    """Return the ring of each cell around the marked ones, shape (rows, cols).
 
     Examples
     --------
@@ -164,7 +162,7 @@ def tally(
     age_years : float
         From the map to the view.
     block : str
-        Where the view lies: what is resampled for intervals.
+        Place of the view.
 
     Examples
     --------
@@ -174,7 +172,7 @@ def tally(
     """
 
     def count(state: int) -> NDArray[np.int64]:
-        """Cells of one state by class and ring."""
+        """Count cells of one state by class and ring."""
         return np.stack(
             [
                 np.bincount(ring[view == state], minlength=NOWHERE + 1)[: FAR + 1]
@@ -186,10 +184,10 @@ def tally(
 
 
 def likeness(tallies: Sequence[Tally]) -> NDArray[np.float64]:
-    """How much being near a class is like being on it: 1 on it, 0 far away, shape (C, FAR + 1).
+    """Return the likeness of cells near a class to cells on it: 1 on it, 0 far away, shape (C, FAR + 1).
 
-    In each ring, the logarithm of the share that was seen present, between those on the class and far away from it:
-    what the paper's exp(-D^2 / 2 tau^2) sets by hand for lines, measured for all classes. It never rises with distance.
+    In each ring it is the logarithm of the share seen present, scaled between cells on the class and far from it. This
+    measures for all classes what the paper's exp(-D^2 / 2 tau^2) sets for lines. It never rises with distance.
 
     Examples
     --------
@@ -206,11 +204,11 @@ def likeness(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 
 def missed_share(tallies: Sequence[Tally], near: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much of a miss on a class one degree of its likeness is worth, 0..1, shape (C,).
+    """Return the loss for a missed cell per degree of likeness, as a share of the loss on the class, 0..1, shape (C,).
 
-    The score of a cell is linear in the likeness of the map, `near`, of shape (C, FAR + 1). What is seen follows it by
-    its making; what is missed beside a class says less than that. This is the slope of least squares through the rings,
-    as a share of the step from far away onto the class.
+    The score of a cell is linear in the likeness of the map, `near`, of shape (C, FAR + 1), which fits cells seen but
+    overstates misses near a class. This is the least-squares slope through the rings, over the step from far away onto
+    the class.
 
     Examples
     --------
@@ -228,29 +226,15 @@ def missed_share(tallies: Sequence[Tally], near: NDArray[np.float64]) -> NDArray
 
 
 def _seen_share(tallies: Sequence[Tally]) -> NDArray[np.float64]:
-    """Share of cells that were seen present by ring, shape (C, FAR + 1); with one witness for what is seen far away."""
+    """Return the share of cells seen present by ring, shape (C, FAR + 1), with a prior of one unit from far away."""
     seen = np.sum([one.seen for one in tallies], axis=0) / _CELLS_PER_WITNESS
     known = seen + np.sum([one.missed for one in tallies], axis=0) / _CELLS_PER_WITNESS
     far = (seen[:, FAR:] + _EDGE) / (known[:, FAR:] + 2 * _EDGE)
     return np.asarray(np.clip((seen + far) / (known + 1), _EDGE, 1 - _EDGE))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FittedRates:
-    """Rates of one class with the 95 % interval of each, and how many views and blocks they come from.
-
-    `lo` and `hi` hold the bounds field by field.
-    """
-
-    best: ClassRates
-    lo: ClassRates
-    hi: ClassRates
-    views: int
-    blocks: int
-
-
 def hand_rates(class_name: str) -> ClassRates:
-    """Rates of a class before anything was measured: yearly ones from the taxonomy, a detector that is mostly right.
+    """Return rates of a class by hand: yearly ones from the taxonomy, and a detector that is mostly right.
 
     Examples
     --------
@@ -268,23 +252,21 @@ def hand_rates(class_name: str) -> ClassRates:
     )
 
 
-def fit_rates(tallies: Sequence[Tally]) -> Mapping[str, FittedRates]:
-    """Estimate the rates of every class from views whose places are known.
+def fit_rates(tallies: Sequence[Tally]) -> dict[str, ClassRates]:
+    """Fit the rates of every class to views of known place.
 
-    The likelihood is that of `weights.likelihood_gains`, cell by cell; views whose map has age 0 show a world that is
-    the map, so nothing can be missing from it there, and they tell hits and false alarms apart from ageing. Cells are
-    no independent witnesses: `_CELLS_PER_WITNESS` of them count as one against a weak prior around `hand_rates`, which
-    decides alone where there is nothing to learn from. Intervals are normal ones of logits and logarithms, from the
-    covariance that is robust to what views of one block have in common (Huber's sandwich).
+    The likelihood is that of `weights.likelihood_gains`, cell by cell. On a map of age 0 nothing is missing, so such
+    views separate hits and false alarms from ageing. Cells are not independent: `_CELLS_PER_WITNESS` of them count as
+    one against a weak prior around `hand_rates`, which decides alone without data.
 
     Parameters
     ----------
     tallies : sequence of Tally
-        Of train blocks; all with the same classes.
+        Of training places; all with the same classes.
 
     Returns
     -------
-    mapping of str to FittedRates
+    dict of str to ClassRates
         By class.
 
     Raises
@@ -296,74 +278,44 @@ def fit_rates(tallies: Sequence[Tally]) -> Mapping[str, FittedRates]:
     --------
     >>> seen, missed = np.array([[90_000, 0, 0, 0, 100]]), np.array([[10_000, 0, 0, 0, 900_000]])
     >>> young = Tally(classes=("building",), age_years=0.0, block="a", seen=seen, missed=missed)
-    >>> round(fit_rates([young])["building"].best.hit, 2)
+    >>> round(fit_rates([young])["building"].hit, 2)
     0.9
     """
     if not tallies:
-        message = "no views to learn rates from: the train part is empty; choose another split, or weights by hand"
+        message = "no views to fit rates to: the train part is empty; choose another split, or weights by hand"
         raise ConfigError(message)
     classes = tallies[0].classes
     if any(other.classes != classes for other in tallies):
-        message = "views to learn rates from have different classes: build their regions with one taxonomy"
+        message = "views to fit rates to have different classes: build their regions with one taxonomy"
         raise ConfigError(message)
     ages_years, age = np.unique([one.age_years for one in tallies], return_inverse=True)
     blocks, block = np.unique([one.block for one in tallies], return_inverse=True)
     counts = np.array([(t.seen[:, 0], t.missed[:, 0], t.seen[:, FAR], t.missed[:, FAR]) for t in tallies])
     sums = np.zeros((len(blocks), len(ages_years), *counts.shape[1:]))
     np.add.at(sums, (block, age), counts)
-    views = (counts[:, 0] + counts[:, 1] > 0).sum(axis=0)
-    return {
-        name: _fitted(hand_rates(name), ages_years, sums[..., at], views=int(views[at]))
-        for at, name in enumerate(classes)
-    }
+    return {name: _fitted(hand_rates(name), ages_years, sums[..., at]) for at, name in enumerate(classes)}
 
 
-def _fitted(
-    hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[np.float64], *, views: int
-) -> FittedRates:
-    """Rates of one class from counts of shape (blocks, ages, 4)."""
+def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[np.float64]) -> ClassRates:
+    """Fit the rates of one class to counts of shape (blocks, ages, 4)."""
     start = _to_vector(hand)
 
-    def losses(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of each block, all but the prior's."""
+    def loss(vector: NDArray[np.float64]) -> float:
+        """Return the negative log posterior."""
         mapped, empty = _chances(vector, ages_years)
         chances = np.stack((mapped, 1 - mapped, empty, 1 - empty), axis=1)
-        return np.asarray(np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS)
+        losses = np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS
+        return float(losses.sum() + 0.5 * (((vector - start) / _PRIOR_WIDTH) ** 2).sum())
 
-    def loss(vector: NDArray[np.float64]) -> float:
-        """Of all blocks and the prior."""
-        return float(losses(vector).sum() + 0.5 * (((vector - start) / _PRIOR_WIDTH) ** 2).sum())
-
-    best = optimize.minimize(loss, start, method="L-BFGS-B").x
-    deviation = _deviations(losses, best)
     total = counts.sum()
     mapped = float(counts[..., :2].sum() / total) if total else hand.mapped
-    low, middle, high = (_to_rates(best + z * deviation, mapped=mapped) for z in (-_Z, 0.0, _Z))
-    return FittedRates(best=middle, lo=low, hi=high, views=views, blocks=int(counts.any(axis=(1, 2)).sum()))
-
-
-def _deviations(
-    losses: Callable[[NDArray[np.float64]], NDArray[np.float64]], best: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Standard deviations of a vector at the least sum of the losses of blocks and of the prior, robust to blocks."""
-    steps = _STEP * np.eye(len(best))
-    slopes = np.stack([(losses(best + step) - losses(best - step)) / (2 * _STEP) for step in steps])
-
-    def slope(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of the sum of all blocks."""
-        return np.array([(losses(vector + step) - losses(vector - step)).sum() / (2 * _STEP) for step in steps])
-
-    bend = np.stack([(slope(best + step) - slope(best - step)) / (2 * _STEP) for step in steps])
-    bend = (bend + bend.T) / 2 + np.eye(len(best)) / _PRIOR_WIDTH**2
-    inner = slopes @ slopes.T + np.eye(len(best)) / _PRIOR_WIDTH**2
-    back = np.linalg.pinv(bend)
-    return np.asarray(np.sqrt(np.clip(np.diag(back @ inner @ back), 0, None)))
+    return _to_rates(optimize.minimize(loss, start, method="L-BFGS-B").x, mapped=mapped)
 
 
 def _chances(
     vector: NDArray[np.float64], ages_years: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Chances to see the class where it is mapped and where it is not, by age."""
+    """Return the probabilities of seeing the class where it is mapped and where it is not, by age."""
     hit, ratio, missing = special.expit(vector[:3])
     false_alarm = hit * ratio
     vanish, appear = np.exp(vector[3:])

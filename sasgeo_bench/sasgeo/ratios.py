@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it says that two nodes have the same degree, area or arms: log-likelihood ratios, and the rules they follow."""
+"""Log-likelihood ratios of equal degrees, areas and arms of two nodes, and their parameters."""
 
 from dataclasses import dataclass
 
@@ -16,25 +16,25 @@ class GraphRules:
     Parameters
     ----------
     gate_m : float
-        How far from where the pose puts it a node may be: twice what maps and detectors are off, and a search.
+        Largest offset of a node: twice the errors of maps and detectors, and that of a search.
     place_sigma_m : float
         Standard deviation of the place of a node, each axis: 4 m of the map, 3 m of the pose, some metres of a warp.
     warp_m, stretch_m : float
-        How far nodes may be moved together, and over what distance they go on being moved alike: after a first
-        assignment the gate follows its neighbours. 15 m rms are survived so; waves are 60 m and longer.
+        Largest common shift of neighbouring nodes, and its correlation length: after a first assignment the gate moves
+        with the neighbours. This tolerates warps of 15 m rms with waves of 60 m and more.
     wander : float
-        Chance that the place, an arm or the area of a right match says nothing.
+        Probability that the place, an arm or the area of a right match is an outlier.
     arm_sigma_deg, area_sigma : float
-        Of the direction of an arm, and of the logarithm of an area.
+        Standard deviations of the direction of an arm, and of the logarithm of an area.
     area_spread : float
-        Standard deviation of the logarithm of the areas of houses that are not the same.
+        Standard deviation of the logarithm of areas of different houses.
     degrees : tuple of float
-        Log-likelihood ratios of equal degrees, of degrees one apart, and further apart.
+        Log-likelihood ratios of degrees that are equal, differ by one, and by more.
     edge_sigma_m, edge_strain : float
-        Standard deviation of the relative place of two neighbours: a part that stays, and one that grows with their
-        distance; a warp of 10 m rms and waves of 90 m strains by 0.4, a pose that is off by 3 degrees by 0.05.
+        Standard deviation of the relative place of two neighbours: a constant, and a part of their distance. A warp of
+        10 m rms with waves of 90 m strains by 0.4, a heading error of 3 degrees by 0.05.
     edge_weight : float
-        Of a pair of neighbours. A node has about six, and they share its place.
+        Weight of a pair of neighbours. A node has about six, which share its place.
     link, false_link, lost_link : float
         Log-likelihood ratios of a way between two nodes on both sides, in the view alone, on the map alone.
     """
@@ -57,19 +57,19 @@ class GraphRules:
 
 
 def by_degree(seen: Ints, mapped: Ints, rules: GraphRules) -> Floats:
-    """Equal degrees, one apart or more; 0 where either is not known, shape (P,).
+    """Return the ratios of degrees; 0 where either is unknown, shape (P,).
 
     Examples
     --------
     >>> by_degree(np.array([3, 3, 0]), np.array([3, 4, 3]), GraphRules()).tolist()
     [0.4, -1.2, 0.0]
     """
-    apart = np.minimum(np.abs(seen - mapped), len(rules.degrees) - 1)
-    return np.where((seen > 0) & (mapped > 0), np.array(rules.degrees)[apart], 0.0)
+    off = np.minimum(np.abs(seen - mapped), len(rules.degrees) - 1)
+    return np.where((seen > 0) & (mapped > 0), np.array(rules.degrees)[off], 0.0)
 
 
 def by_area(seen_m2: Floats, mapped_m2: Floats, rules: GraphRules) -> Floats:
-    """Equal areas against those of two that have nothing to do with each other; 0 where there are none, shape (P,).
+    """Return the ratios of equal against unrelated areas; 0 where there are none, shape (P,).
 
     Examples
     --------
@@ -85,7 +85,7 @@ def by_area(seen_m2: Floats, mapped_m2: Floats, rules: GraphRules) -> Floats:
 
 
 def by_arms(seen_deg: Floats, mapped_deg: Floats, rules: GraphRules) -> Floats:
-    """Each arm seen against the nearest of the map; 0 where either side has none, shape (P,).
+    """Return the ratios of seen arms and the nearest mapped ones; 0 where either side has none, shape (P,).
 
     Examples
     --------

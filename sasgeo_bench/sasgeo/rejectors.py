@@ -8,45 +8,44 @@ from typing import Final, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import special, stats
 from sklearn.ensemble import GradientBoostingClassifier  # type: ignore[import-untyped, unused-ignore]
 from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
 
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.sasgeo.conformal import upper_rate
 from sasgeo_bench.sasgeo.frame import Frame, Rows, features, is_none, lead
 
-_DECIMALS: Final = 12  # of a probability: the last digits of a fit hang on where in memory arrays lie
+_DECIMALS: Final = 12  # of a probability: the last digits of a fit depend on memory alignment
 
-FEW: Final = 5  # fewer answers of a kind, right or false, teach no model which evidence tells them apart
+FEW: Final = 5  # least number of right and of false answers for a fit
 _FOLDS: Final = 4
-_PER_TREE: Final = 500  # answers that a tree sees at most: more cost time and gain nothing at this depth
+_PER_TREE: Final = 500  # answers of one tree at most: more cost time and gain nothing at this depth
 
 
 class Model(Protocol):
-    """Rows of features without gaps -> log-odds of a false fix."""
+    """Model from rows of features without gaps to log-odds of a false fix."""
 
     def log_odds(self, rows: Rows) -> NDArray[np.float64]:
-        """Log-odds, shape (N,), of rows of shape (N, F)."""
+        """Return log-odds, shape (N,), of rows of shape (N, F)."""
         ...
 
 
 class _Fitted(ABC):
-    """What both rules share: who is learnt from, and what is done where a fit is not possible."""
+    """Base of both rules: choice of calibration answers, and a fallback where no fit is possible."""
 
     card: RejectorCard
 
     def __init__(self) -> None:
         self.remark = ""
-        self._rule: _Learnt | Counted | None = None
+        self._rule: _FittedModel | Counted | None = None
 
     @abstractmethod
     def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
-        """Fit the model proper."""
+        """Fit the model."""
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn from answers of calibration blocks; withheld ones and views wholly unknown teach nothing."""
+        """Fit to answers of calibration blocks, without withheld ones and views wholly unknown."""
         at = [index for index, item in enumerate(predictions) if not is_none(item)]
         answers = [predictions[index] for index in at]
         truth = np.asarray(is_false, dtype=bool)[at]
@@ -55,16 +54,16 @@ class _Fitted(ABC):
         if min(false, len(truth) - false) < FEW:
             self._rule = Counted.of(np.array([lead(item) for item in answers]), truth)
             self.remark = (
-                f"{false} of {len(truth)} calibration answers are false, fewer than {FEW} of a kind teach no model: "
-                "ranked by margin, with no more claimed than the counts carry"
+                f"{false} of {len(truth)} calibration answers are false, a fit needs {FEW} of each kind: "
+                "ranked by margin, with the bounds that the counts support"
             )
         else:
             raw = features(answers)
             frame = Frame.of(raw)
-            self._rule = _Learnt(frame=frame, model=self.learn(frame.filled(raw), truth), answers=len(truth))
+            self._rule = _FittedModel(frame=frame, model=self.learn(frame.filled(raw), truth), answers=len(truth))
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Probability of a false fix, shape (N,); 1 where there is no answer."""
+        """Return the probability of a false fix, shape (N,); 1 where there is no answer."""
         if self._rule is None:
             message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
             raise RuntimeError(message)
@@ -129,27 +128,40 @@ class SasgeoBoosted(_Fitted):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Learnt:
-    """A frame and the model that was fitted in it on some answers."""
+class _FittedModel:
+    """A frame of features and the model fitted in it."""
 
     frame: Frame
     model: Model
     answers: int
 
     def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Probability of a false fix, shape (N,)."""
+        """Return the probability of a false fix, shape (N,)."""
         chance = special.expit(self.model.log_odds(self.frame.filled(features(answers))))
         return np.asarray((self.answers * chance + 1.0) / (self.answers + 2.0))
 
 
+def upper_rate(failures: float, trials: float, *, confidence: float = 0.95) -> float:
+    """Return Clopper-Pearson's one-sided upper bound on a rate, in [0, 1]; 1 without a trial.
+
+    Counts need not be whole; 0 <= failures <= trials.
+
+    Examples
+    --------
+    >>> round(upper_rate(0, 299), 4), upper_rate(0, 0)
+    (0.01, 1.0)
+    """
+    return 1.0 if failures == trials else float(stats.beta.ppf(confidence, failures + 1.0, trials - failures))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Counted:
-    """The margin's order where a model cannot be fitted.
+    """Order by margin where no model can be fitted.
 
-    `margins` are those of calibration, ascending. Where nearly all of calibration was right, an answer that leads by
-    more than m calibration answers did is at most as often false as those, if falseness falls with the margin: at most
-    Clopper-Pearson's upper end of their false ones. Where nearly all was false, the chance of being right is that of
-    one more of each kind at most, and less the less an answer leads.
+    `margins` are those of calibration, ascending. Where nearly all of calibration was right, and errors fall with the
+    margin, an answer with a larger margin than m of them is false at most as often as those: at most Clopper-Pearson's
+    upper bound. Where nearly all was false, the probability of being right is that of one more of each kind at most,
+    and falls with the margin.
     """
 
     margins: NDArray[np.float64]
@@ -157,7 +169,7 @@ class Counted:
 
     @classmethod
     def of(cls, margins: NDArray[np.float64], is_false: NDArray[np.bool_]) -> Self:
-        """Count.
+        """Sort margins and count false answers.
 
         Examples
         --------
@@ -168,15 +180,15 @@ class Counted:
         return cls(margins=np.sort(margins), false=int(is_false.sum()))
 
     def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Chance of a false fix, shape (N,)."""
+        """Return the probability of a false fix, shape (N,)."""
         return self.chance(np.array([lead(item) for item in answers]))
 
     def chance(self, margins: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Chance of a false fix by margin, shape (N,); never less for a smaller one."""
+        """Return the probability of a false fix by margin, shape (N,); it never falls for a smaller one."""
         count = len(self.margins)
         if not count:
             return np.ones(len(margins))
-        # How many of calibration lead by no more, in between by a straight line so that the order is kept.
+        # Number of calibration answers with at most this margin, interpolated so that the order is kept.
         distinct, first = np.unique(self.margins, return_index=True)
         passed = np.interp(margins, distinct, np.append(first[1:], count).astype(np.float64), left=0.0)
         if 2 * self.false > count:
@@ -186,7 +198,7 @@ class Counted:
 
 @dataclass(frozen=True, kw_only=True)
 class _Logistic:
-    """A weight for each feature."""
+    """Logistic regression."""
 
     weights: LogisticRegression
 
@@ -197,13 +209,13 @@ class _Logistic:
         return cls(weights=weights.fit(rows, is_false))
 
     def log_odds(self, rows: Rows) -> NDArray[np.float64]:
-        """Log-odds of a false fix, shape (N,)."""
+        """Return log-odds of a false fix, shape (N,)."""
         return np.asarray(self.weights.decision_function(rows), dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Boosted:
-    """Trees that were fitted on different parts, and the line that recalibrates them."""
+    """Trees fitted to different parts, and the line that recalibrates them."""
 
     trees: tuple[GradientBoostingClassifier, ...]
     slope: float
@@ -211,9 +223,9 @@ class _Boosted:
 
     @classmethod
     def of(cls, rows: Rows, is_false: NDArray[np.bool_]) -> Self:
-        """Fit the trees on three parts of four, each time others, and the line on the parts they did not see."""
+        """Fit each tree to three of four parts, and the line to the parts left out."""
         fold = np.empty(len(rows), dtype=np.int64)
-        for kind in (False, True):  # each part has its share of the false ones
+        for kind in (False, True):  # stratified by kind
             at = np.flatnonzero(is_false == kind)
             fold[at] = np.arange(len(at)) % _FOLDS
         trees = tuple(_trees(rows[fold != part], is_false[fold != part]) for part in range(_FOLDS))
@@ -224,9 +236,9 @@ class _Boosted:
         return cls(trees=trees, slope=float(line.coef_[0, 0]), shift=float(line.intercept_[0]))
 
     def log_odds(self, rows: Rows) -> NDArray[np.float64]:
-        """Log-odds of a false fix, shape (N,)."""
-        said = np.mean([tree.decision_function(rows) for tree in self.trees], axis=0)
-        return np.asarray(self.slope * said + self.shift, dtype=np.float64)
+        """Return log-odds of a false fix, shape (N,)."""
+        odds = np.mean([tree.decision_function(rows) for tree in self.trees], axis=0)
+        return np.asarray(self.slope * odds + self.shift, dtype=np.float64)
 
 
 def _trees(rows: Rows, is_false: NDArray[np.bool_]) -> GradientBoostingClassifier:

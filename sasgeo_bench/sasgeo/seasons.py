@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a season does to a class: the d_season of Eq. 5 of the SASGeo paper, by hand and from views that tell theirs."""
+"""Seasonal factors of classes, d_season of Eq. 5 of the SASGeo paper: by hand and fitted to views of known season."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.sasgeo.rates import ClassRates, Tally
 
-# Shares of a mapped class that can still be seen: guesses of ours, for want of a source; 1 for what is not named.
+# Visible share of a mapped class: our guesses, for want of a source; 1 for classes not named.
 HAND: Final[Mapping[str, Mapping[str, float]]] = {
     "leaf_on": {"road_minor": 0.8, "path_track": 0.5, "railway": 0.9, "waterway": 0.7, "field_boundary": 0.8},
     "snow": {
@@ -28,23 +28,23 @@ HAND: Final[Mapping[str, Mapping[str, float]]] = {
 }
 SEASONS: Final = tuple(HAND)
 _CELLS_PER_WITNESS: Final = 200.0  # as for rates: a house or a piece of road is right or wrong as a whole
-_HAND_WITNESSES: Final = 20.0  # that a factor by hand is worth
+_HAND_WITNESSES: Final = 20.0  # weight of a factor by hand
 
 
 def by_hand(season: str, classes: Sequence[str]) -> NDArray[np.float64]:
-    """Factors of a season that were set by hand, shape (C,); all 1 where nothing is said of the season.
+    """Return the factors of a season set by hand, shape (C,); 1 for an unknown season.
 
     Examples
     --------
     >>> by_hand("snow", ["building", "path_track"]).tolist(), by_hand("", ["water"]).tolist()
     ([1.0, 0.3], [1.0])
     """
-    mine = HAND.get(season, {})
-    return np.array([mine.get(name, 1.0) for name in classes], dtype=np.float64)
+    factors = HAND.get(season, {})
+    return np.array([factors.get(name, 1.0) for name in classes], dtype=np.float64)
 
 
 def fit_season(season: str, tallies: Sequence[Tally], rates: Sequence[ClassRates]) -> NDArray[np.float64]:
-    """Estimate the factors of one season: what was seen of what is mapped, over what would be seen without it.
+    """Fit the factors of one season: mapped cells that were seen, over those expected without a season.
 
     Parameters
     ----------
@@ -53,12 +53,12 @@ def fit_season(season: str, tallies: Sequence[Tally], rates: Sequence[ClassRates
     tallies : sequence of Tally
         Views of that season; all of the same classes.
     rates : sequence of ClassRates
-        Of these classes, learnt from views of which no season is told.
+        Rates of these classes, fitted to views without a season.
 
     Returns
     -------
     ndarray of float, shape (C,)
-        0..1; drawn to those by hand where little was seen.
+        0..1; drawn to the factors by hand where few cells were seen.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks -> vectors: the middle lines of roads, railways and waterways, so that a mask has a graph as vectors have."""
+"""Centre lines of roads, railways and waterways from masks, so that a mask has a graph as vectors have."""
 
 from typing import Final
 
@@ -14,25 +14,15 @@ from sasgeo_bench.regions.evidence import PRESENT, Evidence, cell_offsets_m
 from sasgeo_bench.sasgeo.kinds import ROADS
 from sasgeo_bench.tasks.vectors import vector_table
 
-# What is drawn together, and the class that its lines get; which class of road it is a crossing does not ask.
+# Classes thinned together, and the class of their lines: crossings do not depend on the class of a road.
 LAYERS: Final = {"road_minor": ROADS, "railway": ("railway",), "waterway": ("waterway",)}
-SPUR_M: Final = 8.0  # shorter twigs are the corners of a broad line
-_ROUGH_CELLS: Final = 0.75  # what the staircase of cells adds to a line
+SPUR_M: Final = 8.0  # shorter branches are corners of a broad line
+_ROUGH_CELLS: Final = 0.75  # tolerance of the simplification of stairs
 _FORK: Final = 3
 
 
 def lines_of_mask(evidence: Evidence) -> gpd.GeoDataFrame:
-    """Middle lines of what a view shows as narrow, as perceived vectors; unknown cells show nothing.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        The view.
-
-    Returns
-    -------
-    geopandas.GeoDataFrame
-        As `Query.vectors`: (right, up) from the middle of the view, metres.
+    """Return the centre lines of `LAYERS` in a view as `Query.vectors`: (right, up) from its middle, metres.
 
     Examples
     --------
@@ -51,7 +41,7 @@ def lines_of_mask(evidence: Evidence) -> gpd.GeoDataFrame:
 
 
 def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.object_]:
-    """Lines that a mask is thinned to, in (right, up) from its middle, metres; they end where they fork.
+    """Return the centre lines of a mask in (right, up) from its middle, metres; they end at forks.
 
     Examples
     --------
@@ -72,9 +62,9 @@ def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.o
 
 
 def _links(thin: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Pairs of neighbouring cells, as numbers row by row, shape (E, 2).
+    """Return pairs of neighbouring cells by number, row by row, shape (E, 2).
 
-    Two at a corner are linked only where no cell beside both is set: else each fork were a triangle.
+    Diagonal neighbours are linked only where no common neighbour is set: else each fork would be a triangle.
     """
     number = np.arange(thin.size).reshape(thin.shape)
     falls = thin[:-1, :-1] & thin[1:, 1:] & ~thin[:-1, 1:] & ~thin[1:, :-1]
@@ -90,14 +80,14 @@ def _links(thin: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _merged(lines: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Lines strung together where two ends meet and no third."""
+    """Merge lines where exactly two ends meet."""
     if not len(lines):
         return lines
     return np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines))), dtype=object)
 
 
 def _is_spur(lines: NDArray[np.object_]) -> NDArray[np.bool_]:
-    """Whether lines are short, end freely on one side and at a fork on the other."""
+    """Return which lines are short, with one free end and one at a fork."""
     tips_m = np.stack([shapely.get_coordinates(shapely.get_point(lines, at)) for at in (0, -1)], axis=1)
     _, tip = np.unique(tips_m.reshape(-1, 2), axis=0, return_inverse=True)
     tip = tip.reshape(-1, 2)

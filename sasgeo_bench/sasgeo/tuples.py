@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses proposed by pairs of junctions, for unknown heading and scale: two junctions with their arms give both."""
+"""Poses proposed by pairs of junctions, which with their arms determine heading and scale."""
 
 import math
 from typing import Final, NamedTuple
@@ -15,18 +15,18 @@ from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.pairs import JUNCTIONS, JunctionPairs
 
-APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones tell no heading, farther ones are seldom both in a view
-SLACK_M: Final = 4.0  # of their distance, either way
-MOST_PAIRS: Final = 150  # of a view, the longest: they tell the heading best
-_PLACE_M, _YAW_DEG, _LOG_SCALE = 12.0, 8.0, 0.08  # votes nearer than this are for one pose
+APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones give no heading, farther ones are seldom both in a view
+SLACK_M: Final = 4.0  # tolerance of their distance
+MOST_PAIRS: Final = 150  # of a view, the longest: they give the best heading
+_PLACE_M, _YAW_DEG, _LOG_SCALE = 12.0, 8.0, 0.08  # votes within these are for one pose
 _ROUNDS: Final = 2
-_TRIED: Final = 10  # cells of votes that are looked at, for each pose that is asked for
+_TRIED: Final = 10  # cells of votes tried for each requested pose
 _SIGMAS: Final = 3.0
-_REACH: Final = 1.0 + 1e-6  # some votes are always as near to their mean as to what they were gathered around
+_REACH: Final = 1.0 + 1e-6  # tolerance, so that a mean keeps some of its votes
 
 
 class Proposal(NamedTuple):
-    """A pose and its votes: the sum, over pairs of junctions that agree, of how rare each of them is, nats."""
+    """A pose and its votes: the sum of the rarities of agreeing pairs of junctions, nats."""
 
     pose: Pose
     votes: float
@@ -42,8 +42,8 @@ def proposals(
 ) -> list[Proposal]:
     """Propose poses from pairs of junctions whose arms agree.
 
-    Each pair of the view is looked up among those of the map: as long, within the scales, and with arms towards the
-    same sides. A hit gives one pose in closed form and votes for it, the more the fewer pairs of that length agree.
+    Each pair of the view is looked up among those of the map by length, within the scales, and directions of arms. Each
+    hit votes for one pose, in closed form, with a weight that falls with the number of hits for that length.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def proposals(
     scales : tuple of float
         Least and greatest scale of the view.
     prior : Prior, optional
-        Poses outside of its disc, or beyond three sigma of its heading, are not proposed.
+        Poses outside of its disc, or beyond three sigma of its heading, are dropped.
 
     Returns
     -------
@@ -66,29 +66,7 @@ def proposals(
     Raises
     ------
     ConfigError
-        If the scales are no range.
-
-    Examples
-    --------
-    Three streets of a map, seen with another heading and from elsewhere:
-
-    >>> import shapely
-    >>> from sasgeo_bench.regions.evidence import Evidence
-    >>> from sasgeo_bench.regions.graph import build_graph
-    >>> from sasgeo_bench.geometry.grid import Grid
-    >>> from sasgeo_bench.geometry.pose import inverse
-    >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
-    >>> ways = ("LINESTRING (-90 0, 0 0, 40 0, 90 0)", "LINESTRING (0 0, 0 90)", "LINESTRING (40 0, 40 -90)")
-    >>> lines = shapely.from_wkt(ways)
-    >>> grid = Grid(epsg=32632, west_m=-96.0, north_m=96.0, cell_size_m=2.0, rows=96, cols=96)
-    >>> features = as_features(vector_table([("road_minor", 0, False, line) for line in lines]))
-    >>> known = np.ones(grid.shape, dtype=bool)
-    >>> mapped = MappedGraph.make(build_graph(features), features, known=known, grid=grid)
-    >>> local = shapely.transform(lines, inverse(Pose(easting_m=5.0, northing_m=7.0, yaw_deg=50.0)).to_map)
-    >>> view = Evidence(classes=("road_minor",), cells=np.zeros((1, 96, 96), dtype=np.uint8), cell_size_m=2.0)
-    >>> seen = ObservedGraph.make(view, vector_table([("road_minor", 0, False, line) for line in local]))
-    >>> round(proposals(seen, mapped, count=1)[0].pose.yaw_deg)
-    50
+        If the scales are not positive, finite and in order.
     """
     if not 0 < scales[0] <= scales[1] < math.inf:
         message = f"scales are the least and the greatest scale, both positive and finite, got {scales!r}"
@@ -100,8 +78,8 @@ def proposals(
 
 
 def _votes(nodes: Nodes, mapped: MappedGraph, kind: int, scales: tuple[float, float]) -> Floats:
-    """Easting, northing, yaw, scale, weight and number of the view's pair, a row for each hit, shape (V, 6)."""
-    ours, found = JunctionPairs.of(nodes, kind, apart_m=APART_M), [np.zeros((0, 6))]
+    """Return easting, northing, yaw, scale, weight and number of the pair for each hit, shape (V, 6)."""
+    ours, found = JunctionPairs.of(nodes, kind, range_m=APART_M), [np.zeros((0, 6))]
     for theirs in mapped.junction_pairs[kind]:
         low, high = (
             np.searchsorted(theirs.length_m, ours.length_m * scale + slack_m)
@@ -112,7 +90,7 @@ def _votes(nodes: Nodes, mapped: MappedGraph, kind: int, scales: tuple[float, fl
             hits = theirs.like(ours.arms[number], first, last)
             if len(hits):
                 poses = _similarities(nodes, ours, number, mapped, theirs, hits, scales)
-                rarity = math.log((last - first + 1) / len(hits))  # more than 0: no pair is worth nothing
+                rarity = math.log((last - first + 1) / len(hits))  # always positive
                 about = np.broadcast_to([rarity, number], (len(hits), 2))
                 found.append(np.column_stack((poses, about)))
     return np.concatenate(found)
@@ -127,7 +105,7 @@ def _similarities(
     hits: Ints,
     scales: tuple[float, float],
 ) -> Floats:
-    """Easting, northing, yaw and scale that take one pair of the view to each of some of the map, shape (H, 4)."""
+    """Return the similarities from one pair of the view to pairs of the map: easting, northing, yaw, scale, (H, 4)."""
     yaw_deg = theirs.bearing_deg[hits] - ours.bearing_deg[number]
     scale = np.clip(theirs.length_m[hits] / ours.length_m[number], *scales)
     right_m, up_m = nodes.places_m[ours.ends[number]].mean(axis=0)
@@ -138,7 +116,7 @@ def _similarities(
 
 
 def _may_be(cast: Floats, prior: Prior) -> Bools:
-    """Whether poses are where a prior allows them."""
+    """Return which poses a prior allows."""
     fits = np.ones(len(cast), dtype=bool)
     if prior.center_m is not None and prior.radius_m is not None:
         fits &= np.hypot(*(cast[:, :2] - prior.center_m).T) <= prior.radius_m + _PLACE_M
@@ -148,7 +126,7 @@ def _may_be(cast: Floats, prior: Prior) -> Bools:
 
 
 def _counted(cast: Floats, count: int) -> list[Proposal]:
-    """Poses that many votes agree on, the most first, no two for one place and heading."""
+    """Return poses with the most votes, best first, no two for one place and heading."""
     at = _spread(cast)
     tree = cKDTree(at)
     found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, _TRIED * count)]
@@ -160,7 +138,7 @@ def _counted(cast: Floats, count: int) -> list[Proposal]:
 
 
 def _spread(cast: Floats) -> Floats:
-    """Votes as points in which two for one pose are at most 1 apart, and a whole turn is none, shape (V, 5)."""
+    """Return votes as points, shape (V, 5): those for one pose lie within 1 of each other, and headings wrap around."""
     turn = np.radians(cast[:, 2:3])
     return np.column_stack(
         (
@@ -172,7 +150,7 @@ def _spread(cast: Floats) -> Floats:
 
 
 def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
-    """Middles of the cells with the most votes, shape (S, 5)."""
+    """Return centres of the cells with the most votes, shape (S, 5)."""
     _, cell = np.unique(np.floor(at).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     weight = np.bincount(cell, weights=cast[:, 4])
@@ -181,7 +159,7 @@ def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
 
 
 def _gathered(cast: Floats, at: Floats, tree: cKDTree, start: Floats) -> tuple[Proposal, Floats]:
-    """The pose that the votes around a point are for, and where it lies; a pair of the view votes for it once."""
+    """Return the pose of the votes around a point, and its point; each pair of the view votes once."""
     place = at[tree.query(start)[1]]
     for _ in range(_ROUNDS):
         near = np.array(sorted(tree.query_ball_point(place, _REACH)), dtype=np.int64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arms of the experiment as plugins: a card for each setting of the switches."""
+"""Ablations of the scorer as plugins: a card for each setting of the switches."""
 
 from typing import Final
 
@@ -22,6 +22,8 @@ _FITTED: Final = (
     "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "
     "class is like being on it, and an exponent for each class by conditional logit; all learnt on train places"
 )
+_GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
+_GRAPH_FITTED: Final = _GRAPH.format(how="learnt")
 _BLIND: Final = "what is unknown counts as absent, as in all variants of the paper but its last"
 _SILENT: Final = "what is unknown says nothing"
 _LIMITS: Final = (
@@ -45,7 +47,7 @@ def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -
 
 
 class SasgeoRaster(SasgeoMatcher):
-    """Raster alone, all classes alike."""
+    """Raster alone, uniform weights."""
 
     card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _BLIND)
     switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
@@ -54,21 +56,19 @@ class SasgeoRaster(SasgeoMatcher):
 class SasgeoGraph(SasgeoMatcher):
     """Raster and graph."""
 
-    card = _card(
-        "sasgeo_graph", "SASGeo: raster and graph", "Eqs. 7-9, 11", _EVEN, _GRAPH.format(how="set by hand"), _BLIND
-    )
+    card = _card("sasgeo_graph", "SASGeo: raster and graph", "Eqs. 7-9, 11", _EVEN, _GRAPH_BY_HAND, _BLIND)
     switches = Switches(weights="even", is_unknown_silent=False)
 
 
 class SasgeoStability(LearningMatcher):
-    """Raster and graph, classes weighed by what lasts."""
+    """Raster and graph, classes weighed by stability."""
 
     card = _card(
         "sasgeo_stability",
         "SASGeo: raster, graph and stability",
         "Eqs. 5, 7-9, 11",
         _FITTED,
-        _GRAPH.format(how="learnt"),
+        _GRAPH_FITTED,
         _BLIND,
         limits=_UNTAUGHT,
     )
@@ -78,15 +78,7 @@ class SasgeoStability(LearningMatcher):
 class Sasgeo(LearningMatcher):
     """The whole scorer."""
 
-    card = _card(
-        "sasgeo",
-        "SASGeo, whole",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _GRAPH.format(how="learnt"),
-        _SILENT,
-        limits=_UNTAUGHT,
-    )
+    card = _card("sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT)
     switches = Switches()
 
 
@@ -98,7 +90,7 @@ class SasgeoHand(SasgeoMatcher):
         "SASGeo with the paper's weights by hand",
         "Eqs. 5, 7-9, 11-14",
         "prior, decay and lambdas of Eqs. 5 and 7 from the taxonomy",
-        _GRAPH.format(how="set by hand"),
+        _GRAPH_BY_HAND,
         _SILENT,
     )
     switches = Switches(weights="hand")
@@ -113,7 +105,7 @@ class SasgeoDistinct(LearningMatcher):
         "Eqs. 5-9, 11-14",
         _FITTED,
         "cells weigh by -log of the share of the map's configurations that are of their kind (Eq. 6)",
-        _GRAPH.format(how="learnt"),
+        _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,
     )
@@ -121,7 +113,7 @@ class SasgeoDistinct(LearningMatcher):
 
 
 class SasgeoAgeless(LearningMatcher):
-    """The whole scorer, which takes every map for one of today."""
+    """The whole scorer without the age of the map."""
 
     card = _card(
         "sasgeo_ageless",
@@ -129,7 +121,7 @@ class SasgeoAgeless(LearningMatcher):
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
         "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights",
-        _GRAPH.format(how="learnt"),
+        _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,
     )
@@ -137,7 +129,7 @@ class SasgeoAgeless(LearningMatcher):
 
 
 class SasgeoStamped(LearningMatcher):
-    """The whole scorer with each feature by its own age."""
+    """The whole scorer with edit ages of features."""
 
     card = _card(
         "sasgeo_stamped",
@@ -145,7 +137,7 @@ class SasgeoStamped(LearningMatcher):
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
         "features weigh by how long nobody had edited them when the map was taken, learnt by class in four strata",
-        _GRAPH.format(how="learnt"),
+        _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,
     )
@@ -153,14 +145,14 @@ class SasgeoStamped(LearningMatcher):
 
 
 class OracleSasgeo(LearningMatcher):
-    """The whole scorer, learning from what it is asked: what rates known in advance would be worth."""
+    """The whole scorer, trained on the places that it is asked: an upper bound for training."""
 
     card = _card(
         "oracle_sasgeo",
         "SASGeo that learns from the places it is asked on",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        _GRAPH.format(how="learnt"),
+        _GRAPH_FITTED,
         _SILENT,
         "a yardstick, never ranked: a pipeline names it among its oracles",
         limits=f"Knows what no matcher can know; {_LIMITS}",
@@ -169,14 +161,7 @@ class OracleSasgeo(LearningMatcher):
 
 
 class SasgeoNoGraph(LearningMatcher):
-    """The whole scorer but its graph."""
+    """The whole scorer without graph."""
 
-    card = _card(
-        "sasgeo_no_graph",
-        "SASGeo without graph",
-        "Eqs. 5, 7-8, 12-14",
-        _FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
-    )
+    card = _card("sasgeo_no_graph", "SASGeo without graph", "Eqs. 5, 7-8, 12-14", _FITTED, _SILENT, limits=_UNTAUGHT)
     switches = Switches(has_graph=False)

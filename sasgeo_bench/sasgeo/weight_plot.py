@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of what a map is worth to the scorer: all of a region, and a place beside the one it is confused with."""
+"""Pictures of the weights of a map: of a region, and parts for the picture of a place and its lookalike."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -35,11 +35,11 @@ _GREY: Final = "#444444"
 
 @dataclass(frozen=True, kw_only=True)
 class WeightSheet:
-    """A region and the weight of its cells.
+    """A region and the weights of its cells.
 
     `layers` are those of the region; `weights`, shape (rows, cols), are nats for 100 m2, NaN where nothing is known;
-    `worth` says what each class is worth where it is as rare as the map's mean; `top` is the end of the colours (see
-    `top_of`); `facts` say of which age, season and weights.
+    `worth` holds the weight of each class at mean rarity; `top` is the end of the colours (see `top_of`); `facts` is a
+    line on age, season and weights.
     """
 
     manifest: Manifest
@@ -51,7 +51,7 @@ class WeightSheet:
 
 
 def top_of(weights: Sequence[NDArray[np.float32]]) -> float:
-    """Where the colours of some maps end, so that they can be compared: a high percentile of all that is drawn.
+    """Return a common end of the colours of several maps: a high percentile of all positive weights.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def top_of(weights: Sequence[NDArray[np.float32]]) -> float:
 
 
 def shrunk(layers: NDArray[np.uint8], *, most_cells: int = _MOST_CELLS) -> NDArray[np.uint8]:
-    """Layers, shape (C, rows, cols), of at most so many cells a side: a class is where any cell of a square is.
+    """Return layers, shape (C, rows, cols), of limited size: a class is present where any cell of a square has it.
 
     Examples
     --------
@@ -82,13 +82,13 @@ def _factor(shape: tuple[int, ...], most_cells: int) -> int:
 
 
 def _blocks(raster: NDArray[np.generic], factor: int) -> NDArray[np.generic]:
-    """Squares of a raster on axes 1 and 3; the last ones are padded with their edge."""
+    """Return squares of a raster on axes 1 and 3, padded with the edge."""
     padded = np.pad(raster, ((0, -raster.shape[0] % factor), (0, -raster.shape[1] % factor)), mode="edge")
     return padded.reshape(padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
 
 
 def weight_colours() -> Colormap:
-    """Paper where nothing is mapped, dark where most is to be gained, grey where nothing is known."""
+    """Return the colours of weights: paper for 0, dark for high, grey for unknown."""
     steps = mpl.colormaps["magma_r"](np.linspace(0.04, 1.0, 255))
     colours = mpl.colors.ListedColormap([mpl.colors.to_rgba(GROUND), *steps])
     colours.set_bad(HIDDEN)
@@ -96,15 +96,7 @@ def weight_colours() -> Colormap:
 
 
 def draw_weights(path: Path, sheet: WeightSheet) -> None:
-    """Draw a region: its classes, and beside them the weight of each cell.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG to write.
-    sheet : WeightSheet
-        What is drawn.
-    """
+    """Write a PNG of the classes of a region and, next to them, the weight of each cell."""
     about = sheet.manifest
     factor = _factor(sheet.weights.shape, _MOST_CELLS)
     filled = np.where(np.isnan(sheet.weights), -1, sheet.weights)
@@ -154,7 +146,7 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
 def picture_of(
     chart: Axes, picture: NDArray[np.generic], side_m: tuple[float, float], title: str, *, top: float | None = None
 ) -> ScalarMappable:
-    """A raster in metres without ticks; values from 0 to `top` by the colours of weights."""
+    """Draw a raster in metres without ticks; values from 0 to `top` by the colours of weights."""
     box = (0.0, side_m[0], 0.0, side_m[1])
     chart.set_xticks([])
     chart.set_yticks([])
@@ -165,22 +157,22 @@ def picture_of(
 
 
 def colour_bar(figure: Figure, mapped: ScalarMappable, bar: Axes) -> None:
-    """The colours of weights with their unit."""
+    """Draw the colour bar of weights."""
     drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", extend="max", extendfrac=0.03)
     drawn.ax.tick_params(labelsize=8, length=2, pad=2)
     drawn.set_label(f"w = \u03c3\u03bd, {UNIT} that are mapped and seen", fontsize=8.5, labelpad=1)
 
 
 def words(figure: Figure, title: str, facts: str) -> None:
-    """Title and a line of facts at the top."""
+    """Write the title and a line of facts."""
     width, height = figure.get_size_inches()
     figure.text(0.25 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     figure.text(0.25 / width, 1 - 0.45 / height, facts, va="top", fontsize=9, color=_GREY)
 
 
-def _class_keys(said: Mapping[str, str]) -> list[Patch]:
+def _class_keys(values: Mapping[str, str]) -> list[Patch]:
     return [
-        Patch(facecolor=item.colour, edgecolor="#666666", lw=0.4, label=item.title + said[item.name])
+        Patch(facecolor=item.colour, edgecolor="#666666", lw=0.4, label=item.title + values[item.name])
         for item in load_taxonomy().classes
-        if item.name in said
+        if item.name in values
     ]

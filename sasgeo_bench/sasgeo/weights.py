@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agreement or a contradiction is worth, by class, age of the map and season: Eqs. 5 and 7 of the SASGeo paper.
+"""Gains of agreement and contradiction by class, age of the map and season: Eqs. 5 and 7 of the SASGeo paper.
 
-Eq. 5 lets a class fade as the map ages. Here map and world disagree both ways, what vanished and what appeared, and the
-gains of Eq. 7 follow as log-likelihood ratios: as a class stops saying anything, they go to nothing by themselves.
+Eq. 5 lets a class fade as the map ages. Here features vanish and appear; the gains of Eq. 7 follow as log-likelihood
+ratios, which tend to 0 as a class loses its information.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 from sasgeo_bench.sasgeo.rates import ClassRates
 
-_LEAST: Final = 1e-4  # a probability is no nearer to 0 or 1: one cell of a few thousand can always be wrong
+_LEAST: Final = 1e-4  # least distance of probabilities from 0 and 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gains:
-    """What Eq. 7 gives for each class, shape (C,): natural logarithms of likelihood ratios, or the paper's lambdas.
+    """Gains of Eq. 7 for each class, shape (C,): log-likelihood ratios, or the lambdas of the paper.
 
     `agree` for seen and mapped, `extra` for seen and not mapped, `missed` for mapped and seen to be absent, `quiet` for
-    neither (0 in the paper). The first is positive, the next two are negative where a class says anything.
+    neither (0 in the paper). The first is positive, the next two are negative for an informative class.
     """
 
     agree: NDArray[np.float64]
@@ -33,7 +33,7 @@ class Gains:
     quiet: NDArray[np.float64]
 
     def only(self, at: int) -> Self:
-        """Those of one class."""
+        """Return the gains of one class."""
         return type(self)(
             agree=self.agree[at : at + 1],
             extra=self.extra[at : at + 1],
@@ -42,33 +42,27 @@ class Gains:
         )
 
     def scaled(self, weights: NDArray[np.float64]) -> Self:
-        """The same, each class times its weight."""
+        """Return the gains times a weight for each class."""
         parts = (self.agree, self.extra, self.missed, self.quiet)
         agree, extra, missed, quiet = (part * weights for part in parts)
         return type(self)(agree=agree, extra=extra, missed=missed, quiet=quiet)
 
     def softened(self, shares: NDArray[np.float64]) -> Self:
-        """The same, a miss worth a share of each class, shape (C,): see `rates.missed_share`."""
+        """Return the gains with losses for misses reduced to shares, shape (C,): see `rates.missed_share`."""
         missed = self.quiet + shares * (self.missed - self.quiet)
         return type(self)(agree=self.agree, extra=self.extra, missed=missed, quiet=self.quiet)
 
 
 def even_gains(classes: Sequence[str]) -> Gains:
-    """Eq. 7 with nothing known of classes: all lambdas 1.
-
-    Examples
-    --------
-    >>> even_gains(["railway"]).missed.tolist()
-    [-1.0]
-    """
+    """Return the gains of Eq. 7 with all lambdas 1."""
     one = np.ones(len(classes))
     return Gains(agree=one, extra=-one, missed=-one, quiet=np.zeros(len(classes)))
 
 
 def likelihood_gains(rates: Sequence[ClassRates], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
-    """Log-likelihood ratios of what is seen of each class, given the map, against not knowing the map.
+    """Return log-likelihood ratios of the view of each class with and without the map.
 
-    With S the chance that what is mapped still stands, B that something stands where nothing is mapped, t and f hit and
+    With S the probability that a mapped class still exists, B that it exists where it is not mapped, t and f hit and
     false alarm: P(seen | mapped) = S t + (1 - S) f, P(seen | not mapped) = B t + (1 - B) f, and their mean by the share
     of the ground that is mapped is the reference.
 
@@ -88,7 +82,7 @@ def likelihood_gains(rates: Sequence[ClassRates], *, age_years: float, persists:
 
     Examples
     --------
-    Where what is mapped is no likelier to be there than what is not, a class is silent:
+    A class without information has gain 0:
 
     >>> volatile = ClassRates(
     ...     hit=0.9, false_alarm=0.1, missing=0.0, vanish_per_year=9.9, appear_per_year=0.0, mapped=0.2
@@ -104,7 +98,7 @@ def likelihood_gains(rates: Sequence[ClassRates], *, age_years: float, persists:
 
 def _ratios(rates: ClassRates, age_years: float, persists: float) -> tuple[float, float, float, float]:
     survival, unmapped = rates.survival(age_years) * persists, rates.unmapped(age_years)
-    if survival <= unmapped:  # the map says nothing, or the wrong thing: then it is not asked
+    if survival <= unmapped:  # the map has no information on the class
         return 0.0, 0.0, 0.0, 0.0
     mapped, empty = (
         float(np.clip(share * rates.hit + (1 - share) * rates.false_alarm, _LEAST, 1 - _LEAST))
@@ -119,7 +113,7 @@ def _ratios(rates: ClassRates, age_years: float, persists: float) -> tuple[float
 
 
 def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
-    """Eqs. 5 and 7 as written: lambdas of 1, times prior, decay by age and season of each class, set by hand.
+    """Return the gains of Eqs. 5 and 7 as written: lambdas of 1, times prior, decay by age and season by hand.
 
     Examples
     --------
@@ -133,7 +127,7 @@ def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[f
 
 
 def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Turn a view into the linear form of Eq. 8: what the map's classes and its knowing anything are worth.
+    """Return the linear form of Eq. 8: factors of the classes of the map and of its known cells.
 
     Parameters
     ----------
@@ -146,7 +140,7 @@ def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], 
     -------
     weights : ndarray of float32, shape (C, rows, cols)
     known : ndarray of float32, shape (rows, cols)
-        See `search.field.Template`. What is unknown is 0 in both.
+        See `search.field.Template`. Unknown cells are 0 in both.
 
     Examples
     --------
@@ -166,7 +160,7 @@ def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], 
 
 
 def information(rates: ClassRates, *, age_years: float, persists: float = 1.0) -> float:
-    """Mutual information between the map and what is seen of a class, nats a cell: what the class is worth.
+    """Return the mutual information between the map and the view of a class, nats a cell.
 
     `persists` is the seasonal factor of the class, as in `likelihood_gains`.
 

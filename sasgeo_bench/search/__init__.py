@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dense pose search: three-state evidence of any weights on a map, over place, heading and scale, coarse to fine."""
+"""Dense search over place, heading and scale: by sums of likelihoods (`find`) or by mean votes (`vote_search`)."""

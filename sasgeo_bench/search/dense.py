@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All places at once: one correlation for each class, summed in the Fourier domain, one inverse transform a heading."""
+"""Scores of all places: correlations of classes summed in the Fourier domain, one inverse transform a heading."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -20,26 +20,27 @@ from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.search.field import Level, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Mode, Null
 from sasgeo_bench.search.space import Tile, Turns
+from sasgeo_bench.search.votes import correlated, map_spectrum
 
-_SPARE: Final = 4  # times as many peaks of one heading as modes are wanted, for neighbours are dropped
-_LOW: Final = np.float32(-1e30)  # a place that is not allowed
-_BLUR: Final = 3  # squares of the view across a coarse cell, before it is turned: odd, so that nothing is shifted
-_NEXT: Final = 1.5  # steps: nearer is a neighbour
+_SPARE: Final = 4  # peaks of one heading for each requested mode, since neighbours are dropped
+_LOW: Final = np.float32(-1e30)  # score of a place that is not allowed
+_BLUR: Final = 3  # squares of the view across a coarse cell before rotation: odd, so that nothing is shifted
+_NEXT: Final = 1.5  # steps within which peaks are neighbours
 _NOTHING: Final = 1e-9
 
 
 def dense(
     level: Level, template: Template, tiles: Sequence[Tile], turns: Turns, *, most: int, threads: int
 ) -> tuple[list[list[Mode]], Null]:
-    """Best modes of every tile, no two of them neighbours, and how places score."""
-    if not len(template.speaking) or not any(tile.allowed.any() for tile in tiles):
+    """Return the best modes of every tile, no two of them neighbours, and statistics of all places."""
+    if not len(template.active) or not any(tile.allowed.any() for tile in tiles):
         return [[] for _ in tiles], Null(best=0.0, mean=0.0, deviation=0.0, places=0)
     votes = _Votes.of(level, template, tiles, turns)
     highest = [np.full(tile.allowed.shape, _LOW, dtype=np.float32) for tile in tiles]
     locks = [Lock() for _ in tiles]
 
     def peaks_of(base: Pose) -> list[tuple[int, _Peaks]]:
-        """Of one heading on every tile it speaks to; notes the highest score of each place."""
+        """Return the peaks of one heading on every tile; update the highest score of each place."""
         found = []
         for at, turn, score in votes.scores(base):
             score[~tiles[at].allowed] = _LOW
@@ -53,7 +54,7 @@ def dense(
     modes = []
     for at, tile in enumerate(tiles):
         peaks = _Peaks.joined([peaks for owner, peaks in parts if owner == at])
-        chosen = peaks.apart(most, turns)
+        chosen = peaks.separate(most, turns)
         cells = np.column_stack((peaks.row[chosen] + tile.row, peaks.col[chosen] + tile.col))
         points_m = level.grid.to_centres_m(cells)
         modes.append([peaks.mode(i, point_m) for i, point_m in zip(chosen, points_m.tolist(), strict=True)])
@@ -67,9 +68,9 @@ def _null(scores: NDArray[np.float32]) -> Null:
 
 @dataclass(frozen=True, kw_only=True)
 class _Votes:
-    """The transforms of the map under each tile, at each right angle, and the template they wait for.
+    """Transforms of the map under each tile at each right angle, and the template to correlate.
 
-    `bands` of the view on `frame` are laid on cells of the level around its middle, `half` of them to each side.
+    `bands` of the view on `frame` are resampled onto `around`, cells of the level around its middle.
     """
 
     bands: NDArray[np.float32]
@@ -81,24 +82,24 @@ class _Votes:
 
     @classmethod
     def of(cls, level: Level, template: Template, tiles: Sequence[Tile], turns: Turns) -> Self:
-        """Transform what lies under each tile, once for all headings."""
+        """Transform the map under each tile, once for all headings."""
         step_m, largest = level.grid.cell_size_m, max(base.scale for base in turns.bases)
         half = math.ceil(template.reach_m * largest / step_m) + 1
         shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)
         size = int(fft.next_fast_len(max(max(shape) for shape in shapes) + 2 * half, real=True))
         windows = [
-            level.window(tile.row - half, tile.col - half, (rows + 2 * half, cols + 2 * half), template.speaking)
+            level.window(tile.row - half, tile.col - half, (rows + 2 * half, cols + 2 * half), template.active)
             for tile, (rows, cols) in zip(tiles, shapes, strict=True)
         ]
-        is_used = [any(window[at].any() for window in windows) for at in range(len(template.speaking))]
+        is_used = [any(window[at].any() for window in windows) for at in range(len(template.active))]
         used = np.flatnonzero(is_used) if any(is_used) else np.arange(1)
         spectra = []
         for window in windows:
             turned = (np.rot90(window[used], quarter, (1, 2)) for quarter in range(turns.quarters))
-            spectra.append(tuple(np.conj(fft.rfft2(each, s=(size, size))) for each in turned))
+            spectra.append(tuple(map_spectrum(each, (size, size)) for each in turned))
         ratio = step_m / template.cell_size_m
         bands, frame = pooled(template, level, max(1, round(ratio / _BLUR)))
-        bands = bands[used]  # what the map holds nowhere here adds nothing
+        bands = bands[used]  # classes that the map lacks here add nothing
         width = 2 * math.floor(step_m / frame.cell_size_m / 2) + 1
         bands = np.stack([cv2.blur(band, (width, width), borderType=cv2.BORDER_CONSTANT) for band in bands])
         reach_m, side = (half + 0.5) * step_m, 2 * half + 1
@@ -106,20 +107,17 @@ class _Votes:
         return cls(bands=bands, frame=frame, around=around, size=size, shapes=shapes, spectra=tuple(spectra))
 
     def scores(self, base: Pose) -> Iterator[tuple[int, Pose, NDArray[np.float32]]]:
-        """Score all places of every tile for a heading and those at right angles from it."""
+        """Score all places of every tile for a heading and those at right angles to it."""
         spectrum = fft.rfft2(self._laid(base), s=(self.size, self.size))
         for at, (windows, (rows, cols)) in enumerate(zip(self.spectra, self.shapes, strict=True)):
             for quarter, window in enumerate(windows):
-                total = window[0] * spectrum[0]
-                for layer, band in zip(window[1:], spectrum[1:], strict=True):
-                    total += layer * band  # one by one they stay in the cache
-                score = fft.irfft2(np.conj(total, out=total), s=(self.size, self.size))
+                score = correlated(window, spectrum, (self.size, self.size))
                 valid = score[:rows, :cols] if quarter % 2 == 0 else score[:cols, :rows]
                 turn = replace(base, yaw_deg=base.yaw_deg + 90 * quarter)
                 yield at, turn, np.ascontiguousarray(np.rot90(valid, -quarter))
 
     def _laid(self, base: Pose) -> NDArray[np.float32]:
-        """Lay the view on cells of the level, turned and scaled; sums stay what they are."""
+        """Resample the view onto cells of the level, rotated and scaled; sums are preserved."""
         to_view = between(self.around, inverse(base), self.frame)
         laid = np.stack([warped(band, to_view, self.around.shape) for band in self.bands])
         return laid * np.float32((self.around.cell_size_m / (base.scale * self.frame.cell_size_m)) ** 2)
@@ -137,7 +135,7 @@ class _Peaks:
 
     @classmethod
     def of(cls, score: NDArray[np.float32], turn: Pose, *, most: int) -> Self:
-        """Best local maxima of a tile at one heading and scale."""
+        """Return the best local maxima of a tile at one heading and scale."""
         is_peak = (score == cv2.dilate(score, np.ones((3, 3), dtype=np.uint8))) & (score > _LOW)
         row, col = np.nonzero(is_peak)
         if len(row) > most:
@@ -148,14 +146,14 @@ class _Peaks:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """All of them, best first; equals by place, heading and scale, so that threads change nothing."""
+        """Join and sort peaks, best first; ties by place, heading and scale, so that threads change nothing."""
         names = ("score", "row", "col", "yaw_deg", "scale")
         score, row, col, yaw_deg, scale = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
         order = np.lexsort((scale, yaw_deg, col, row, -score))
         return cls(score=score[order], row=row[order], col=col[order], yaw_deg=yaw_deg[order], scale=scale[order])
 
-    def apart(self, most: int, turns: Turns) -> list[int]:
-        """Which are best, none of them next to a better one in place, heading and scale at once."""
+    def separate(self, most: int, turns: Turns) -> list[int]:
+        """Return indices of the best peaks, none next to a better one in place, heading and scale at once."""
         chosen: list[int] = []
         at_cell: dict[tuple[int, int], list[int]] = {}
         for at, (row, col) in enumerate(zip(self.row.tolist(), self.col.tolist(), strict=True)):
@@ -168,13 +166,13 @@ class _Peaks:
         return chosen
 
     def _is_near(self, at: int, other: int, turns: Turns) -> bool:
-        """Whether two have neighbouring headings and scales."""
-        apart_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
-        is_turned = apart_deg >= _NEXT * turns.yaw_step_deg + _NOTHING
+        """Tell if two peaks have neighbouring headings and scales."""
+        off_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
+        is_turned = off_deg >= _NEXT * turns.yaw_step_deg + _NOTHING
         return not is_turned and abs(self.scale[at] - self.scale[other]) < _NEXT * turns.scale_step + _NOTHING
 
     def mode(self, at: int, point_m: tuple[float, float]) -> Mode:
-        """One of them as a mode, its place given in metres."""
+        """Return a peak as a mode at a place in metres."""
         easting_m, northing_m = point_m
         pose = Pose(
             easting_m=easting_m, northing_m=northing_m, yaw_deg=float(self.yaw_deg[at]), scale=float(self.scale[at])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search itself: all that a prior leaves open on large cells, the best of it ever more finely."""
+"""Search by sums of likelihoods: the whole prior on coarse cells, the best modes on ever finer ones."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -15,8 +15,8 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.search.dense import dense
 from sasgeo_bench.search.field import Field, Template
-from sasgeo_bench.search.local_refinement import Guess, Sight, Stride, climbed, polished
-from sasgeo_bench.search.plan import Found, Mode, Null, Plan
+from sasgeo_bench.search.local_refinement import Guess, LevelView, Stride, climbed, polished
+from sasgeo_bench.search.plan import Found, Mode, Null, Plan, place_m, thinned
 from sasgeo_bench.search.space import NO_PLACE, Disc, Tile, Turns, all_around, tiles_of, turns_of
 
 _NOTHING: Final = 1e-9
@@ -32,7 +32,7 @@ def search(
     count: int = 10,
     starts: Sequence[Pose] = (),
 ) -> Found:
-    """Find the best modes within a prior: all of it on large cells, the best of that ever more finely.
+    """Find the best modes within a prior, coarse to fine.
 
     Parameters
     ----------
@@ -41,19 +41,19 @@ def search(
     template : Template
         The view.
     prior : Prior
-        Where it may lie and how it may be turned and scaled; anywhere on the map where it says nothing.
+        Allowed places, headings and scales; without limits the whole map.
     plan : Plan, optional
-        How it is done.
+        Settings of the search.
     count : int
-        Most modes that are given.
+        Largest number of modes.
     starts : sequence of Pose
-        Poses that something else proposes; they are followed as the search's own are, where they score as well.
+        Proposed poses, refined like those of the search if they score as well.
 
     Returns
     -------
     Found
-        Modes at least `apart_m` from each other, best first; none where the view says nothing or the prior holds no
-        place of the map. Those the beam left behind have the order of a coarser level, below all that were followed.
+        Modes at least `apart_m` from each other, best first; none for an empty template or a prior beyond the map.
+        Modes that the beam dropped keep the order of a coarser level, below all refined ones.
 
     Examples
     --------
@@ -76,53 +76,28 @@ def search(
 def rank(
     field: Field, template: Template, prior: Prior, poses: Sequence[Pose], plan: Plan | None = None
 ) -> tuple[list[Mode | None], Null]:
-    """Give each of some candidates the best mode near it, by the same machinery; None where there is none.
+    """Return the best mode near each candidate, None where there is none, and statistics of coarse scores.
 
-    Those that the beam leaves behind keep the order they had, below all that were followed to the end.
+    Candidates that the beam drops keep their order, below all refined ones.
     """
     return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).candidates(poses)
 
 
 def exhaustive(field: Field, template: Template, *, yaw_step_deg: float, threads: int = 1) -> Mode:
-    """Score every cell of the map at every heading, on the map's own cells: the reference, slow.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sasgeo_bench.search.field import FULL
-    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=8.0, cell_size_m=1.0, rows=8, cols=8)
-    >>> dot = np.zeros((1, 8, 8), np.uint8)
-    >>> dot[0, 2, 5] = FULL
-    >>> field = Field(grid=grid, layers=dot, known=np.full((8, 8), FULL, np.uint8))
-    >>> view = Template(weights=np.ones((1, 1, 1), np.float32), known=np.zeros((1, 1), np.float32), cell_size_m=1.0)
-    >>> best = exhaustive(field, view, yaw_step_deg=90.0).pose
-    >>> best.easting_m, best.northing_m
-    (5.5, 5.5)
-    """
+    """Return the best mode over all cells and headings on the map's own cells: a slow reference."""
     tiles = tiles_of(field.grid, field.grid, Disc(center_m=None, radius_m=0.0))
     found, _ = dense(field.level(1), template, tiles, all_around(yaw_step_deg), most=1, threads=threads)
     return max((mode for modes in found for mode in modes), key=lambda mode: mode.score)
 
 
 def score_at(field: Field, template: Template, pose: Pose) -> float:
-    """Score one pose on the map's own cells, as `Template` says.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sasgeo_bench.search.field import FULL
-    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4.0, cell_size_m=1.0, rows=4, cols=4)
-    >>> full = Field(grid=grid, layers=np.full((1, 4, 4), FULL, np.uint8), known=np.full((4, 4), FULL, np.uint8))
-    >>> seen = Template(weights=np.ones((1, 2, 2), np.float32), known=np.zeros((2, 2), np.float32), cell_size_m=1.0)
-    >>> score_at(full, seen, Pose(easting_m=2.0, northing_m=2.0, yaw_deg=0.0))
-    4.0
-    """
-    return Sight.of(field, template, 1).score(pose)
+    """Return the score of one pose on the map's own cells, as `Template` defines it."""
+    return LevelView.of(field, template, 1).score(pose)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Search:
-    """The search for one view on one map."""
+    """Search for one view on one map."""
 
     field: Field
     template: Template
@@ -130,25 +105,25 @@ class _Search:
     plan: Plan
 
     def places(self, count: int, starts: Sequence[Pose]) -> Found:
-        """Best modes within the prior."""
+        """Return the best modes within the prior."""
         disc = Disc(center_m=self.prior.center_m, radius_m=self.prior.radius_m or 0.0)
         tiles = tiles_of(self._coarse_grid, self.field.grid, disc.wider(_CORNER * self._coarse_m))
         guesses, null = self._begun(tiles, most=self.plan.width(0))
         guesses = _ranked([*(replace(guess, owner=0) for guess in guesses), *self._proposed(starts)])
         followed = self._followed(guesses, [disc])
-        near = disc.wider(_CORNER * self.field.grid.cell_size_m)  # those left behind had the leeway of larger cells
+        near = disc.wider(_CORNER * self.field.grid.cell_size_m)  # dropped modes were limited by larger cells
         inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
-        return Found(modes=tuple(_thinned(inside, self.plan.apart_m)[:count]), null=null)
+        return Found(modes=tuple(thinned(inside, self.plan.apart_m)[:count]), null=null)
 
     def _proposed(self, starts: Sequence[Pose]) -> list[Guess]:
-        """Score poses that are given on the coarsest level."""
-        if not starts or not len(self.template.speaking):
+        """Score proposed poses on the coarsest level."""
+        if not starts or not len(self.template.active):
             return []
-        sight = Sight.of(self.field, self.template, self._factor)
-        return [Guess(mode=Mode(pose=pose, score=sight.score(pose)), owner=0) for pose in starts]
+        level_view = LevelView.of(self.field, self.template, self._factor)
+        return [Guess(mode=Mode(pose=pose, score=level_view.score(pose)), owner=0) for pose in starts]
 
     def candidates(self, poses: Sequence[Pose]) -> tuple[list[Mode | None], Null]:
-        """Best mode near each of some poses."""
+        """Return the best mode near each pose."""
         discs = [Disc(center_m=place_m(pose), radius_m=self.plan.around_m) for pose in poses]
         wide = [disc.wider(_CORNER * self._coarse_m) for disc in discs]
         tiles = [(tiles_of(self._coarse_grid, self.field.grid, disc) or [NO_PLACE])[0] for disc in wide]
@@ -160,7 +135,7 @@ class _Search:
 
     @cached_property
     def _factor(self) -> int:
-        """Cells of the map a side of the largest cell that still leaves enough of them along the view's side."""
+        """Return map cells a side of the largest cell that leaves `plan.cells` along the side of the view."""
         most = self.template.side_m / (self.plan.cells * self.field.grid.cell_size_m)
         return 1 << max(0, math.floor(math.log2(max(most, 1.0)) + _NOTHING))
 
@@ -174,57 +149,53 @@ class _Search:
 
     @cached_property
     def _turns(self) -> Turns:
-        """Neighbours differ by a coarse cell at the middle of a side of the view."""
+        """Return headings and scales whose neighbours differ by a coarse cell at the side of the view."""
         return turns_of(self.prior, spread=self.plan.spread, step=self._coarse_m / (self.template.side_m / 2))
 
     def _begun(self, tiles: Sequence[Tile], *, most: int) -> tuple[list[Guess], Null]:
-        """Best modes of each tile on the coarsest level, best first."""
+        """Return the best modes of each tile on the coarsest level, best first."""
         level = self.field.level(self._factor)
         found, null = dense(level, self.template, tiles, self._turns, most=most, threads=self.plan.threads)
         return _ranked(Guess(mode=mode, owner=owner) for owner, modes in enumerate(found) for mode in modes), null
 
     def _followed(self, guesses: list[Guess], discs: Sequence[Disc]) -> list[Guess]:
-        """Follow the best to the map's own cells and between them; best first, then those left behind."""
+        """Refine the best to the map's own cells and between them; best first, then dropped ones."""
         stride = Stride(yaw_deg=self._turns.yaw_step_deg, scale=self._turns.scale_step)
         kept, behind = guesses[: self.plan.width(0)], [guesses[self.plan.width(0) - 1 :]]
         factor = self._factor
         with ThreadPoolExecutor(self.plan.threads) as pool:
             while factor > 1:
                 factor, stride = factor // 2, stride.half()
-                step = partial(climbed, Sight.of(self.field, self.template, factor), stride)
+                step = partial(climbed, LevelView.of(self.field, self.template, factor), stride)
                 near = [disc.wider(_CORNER * factor * self.field.grid.cell_size_m) for disc in discs]
                 moved = _ranked(pool.map(step, kept, [near[guess.owner] for guess in kept]))
                 merged = _merged(moved, factor * self.field.grid.cell_size_m, stride.yaw_deg)
                 width = self.plan.width(len(behind))
                 kept, behind = merged[:width], [*behind, merged[width - 1 :]]
             near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
-            sight = Sight.of(self.field, self.template, 1)
+            level_view = LevelView.of(self.field, self.template, 1)
             for move in (climbed, climbed, polished):
-                kept = _ranked(pool.map(partial(move, sight, stride), kept, [near[guess.owner] for guess in kept]))
+                kept = _ranked(pool.map(partial(move, level_view, stride), kept, [near[guess.owner] for guess in kept]))
                 stride = stride.half()
         for rest in reversed(behind):
             kept = [*kept, *_below(kept, rest)]
         return kept
 
 
-def place_m(pose: Pose) -> tuple[float, float]:
-    """Easting and northing of a pose."""
-    return (pose.easting_m, pose.northing_m)
-
-
 def _ranked(guesses: Iterable[Guess]) -> list[Guess]:
-    """Best first; equals keep their order. Those that left their disc are gone."""
+    """Sort guesses, best first; ties keep their order. Guesses outside of their disc are dropped."""
     return sorted((guess for guess in guesses if math.isfinite(guess.mode.score)), key=lambda guess: -guess.mode.score)
 
 
 def _merged(guesses: Sequence[Guess], apart_m: float, apart_deg: float) -> list[Guess]:
-    """Without those that came to lie beside a better one of the same candidate."""
+    """Drop guesses near a better one of the same candidate."""
     kept: list[Guess] = []
     for guess in guesses:
         pose, owner = guess.mode.pose, guess.owner
         others = (other.mode.pose for other in kept if other.owner == owner)
         if not any(
-            _distance_m(pose, other) <= apart_m and abs(wrap_deg(pose.yaw_deg - other.yaw_deg)) <= apart_deg
+            math.dist(place_m(pose), place_m(other)) <= apart_m
+            and abs(wrap_deg(pose.yaw_deg - other.yaw_deg)) <= apart_deg
             for other in others
         ):
             kept.append(guess)
@@ -232,21 +203,8 @@ def _merged(guesses: Sequence[Guess], apart_m: float, apart_deg: float) -> list[
 
 
 def _below(kept: Sequence[Guess], rest: Sequence[Guess]) -> list[Guess]:
-    """Those left behind at one level, as far below the last of the others as they were behind the first of `rest`."""
+    """Return guesses dropped at one level, shifted below the last kept one."""
     if not kept or not rest:
         return []
     down = min(guess.mode.score for guess in kept) - rest[0].mode.score
     return [replace(guess, mode=replace(guess.mode, score=guess.mode.score + down)) for guess in rest[1:]]
-
-
-def _thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
-    """Without those nearer to a better one than a distance."""
-    kept: list[Mode] = []
-    for mode in modes:
-        if all(_distance_m(mode.pose, other.pose) >= apart_m for other in kept):
-            kept.append(mode)
-    return kept
-
-
-def _distance_m(one: Pose, other: Pose) -> float:
-    return math.dist(place_m(one), place_m(other))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a search is done, and what it comes back with."""
+"""Settings and results of a search."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,24 +13,24 @@ from sasgeo_bench.geometry.pose import Pose
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """How a search is done.
+    """Settings of a search.
 
     Parameters
     ----------
     cells : int
-        Least cells of the coarsest level along the view's longer side.
+        Least number of cells of the coarsest level along the longer side of the view.
     beam : tuple of int
-        Modes that are kept at the coarsest level, and how many of them at each finer one; the last for all that follow.
+        Modes kept at the coarsest level, then at each finer one; the last number holds for all further levels.
     each : int
-        Modes that each candidate begins with.
+        Modes that each candidate starts with.
     spread : float
-        Standard deviations of heading and scale that are searched.
+        Searched range of heading and scale, standard deviations.
     apart_m : float
-        Least distance between two of the modes that are given.
+        Least distance between two modes of a result.
     around_m : float
-        How far around a candidate the view may lie.
+        Radius around a candidate within which the view may lie.
     threads : int
-        Threads of one search; they change nothing but its time.
+        Threads of one search; they change its time alone.
     """
 
     cells: int = 16
@@ -41,7 +42,7 @@ class Plan:
     threads: int = 1
 
     def width(self, depth: int) -> int:
-        """How many modes are kept at a depth of the pyramid, 0 the coarsest."""
+        """Return how many modes are kept at a depth of the pyramid, 0 the coarsest."""
         return self.beam[min(depth, len(self.beam) - 1)]
 
 
@@ -55,7 +56,7 @@ class Mode:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Null:
-    """Coarse scores of all places, each with its best heading and scale; nearly all of them are wrong."""
+    """Statistics of the coarse scores of all places, each at its best heading and scale; nearly all are wrong."""
 
     best: float
     mean: float
@@ -65,34 +66,41 @@ class Null:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
-    """What a search comes back with: modes, best first, and the coarse scores they stand out from."""
+    """Modes of a search, best first, and statistics of all coarse scores."""
 
     modes: tuple[Mode, ...]
     null: Null
 
 
-def posterior(scores: Sequence[float], *, temper: float, null_score: float = 0.0) -> NDArray[np.float64]:
-    """Probability of each mode and, last, that it is none of them: a softmax of tempered scores.
+def place_m(pose: Pose) -> tuple[float, float]:
+    """Return easting and northing of a pose."""
+    return (pose.easting_m, pose.northing_m)
+
+
+def thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
+    """Drop modes that lie nearer than a distance to a better one."""
+    kept: list[Mode] = []
+    for mode in modes:
+        if all(math.dist(place_m(mode.pose), place_m(other.pose)) >= apart_m for other in kept):
+            kept.append(mode)
+    return kept
+
+
+def posterior(scores: Sequence[float], *, null_score: float = 0.0) -> NDArray[np.float64]:
+    """Return the probability of each mode and, last, of none of them: a softmax, shape (len(scores) + 1,).
 
     Parameters
     ----------
     scores : sequence of float
         Scores of modes, logarithms of likelihood ratios.
-    temper : float
-        What they are multiplied with: neighbouring cells say the same thing more than once.
     null_score : float
-        Score of there being none.
-
-    Returns
-    -------
-    ndarray of float, shape (len(scores) + 1,)
-        They sum to 1.
+        Score of none of them.
 
     Examples
     --------
-    >>> posterior([2.0, 0.0], temper=1.0).round(3).tolist()
+    >>> posterior([2.0, 0.0]).round(3).tolist()
     [0.787, 0.107, 0.107]
     """
-    logs = temper * np.array([*scores, null_score], dtype=np.float64)
+    logs = np.array([*scores, null_score], dtype=np.float64)
     mass = np.exp(logs - logs.max())
     return np.asarray(mass / mass.sum())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which headings, scales and places a prior leaves open."""
+"""Headings, scales and places that a prior allows."""
 
 import math
 from collections.abc import Sequence
@@ -13,13 +13,13 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 
 _QUARTERS: Final = 4
-_MOST_PLACES: Final = 512  # a side of what is searched at once: bounds the memory of the transforms
+_MOST_PLACES: Final = 512  # a side of a tile: bounds the memory of the transforms
 _NOTHING: Final = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Turns:
-    """Headings and scales that are tried: all poses of `bases`, and `quarters` - 1 others at right angles from each."""
+    """Headings and scales to try: all poses of `bases`, and `quarters` - 1 others at right angles to each."""
 
     bases: tuple[Pose, ...]
     quarters: int
@@ -28,7 +28,7 @@ class Turns:
 
 
 def turns_of(prior: Prior, *, spread: float, step: float) -> Turns:
-    """What a prior leaves open, in steps no larger than `step` (radians of heading, and scale)."""
+    """Return headings and scales that a prior allows, in steps of at most `step` (radians of heading, and scale)."""
     offsets, scale_step = _steps(min(spread * prior.scale_sigma, 0.9), step)
     scales = [1 + offset for offset in offsets]
     if prior.yaw_deg is None or prior.yaw_sigma_deg is None or spread * prior.yaw_sigma_deg >= 180:  # noqa: PLR2004
@@ -39,7 +39,7 @@ def turns_of(prior: Prior, *, spread: float, step: float) -> Turns:
 
 
 def all_around(step_deg: float, scales: Sequence[float] = (1.0,), scale_step: float = 0.0) -> Turns:
-    """All headings, no further apart than a step."""
+    """Return all headings in equal steps of at most `step_deg`."""
     count = math.ceil(90 / step_deg - _NOTHING)
     bases = tuple(_turn(90 * at / count, scale) for scale in scales for at in range(count))
     return Turns(bases=bases, quarters=_QUARTERS, yaw_step_deg=90 / count, scale_step=scale_step)
@@ -50,32 +50,42 @@ def _turn(yaw_deg: float, scale: float) -> Pose:
 
 
 def _steps(reach: float, step: float) -> tuple[list[float], float]:
-    """Cut -reach to reach into equal parts no larger than `step`: their middles, and their size."""
+    """Cut -reach to reach into equal parts of at most `step`; return their middles and their size."""
     count = math.ceil(2 * reach / step - _NOTHING)
     return ([reach * (2 * at + 1 - count) / count for at in range(count)], 2 * reach / count) if count else ([0.0], 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disc:
-    """Where a view may lie; anywhere, if there is no centre."""
+    """Disc of places where a view may lie; all places, if it has no centre."""
 
     center_m: tuple[float, float] | None
     radius_m: float
 
     def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each of some places, shape (N, 2), lies within."""
+        """Return which places, shape (N, 2), lie within.
+
+        Examples
+        --------
+        >>> Disc(center_m=(0.0, 0.0), radius_m=5.0).holds(np.array([(3.0, 4.0), (4.0, 4.0)])).tolist()
+        [True, False]
+        """
         if self.center_m is None:
             return np.ones(len(points_m), dtype=bool)
         return np.asarray(np.hypot(*(points_m - self.center_m).T) <= self.radius_m)
 
+    def has(self, pose: Pose) -> bool:
+        """Tell if a pose lies within."""
+        return self.center_m is None or math.dist((pose.easting_m, pose.northing_m), self.center_m) <= self.radius_m
+
     def wider(self, by_m: float) -> Self:
-        """The same with a larger radius."""
+        """Return the disc with a larger radius."""
         return replace(self, radius_m=self.radius_m + by_m)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """A rectangle of places, cells of one level: the first of them, and which are allowed, shape (rows, cols)."""
+    """Rectangle of places, cells of one level: its first cell, and which are allowed, shape (rows, cols)."""
 
     row: int
     col: int
@@ -86,7 +96,7 @@ NO_PLACE: Final = Tile(row=0, col=0, allowed=np.zeros((1, 1), dtype=np.bool_))
 
 
 def tiles_of(grid: Grid, ground: Grid, disc: Disc) -> list[Tile]:
-    """Places of a level within a disc and on the ground of the map, in parts that are not too large."""
+    """Return the places of a level within a disc and on the map, in tiles of limited size."""
     top, left, bottom, right = 0, 0, grid.rows, grid.cols
     if disc.center_m is not None:
         row, col = grid.to_cells(np.array([disc.center_m]))[0].tolist()

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.chart import Chart
 from sasgeo_baselines.descriptor import BINS, LEAST_M2, MOST_THINGS, Descriptor, components
 from sasgeo_baselines.raster import REACH_M, THIN
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
+from sasgeo_bench.search.chart import Chart
 
 PLACES = arrays(np.float64, st.tuples(st.integers(0, 9), st.just(2)), elements=st.floats(-40, 40))
 REACH = 120.0

@@ -17,8 +17,12 @@ from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_matc
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 
-PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
-REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.matchers"]
+ROOT = Path(__file__).parents[2]
+LIBRARY, BASELINES = (
+    tomllib.loads(path.read_text(encoding="utf-8"))["project"]["entry-points"]["sasgeo_bench.matchers"]
+    for path in (ROOT / "pyproject.toml", ROOT / "baselines" / "pyproject.toml")
+)
+REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in value} | BASELINES
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
 DENSE = ("fft_vote", "raster_uniform", *VARIANTS)
 STRIDES = dict.fromkeys(VARIANTS, 12) | {"fft_vote": 6, "raster_uniform": 6, "graph_only": 6}

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sasgeo_baselines.dense import Disc, Plan, Search, turns
-from sasgeo_baselines.fft_vote import FftVote
 from sasgeo_baselines.full_unknown import FullUnknown
 from sasgeo_baselines.raster_graph import RasterGraph
 from sasgeo_baselines.raster_uniform import RasterUniform
-from sasgeo_baselines.view import Patch, View
 
 from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.controls.fft_vote import FftVote
 from sasgeo_bench.matching.matcher import WITHHELD, check_match
 from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.search.space import Disc
+from sasgeo_bench.search.view import Patch, View
+from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, turns
 
 CELL_M, YAW_STEP_DEG = 1.0, 3.0
 POSES = st.builds(
@@ -114,7 +115,7 @@ def test_a_wrong_sign_half_a_cell_or_swapped_axes_are_noticed(made, monkeypatch,
 def test_a_view_is_found_without_any_prior_and_on_cells_of_another_size(made) -> None:
     region = made.region_of(made.textured(2, side=240), cell_size_m=2.0)
     pose = Pose(easting_m=1251.0, northing_m=8733.0, yaw_deg=200.0)
-    matcher = FftVote(Plan(yaw_step_deg=6.0))
+    matcher = FftVote(VotePlan(yaw_step_deg=6.0))
     matcher.prepare(region, None)
     nothing = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
     query = made.query_of(made.view_of(region, pose, size_cells=128), nothing)
@@ -125,12 +126,12 @@ def test_a_view_is_found_without_any_prior_and_on_cells_of_another_size(made) ->
 @pytest.mark.parametrize("candidates", [(), SOME])
 def test_headings_at_right_angles_may_share_a_template(made, monkeypatch, candidates) -> None:
     region = made.region_of(made.textured(1))
-    matcher = FftVote(Plan(yaw_step_deg=10.0))
+    matcher = FftVote(VotePlan(yaw_step_deg=10.0))
     matcher.prepare(region, None)
     prior = prior_near(SOME[1], sigma_deg=None)
     query = made.query_of(made.view_of(region, SOME[1], size_cells=96), prior, candidates=candidates)
     shared = matcher.match(query, top_k=3)
-    monkeypatch.setattr(Search, "_quarters", lambda *_: 1)
+    monkeypatch.setattr(VoteSearch, "_quarters", lambda *_: 1)
     alone = matcher.match(query, top_k=3)
     assert shared.poses == alone.poses
     assert shared.scores == pytest.approx(alone.scores, abs=1e-6)
@@ -193,11 +194,11 @@ def test_an_answer_is_withheld_where_nothing_was_seen_or_no_map_is_near(made, ma
 
 def test_headings_and_scales_reach_two_standard_deviations() -> None:
     prior = Prior(center_m=None, radius_m=None, yaw_deg=350.0, yaw_sigma_deg=20.0, scale_sigma=0.03)
-    tried = turns(prior, Plan())
+    tried = turns(prior, VotePlan())
     yaws = [float(wrap_deg(pose.yaw_deg - 350.0)) for pose in tried]
     assert (min(yaws), max(yaws)) == pytest.approx((-40.0, 40.0))
     assert {round(pose.scale, 2) for pose in tried} == {0.94, 1.0, 1.06}
-    assert len(turns(replace(prior, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), Plan())) == 120
+    assert len(turns(replace(prior, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), VotePlan())) == 120
 
 
 def test_a_disc_without_a_middle_holds_everything() -> None:

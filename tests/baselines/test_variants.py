@@ -9,15 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.fft_vote import FftVote
 from sasgeo_baselines.full_unknown import FullUnknown
 from sasgeo_baselines.raster import stability
 from sasgeo_baselines.raster_graph import RasterGraph
 from sasgeo_baselines.raster_graph_stability import RasterGraphStability
 from sasgeo_baselines.raster_uniform import RasterUniform
-from sasgeo_baselines.verification import BETA, Verifier, blended
+from sasgeo_baselines.verification import BETA, GraphCheck, blended
 
 from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.controls.dense_matcher import PoseCheck
+from sasgeo_bench.matching.controls.fft_vote import FftVote
 from sasgeo_bench.matching.matcher import check_match
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
@@ -93,8 +94,7 @@ def test_hidden_houses_are_missed_or_not_looked_at(made) -> None:
     chart = RasterUniform().read(made.region_of(layers))
     pose = Pose(easting_m=1024.0, northing_m=8976.0, yaw_deg=0.0)
     by_variant = [
-        Verifier(chart=chart, bands=np.array([0]), seen=variant().seen(seen)[:1], cell_size_m=1.0).distance(pose)
-        for variant in (RasterGraphStability, FullUnknown)
+        graph_check(chart, variant().seen(seen)[:1]).distance(pose) for variant in (RasterGraphStability, FullUnknown)
     ]
     # 2 against 4 counts 2 / 7, and their distances differ; 2 against the same 2 is nothing.
     assert by_variant[0] > (2 / 7) / 2
@@ -102,6 +102,11 @@ def test_hidden_houses_are_missed_or_not_looked_at(made) -> None:
 
 
 # Graph
+
+
+def graph_check(chart, seen: np.ndarray) -> GraphCheck:
+    """Of a view with the first classes of a map."""
+    return GraphCheck(check=PoseCheck(chart=chart, bands=np.arange(len(seen)), seen=seen, cell_size_m=1.0))
 
 
 def scene(houses, *, size=48, tall=10) -> np.ndarray:
@@ -156,7 +161,7 @@ def test_the_descriptor_is_that_of_the_window_at_the_scale_of_the_pose(made) -> 
     chart = RasterUniform().read(made.region_of(made.textured(1)))
     pose = Pose(easting_m=1200.3, northing_m=8790.7, yaw_deg=33.0, scale=1.1)
     seen = made.view_of(made.region_of(made.textured(1)), pose, size_cells=96)
-    verifier = Verifier(chart=chart, bands=np.arange(3), seen=seen.cells, cell_size_m=1.0)
+    verifier = graph_check(chart, seen.cells)
     other = Pose(easting_m=1200.3, northing_m=8790.7, yaw_deg=33.0, scale=0.8)
     assert verifier.distance(pose) == 0.0 < verifier.distance(other)
 
@@ -164,7 +169,7 @@ def test_the_descriptor_is_that_of_the_window_at_the_scale_of_the_pose(made) -> 
 def test_beyond_the_map_neither_side_is_described(made) -> None:
     chart = RasterUniform().read(made.region_of(scene(HOUSES)))
     seen = scene(HOUSES)
-    verifier = Verifier(chart=chart, bands=np.arange(3), seen=seen, cell_size_m=1.0)
+    verifier = graph_check(chart, seen)
     assert verifier.distance(Pose(easting_m=1024.0, northing_m=8976.0, yaw_deg=0.0)) == 0.0
     assert verifier.distance(Pose(easting_m=9000.0, northing_m=8976.0, yaw_deg=0.0)) == 0.0
 
@@ -243,8 +248,8 @@ def test_agreement_is_the_mean_over_classes_of_both_over_either(made) -> None:
     seen[0, 0, 1:3] = seen[1, 0, 0] = PRESENT
     seen[2, 0, 4] = UNKNOWN
     chart = FftVote().read(made.region_of(layers))
-    verifier = Verifier(chart=chart, bands=np.arange(3), seen=seen, cell_size_m=1.0)
-    assert verifier.agreement(Pose(easting_m=1002.5, northing_m=8999.5, yaw_deg=0.0)) == pytest.approx((2 / 3 + 0) / 2)
+    check = PoseCheck(chart=chart, bands=np.arange(3), seen=seen, cell_size_m=1.0)
+    assert check.agreement(Pose(easting_m=1002.5, northing_m=8999.5, yaw_deg=0.0)) == pytest.approx((2 / 3 + 0) / 2)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -7,7 +7,7 @@ import pytest
 from matplotlib import image
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel as Learnt
 
 TOWN = "town-riverside"
 
@@ -84,7 +84,7 @@ def test_a_missing_file_and_foreign_classes_get_one_line(mistake, tmp_path, lear
 def test_a_region_with_other_classes_gets_one_line(mistake, own_out, tmp_path):
     few = tmp_path / "few.json"
     few.write_text(Learnt.by_hand(["water"]).to_text())
-    assert "nothing was learnt of the map's class" in mistake("weights", TOWN, "--learned", few, "--out", own_out)
+    assert "the model lacks the map's class" in mistake("weights", TOWN, "--learned", few, "--out", own_out)
     manifest = own_out / "regions" / TOWN / "region.json"
     about = json.loads(manifest.read_text())
     manifest.write_text(json.dumps(about | {"classes": ["tramway", *about["classes"][1:]]}))

@@ -188,7 +188,7 @@ def test_a_matcher_of_others_whose_card_bears_a_shipped_name_is_refused(name) ->
         ):
             check_card_name(spec, name)
     check_card_name("mine:Matcher", "mine")
-    check_card_name("sasgeo_baselines.fft_vote:FftVote", "fft_vote")
+    check_card_name("sasgeo_bench.matching.controls.fft_vote:FftVote", "fft_vote")
     check_card_name("fft_vote", "fft_vote")
 
 

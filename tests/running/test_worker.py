@@ -6,12 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import psutil
 import pytest
 
-from sasgeo_bench.running import leak_scan, sandbox
+from sasgeo_bench.running import leak_scan, sandbox, worker
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files, task_rows
 
@@ -73,6 +74,17 @@ def test_whatever_a_matcher_does_becomes_a_status_and_a_line(place, task, name, 
     assert reply.status == status, reply.message
     assert re.search(words, reply.message), reply.message
     assert "\n" not in reply.message
+
+
+def test_last_words_are_awaited_however_late_they_are_read(place, task, monkeypatch):
+    def read_late(stream, printed):
+        time.sleep(1.0)
+        drain(stream, printed)
+
+    drain = worker._drain
+    monkeypatch.setattr(worker, "_drain", read_late)
+    (reply,), _ = ask(place, task, "Exits")
+    assert reply.message == "ended with exit status 3: last words"
 
 
 def test_a_map_that_takes_too_long_is_a_timeout(place, task):

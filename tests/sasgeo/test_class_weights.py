@@ -19,7 +19,7 @@ from sasgeo_bench.sasgeo.class_weights import (
     worth_of,
     worth_table,
 )
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.rates import ClassRates
 from sasgeo_bench.sasgeo.seasons import by_hand
 from sasgeo_bench.sasgeo.weights import information
@@ -31,11 +31,11 @@ HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01
 def test_by_hand_the_worth_is_sigma_of_eq_5():
     hand = [load_taxonomy()[name].persistence for name in NAMES]
     sigma = [one.prior * np.exp(-7 * one.vanish_per_year) for one in hand] * by_hand("snow", NAMES)
-    assert worth_of(Learnt.by_hand(NAMES), HAND, age_years=7.0, season="snow") == pytest.approx(sigma)
+    assert worth_of(ScorerModel.by_hand(NAMES), HAND, age_years=7.0, season="snow") == pytest.approx(sigma)
 
 
 def test_gains_and_information_shrink_as_the_map_ages():
-    learnt = replace(Learnt.by_hand(["building"]), rates=(HOUSE,))
+    learnt = replace(ScorerModel.by_hand(["building"]), rates=(HOUSE,))
     table = worth_table(learnt, FITTED)
     for column in ("worth", "agree", "information"):
         assert table[column].is_monotonic_decreasing
@@ -43,12 +43,14 @@ def test_gains_and_information_shrink_as_the_map_ages():
 
 
 def test_a_fitted_table_holds_the_gains_of_the_arm_and_its_exponents():
-    learnt = replace(Learnt.by_hand(NAMES), temper=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(13, 0.4))
+    learnt = replace(
+        ScorerModel.by_hand(NAMES), scaling=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(13, 0.4)
+    )
     table = worth_table(learnt, FITTED, ages_years=[3.0], season="leaf_on")
     gains = FITTED.gains(learnt, age_years=3.0, season="leaf_on")
     assert table["class"].tolist() == list(NAMES)
     assert table["missed"].to_numpy() == pytest.approx(gains.missed)
-    assert table["worth"].to_numpy() == pytest.approx(100 * learnt.temper * gains.agree)
+    assert table["worth"].to_numpy() == pytest.approx(100 * learnt.scaling * gains.agree)
 
 
 def test_information_out_of_season_is_less():
@@ -57,7 +59,8 @@ def test_information_out_of_season_is_less():
 
 def test_tables_stand_side_by_side_in_the_order_of_the_classes():
     tables = {
-        name: worth_table(Learnt.by_hand(NAMES), arm, ages_years=[0.0, 5.0]) for name, arm in (("a", HAND), ("b", HAND))
+        name: worth_table(ScorerModel.by_hand(NAMES), arm, ages_years=[0.0, 5.0])
+        for name, arm in (("a", HAND), ("b", HAND))
     }
     wide = side_by_side(tables, "worth")
     assert wide.index.tolist() == list(NAMES)
@@ -82,6 +85,6 @@ def test_what_is_no_season_or_no_class_is_refused():
     with pytest.raises(ConfigError, match=r"no season 'spring' \(leaf_on"):
         check_season("spring")
     with pytest.raises(ConfigError, match="no class 'lamp'"):
-        check_classes(Learnt.by_hand(["water"]), ["lamp"])
-    with pytest.raises(ConfigError, match="nothing was learnt of the map's class 'railway'"):
-        check_classes(Learnt.by_hand(["water"]), ["water", "railway"])
+        check_classes(ScorerModel.by_hand(["water"]), ["lamp"])
+    with pytest.raises(ConfigError, match="the model lacks the map's class 'railway'"):
+        check_classes(ScorerModel.by_hand(["water"]), ["water", "railway"])

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 import shapely
 
-from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
-from sasgeo_bench.sasgeo.kinds import INDEX
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
@@ -142,18 +140,6 @@ def test_a_way_that_is_cut_on_the_map_is_a_contradiction(seen):
     ways = (*west, "LINESTRING (-5 -20, 20 -20, 97 -20)")
     cut = mapped_from(drawn(ways=(*WAYS[1:], *ways)))
     assert score(seen, cut).contradicting > score(seen, mapped_from(drawn())).contradicting
-
-
-def test_weights_count_nodes_more_or_not_at_all(seen, mapped):
-    plain = score(seen, mapped)
-    ones = score(seen, mapped, seen_weights=np.ones(len(seen.nodes)), mapped_weights=np.ones(len(mapped.nodes)))
-    assert asdict(ones) == asdict(plain)
-    half = score(seen, mapped, mapped_weights=np.full(len(mapped.nodes), 0.5))
-    assert half.score == pytest.approx(plain.score / 2)
-    silent = (mapped.nodes.kind != INDEX["building"]).astype(float)
-    assert score(seen, mapped, mapped_weights=silent).score < plain.score
-    with pytest.raises(ShapeError, match="seen_weights is one finite weight"):
-        verify(seen, mapped, [HERE], seen_weights=np.ones(2))
 
 
 @pytest.mark.parametrize("vectors", [None, vector_table([])])

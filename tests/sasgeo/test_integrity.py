@@ -104,5 +104,5 @@ def test_what_is_no_list_of_modes_is_refused(positions_m, by_class, changes, wor
 
 
 def test_a_name_that_is_not_in_the_list_is_refused():
-    with pytest.raises(ShapeError, match="'margin' is nothing a matcher may tell"):
+    with pytest.raises(ShapeError, match="'margin' is no evidence that a matcher supplies"):
         evidence_of(modes_of([[0, 0]], [[1.0]]), margin=2.0)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.sasgeo.joint import SIGHT, Blend, columns, contradiction
+from sasgeo_bench.sasgeo.joint import HALF_NODES, Blend, columns, contradiction
 
 
 @pytest.mark.parametrize(("name", "value"), [("alpha", -1.0), ("beta", float("nan")), ("eta", float("inf"))])
@@ -18,7 +18,7 @@ def test_by_hand():
     terms = columns(
         np.array([[2.0, -4.0], [1.0, 0.5]]), np.array([3.0, -1.0]), Blend(alpha=2.0, beta=0.5, eta=0.25), nodes=2
     )
-    share = 2 / (2 + SIGHT)
+    share = 2 / (2 + HALF_NODES)
     assert terms == pytest.approx(np.array([[4.0, -8.0, 1.5 * share, -1.0], [2.0, 1.0, -0.5 * share, 0.0]]))
 
 

@@ -8,12 +8,12 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.sasgeo.joint import Blend
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.rates import FAR, hand_rates
 
 
 def learnt(**changes):
-    said = json.loads(Learnt.by_hand(["railway", "water"]).to_text())
+    said = json.loads(ScorerModel.by_hand(["railway", "water"]).to_text())
     for name, value in changes.items():
         said["classes"]["water"][name] = value
     return json.dumps(said)
@@ -21,18 +21,18 @@ def learnt(**changes):
 
 def test_text_keeps_six_digits_and_comes_back():
     text = learnt(temper=0.00123456789, vanish_per_year=1 / 3)
-    first = Learnt.from_text(text)
-    again = Learnt.from_text(first.to_text())
+    first = ScorerModel.from_text(text)
+    again = ScorerModel.from_text(first.to_text())
     assert again == first
-    assert first.temper.tolist() == [0.01, 0.00123456789]
+    assert first.scaling.tolist() == [0.01, 0.00123456789]
     assert again.rates[1].vanish_per_year == pytest.approx(1 / 3, rel=1e-5)
 
 
 def test_classes_are_put_in_the_order_of_a_map_and_unknown_ones_are_by_hand():
-    said = Learnt.from_text(learnt(temper=0.5))
+    said = ScorerModel.from_text(learnt(temper=0.5))
     mine = said.of_classes(["building", "water"])
     assert mine.classes == ("building", "water")
-    assert mine.temper.tolist() == [0.01, 0.5]
+    assert mine.scaling.tolist() == [0.01, 0.5]
     assert mine.rates[0] == hand_rates("building")
     assert mine.likeness.shape == (2, FAR + 1)
     assert mine.blend == Blend()
@@ -58,14 +58,14 @@ def test_classes_are_put_in_the_order_of_a_map_and_unknown_ones_are_by_hand():
 )
 def test_text_that_says_no_such_thing_is_refused_in_a_line(text, fault):
     with pytest.raises(ConfigError, match=fault) as caught:
-        Learnt.from_text(text)
+        ScorerModel.from_text(text)
     assert "\n" not in str(caught.value)
 
 
 def test_equal_by_what_is_said():
-    one, same = Learnt.by_hand(["water"]), Learnt.by_hand(["water"])
+    one, same = ScorerModel.by_hand(["water"]), ScorerModel.by_hand(["water"])
     assert one == same
     assert hash(one) == hash(same)
-    assert one != Learnt.by_hand(["railway"])
+    assert one != ScorerModel.by_hand(["railway"])
     assert one != "water"
-    assert np.isfinite(one.temper).all()
+    assert np.isfinite(one.scaling).all()

@@ -11,7 +11,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_match
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
-from sasgeo_bench.sasgeo.learnt import Learnt
+from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.protection import PROTECTION
 from sasgeo_bench.sasgeo.variants import (
     Sasgeo,
@@ -76,7 +76,7 @@ def test_switches_tell_the_arms_apart():
 
 
 def test_an_arm_without_age_weighs_every_map_as_one_of_today():
-    learnt = Learnt.by_hand(["building", "railway"])
+    learnt = ScorerModel.by_hand(["building", "railway"])
     young, old = (SasgeoAgeless.switches.gains(learnt, age_years=age) for age in (0.0, 30.0))
     aged = Sasgeo.switches.gains(learnt, age_years=30.0)
     assert (young.agree == old.agree).all()
@@ -179,7 +179,7 @@ def training(tiny):
 def test_what_is_learnt_is_read_back_and_the_same_again(tiny, training):
     one, other = (SasgeoNoGraph().learn(training) for _ in range(2))
     assert one == other
-    said = Learnt.from_text(one)
+    said = ScorerModel.from_text(one)
     assert said.views == sum(query.track == "localization" for query, _ in training.pairs)
     assert set(said.classes) == set(tiny.region.classes)
     matcher = SasgeoNoGraph()
@@ -190,8 +190,8 @@ def test_what_is_learnt_is_read_back_and_the_same_again(tiny, training):
 
 
 def test_the_whole_scorer_learns_weights_of_the_joint_score(training):
-    said = Learnt.from_text(Sasgeo().learn(training))
-    assert said.blend != Learnt.by_hand(said.classes).blend
+    said = ScorerModel.from_text(Sasgeo().learn(training))
+    assert said.blend != ScorerModel.by_hand(said.classes).blend
 
 
 def test_nothing_to_learn_from_is_said(training):

@@ -39,7 +39,6 @@ def test_a_fork_in_a_mask_is_one_node_with_three_arms():
     assert np.hypot(right_m - 20, up_m - 0) <= 3
     arms = np.sort(graph.nodes.arms_deg[0][:3])
     assert arms == pytest.approx([0, 90, 270], abs=15) or arms == pytest.approx([90, 270, 360], abs=15)
-    assert graph.source == ["mask"]
 
 
 def test_a_road_that_ends_in_the_view_is_an_end_but_not_at_unknown_ground_or_the_border():
@@ -95,15 +94,6 @@ def test_short_gaps_of_a_detector_are_closed_and_longer_ones_are_not():
     assert len(bridged(halves(9.0))) == 2
     assert found(ObservedGraph.make(view(), halves(6.0))) == []
     assert [name for name, *_ in found(ObservedGraph.make(view(), halves(9.0)))] == ["dead_end", "dead_end"]
-
-
-def test_edges_have_distance_and_bearing():
-    wkt = ["LINESTRING (-58 0, -20 0, 20 0, 58 0)", "LINESTRING (-20 0, -20 58)", "LINESTRING (20 0, 20 58)"]
-    roads = vector_table([("road_minor", 0, False, shape) for shape in shapely.from_wkt(wkt)])
-    edges = ObservedGraph.make(view(), roads).edges()
-    along = edges[edges["relation"] >= 0]
-    assert along["distance_m"].tolist() == [40.0]
-    assert along["bearing_deg"].tolist() == [90.0]
 
 
 def test_an_empty_or_unknown_view_has_no_nodes():

@@ -93,12 +93,12 @@ def test_a_blind_view_says_nothing(tiny, asked):
     seen = asked[0][0].evidence
     blind = seen.replace(np.full_like(seen.cells, UNKNOWN))
     view = RasterView.of(blind, tiny.region.classes, gains_of(tiny.region))
-    assert not len(view.template().speaking)
+    assert not len(view.template().active)
 
 
 def test_exponents_scale_each_class(tiny, field, asked):
     query, pose = asked[0]
     view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
-    temper = np.linspace(0.1, 1.0, len(tiny.region.classes))
-    parts = view.tempered(temper).by_class(field, [pose])
-    assert parts == pytest.approx(view.by_class(field, [pose]) * temper, rel=1e-4, abs=1e-3)
+    scaling = np.linspace(0.1, 1.0, len(tiny.region.classes))
+    parts = view.scaled(scaling).by_class(field, [pose])
+    assert parts == pytest.approx(view.by_class(field, [pose]) * scaling, rel=1e-4, abs=1e-3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rates come back from views that were made with them, within their intervals."""
+"""Fitted rates are those that the views were made with."""
 
 import numpy as np
 import pytest
@@ -34,25 +34,16 @@ def made_up(rates, *, ages_years=(0.0, 2.0, 5.0, 10.0), blocks=24, cells=36_000,
     return made
 
 
-def test_intervals_hold_the_true_rates_as_often_as_they_say():
-    worlds = [fit_rates(made_up(TRUE, blocks=16, seed=seed))["building"] for seed in range(40)]
-    assert all(fitted.blocks == 16 for fitted in worlds)
+def test_fitted_rates_are_the_true_ones_on_average():
+    worlds = [fit_rates(made_up(TRUE, blocks=16, seed=seed))["building"] for seed in range(10)]
     for name in ("hit", "false_alarm", "missing", "vanish_per_year", "appear_per_year"):
-        assert all(getattr(one.lo, name) <= getattr(one.best, name) <= getattr(one.hi, name) for one in worlds)
-        held = np.mean([getattr(one.lo, name) <= getattr(TRUE, name) <= getattr(one.hi, name) for one in worlds])
-        assert held >= 0.85, name  # of 0.95: 34 of 40 or fewer have a chance of 1 in 100
-
-
-def test_more_blocks_make_intervals_narrower():
-    few, many = (fit_rates(made_up(TRUE, blocks=blocks))["building"] for blocks in (6, 48))
-    assert many.hi.vanish_per_year - many.lo.vanish_per_year < few.hi.vanish_per_year - few.lo.vanish_per_year
+        assert np.mean([getattr(one, name) for one in worlds]) == pytest.approx(getattr(TRUE, name), rel=0.1), name
 
 
 def test_where_nothing_was_seen_the_hand_decides():
     nothing = np.zeros((1, FAR + 1), dtype=np.int64)
     fitted = fit_rates([as_tally(nothing, nothing, age_years=5.0)])["building"]
-    assert fitted.best.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-3)
-    assert fitted.views == 0
+    assert fitted.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-3)
     assert likeness([as_tally(nothing, nothing)])[0].tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
 
 
@@ -80,7 +71,7 @@ def test_a_map_that_lies_beside_the_world_makes_being_near_alike():
 
 
 def test_a_map_of_one_age_tells_the_detector_and_leaves_ageing_to_the_hand():
-    fitted = fit_rates(made_up(TRUE, ages_years=(0.0,)))["building"].best
+    fitted = fit_rates(made_up(TRUE, ages_years=(0.0,)))["building"]
     assert fitted.hit == pytest.approx(TRUE.hit, abs=0.01)
     assert fitted.false_alarm == pytest.approx(TRUE.false_alarm, rel=0.1)
     assert fitted.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-2)

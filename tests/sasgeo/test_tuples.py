@@ -110,4 +110,4 @@ def test_pairs_read_from_the_other_end_lead_the_other_way(mapped):
     np.testing.assert_array_equal(there.ends, back.ends)
     assert int(there.arms.max()) < 1 << SECTORS
     assert (np.diff(there.length_m) >= 0).all()
-    assert len(JunctionPairs.of(nothing(), JUNCTIONS[0], apart_m=(1.0, 9.0)).ends) == 0
+    assert len(JunctionPairs.of(nothing(), JUNCTIONS[0], range_m=(1.0, 9.0)).ends) == 0

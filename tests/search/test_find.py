@@ -292,15 +292,15 @@ def test_peaks_beside_a_better_one_are_dropped():
         beside = np.maximum(abs(row[chosen] - row[at]), abs(col[chosen] - col[at])) <= 1
         if not (turned & beside).any():
             chosen.append(at)
-    assert peaks.apart(500, turns) == chosen
-    assert peaks.apart(7, turns) == chosen[:7]
+    assert peaks.separate(500, turns) == chosen
+    assert peaks.separate(7, turns) == chosen[:7]
 
 
 def test_a_posterior_sums_to_one_and_grows_with_the_score():
-    mass = posterior([3.0, 1.0, -2.0], temper=0.5)
+    mass = posterior([3.0, 1.0, -2.0])
     assert mass.sum() == pytest.approx(1.0)
     assert mass[0] > mass[1] > mass[3] > mass[2]
-    assert posterior([1e6, 0.0], temper=1.0).tolist() == [1.0, 0.0, 0.0]
+    assert posterior([1e6, 0.0]).tolist() == [1.0, 0.0, 0.0]
 
 
 def test_a_pose_that_is_given_is_followed_where_the_search_would_not_look(place):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`entropy`: over how many places the scores are spread."""
+"""`entropy`: spread of the scores over places."""
 
 import math
 from collections.abc import Sequence
@@ -32,8 +32,8 @@ class Entropy:
     )
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn nothing."""
+        """Do nothing."""
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
-        """The more candidates share the scores, the nearer to 1, shape (N,)."""
+        """Return values that grow with the entropy, shape (N,)."""
         return with_withheld(predictions, lambda answers: np.array([-math.expm1(-entropy(item)) for item in answers]))

@@ -12,7 +12,7 @@ from sasgeo_bench import Prediction, RejectorCard
 
 
 class IsotonicMargin:
-    """The share of false fixes among answers of such a margin, never rising with it."""
+    """Share of false fixes at a margin, never rising with it."""
 
     card = RejectorCard(
         name="isotonic_margin",
@@ -32,7 +32,7 @@ class IsotonicMargin:
         self._curve: IsotonicRegression | float | None = None
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn how falseness falls with the margin."""
+        """Fit the share of false fixes by margin."""
         at = answered(predictions)
         truth = np.asarray(is_false, dtype=bool)[at]
         if truth.all() or not truth.any():
@@ -43,7 +43,7 @@ class IsotonicMargin:
         self._curve = curve.fit(margins, truth.astype(np.float64))
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Calibrated share of false fixes, shape (N,)."""
+        """Return calibrated shares of false fixes, shape (N,)."""
         curve = self._curve
         if curve is None:
             message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the rules read of the scores of an answer: by how much the first place leads, and over how many it is spread."""
+"""Statistics of the scores of an answer: lead of the first place, and entropy over places."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 
 from sasgeo_bench import Pose, Prediction
 
-# The widest tolerance of the benchmark: what lies nearer is the same answer. (A footprint would do, but no rule sees
-# the view.)
+# The widest tolerance of the benchmark: nearer candidates are one answer.
 APART_M: Final = 25.0
-MOST: Final = 1e100  # larger numbers are taken for this one, so that squares and differences stay finite
+MOST: Final = 1e100  # numbers are clipped to it, so that squares and differences stay finite
 
 Values = NDArray[np.float64]
 
 
 def with_withheld(predictions: Sequence[Prediction], rule: Callable[[Sequence[Prediction]], Values]) -> Values:
-    """What a rule says of answers with candidates, and 1 of those without, shape (N,).
+    """Return a rule's values for answers with candidates, and 1 for those without, shape (N,).
 
     Examples
     --------
@@ -34,20 +33,20 @@ def with_withheld(predictions: Sequence[Prediction], rule: Callable[[Sequence[Pr
 
 
 def answered(predictions: Sequence[Prediction]) -> NDArray[np.int64]:
-    """Which of some answers hold any candidate."""
+    """Return indices of answers with candidates."""
     return np.array([at for at, item in enumerate(predictions) if item.candidates], dtype=np.int64)
 
 
 def margin(prediction: Prediction) -> float:
-    """Score of the first candidate less that of the second; 0 where there is none to compare with."""
+    """Return the score of the first candidate less that of the second; 0 without a second."""
     scores = scores_of(prediction)
     return float(min(scores[0] - scores[1], MOST)) if len(scores) > 1 else 0.0
 
 
 def margin_nms(prediction: Prediction) -> float:
-    """Score of the first candidate less that of the best at least `APART_M` away from it.
+    """Return the score of the first candidate less that of the best at least `APART_M` away from it.
 
-    Where all lie near, a rival is none of those given, and so no better than the last of them.
+    Without one, less that of the last candidate: a rival that was not returned scores no better.
     """
     scores = scores_of(prediction)
     (first, _), *others = prediction.candidates
@@ -57,10 +56,7 @@ def margin_nms(prediction: Prediction) -> float:
 
 
 def entropy(prediction: Prediction) -> float:
-    """Entropy, in nats, of a softmax over the scores, standardised by their spread.
-
-    As for two candidates that tie where there is only one: nothing says that it is better than others.
-    """
+    """Return the entropy of a softmax over standardised scores, nats; for one candidate that of a tie of two."""
     scores = scores_of(prediction)
     if len(scores) == 1:
         return math.log(2)
@@ -74,7 +70,7 @@ def entropy(prediction: Prediction) -> float:
 
 
 def scores_of(prediction: Prediction) -> Values:
-    """Scores of the candidates, best first, shape (N,)."""
+    """Return the scores of the candidates, best first, shape (N,)."""
     return np.clip(np.array([score for _, score in prediction.candidates], dtype=np.float64), -MOST, MOST)
 
 
@@ -83,7 +79,7 @@ def _place(pose: Pose) -> tuple[float, float]:
 
 
 def base_rate(is_false: NDArray[np.bool_]) -> float:
-    """Share of false fixes with one more of each kind (Laplace): never 0 or 1.
+    """Return the share of false fixes with one more of each kind (Laplace): never 0 or 1.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`logistic_all`: logistic regression on everything that an answer tells."""
+"""`logistic_all`: logistic regression on all scores and diagnostics of an answer."""
 
 import math
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ from sasgeo_baselines.rejectors.leads import (
 )
 from sasgeo_bench import Prediction, RejectorCard
 
-_NEAR: Final = 1e-150  # a smaller spread is none: quotients stay finite
-_FAR: Final = 10.0  # standard deviations: beyond what calibration has seen, farther is no more
+_NEAR: Final = 1e-150  # a smaller spread is zero, so that quotients stay finite
+_FAR: Final = 10.0  # standard deviations: features are clipped to it
 
-_DECIMALS: Final = 12  # of a probability: the last digits of a fit hang on where in memory arrays lie
+_DECIMALS: Final = 12  # of a probability: the last digits of a fit depend on memory alignment
 
 
 class LogisticAll:
-    """Margins, entropy, number of candidates, best score and the shared diagnostics, weighed by calibration."""
+    """Margins, entropy, number of candidates, best score and shared diagnostics, weighed by calibration."""
 
     card = RejectorCard(
         name="logistic_all",
@@ -51,7 +51,7 @@ class LogisticAll:
         self._model: _Model | float | None = None
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn the weights."""
+        """Fit the weights."""
         at = answered(predictions)
         truth = np.asarray(is_false, dtype=bool)[at]
         if truth.all() or not truth.any():
@@ -60,7 +60,7 @@ class LogisticAll:
             self._model = _Model.of([predictions[index] for index in at], truth)
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Calibrated probability of a false fix, shape (N,)."""
+        """Return calibrated probabilities of a false fix, shape (N,)."""
         model = self._model
         if model is None:
             message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
@@ -72,7 +72,7 @@ class LogisticAll:
 
 @dataclass(frozen=True, kw_only=True)
 class _Model:
-    """What was learnt: names of diagnostics, and median, mean and spread of each feature."""
+    """Fitted model: names of diagnostics, and median, mean and spread of each feature."""
 
     names: tuple[str, ...]
     medians: NDArray[np.float64]
@@ -82,7 +82,7 @@ class _Model:
 
     @classmethod
     def of(cls, answers: Sequence[Prediction], is_false: NDArray[np.bool_]) -> Self:
-        """Fit."""
+        """Fit the model to answers."""
         shared = set.intersection(*(set(item.diagnostics) for item in answers))
         names = tuple(sorted(name for name in shared if any(math.isfinite(item.diagnostics[name]) for item in answers)))
         raw = features(answers, names)
@@ -96,7 +96,7 @@ class _Model:
         return cls(names=names, medians=medians, means=means, spreads=spreads, weights=weights)
 
     def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Probability of a false fix, shape (N,)."""
+        """Return probabilities of a false fix, shape (N,)."""
         raw = features(answers, self.names)
         filled = np.where(np.isnan(raw), self.medians, raw)
         chances = self.weights.predict_proba(_standardised(filled, self.means, self.spreads))
@@ -104,10 +104,7 @@ class _Model:
 
 
 def features(answers: Sequence[Prediction], names: Sequence[str]) -> NDArray[np.float64]:
-    """Margins, entropy, number of candidates, best score, and some diagnostics, shape (N, 5 + names).
-
-    A diagnostic that an answer lacks, or that is not finite, is nan.
-    """
+    """Return margins, entropy, candidate count, best score and diagnostics, shape (N, 5 + names); NaN if missing."""
     rows = [
         [
             margin(item), margin_nms(item), entropy(item), len(item.candidates), scores_of(item)[0],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`margin`: by how much the first candidate leads the second."""
+"""`margin`: lead of the first candidate over the second."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from sasgeo_bench import Prediction, RejectorCard
 
 
 class Margin:
-    """The lead over the second candidate, made a number from 0 to 1/2."""
+    """Lead over the second candidate, as a number from 0 to 1/2."""
 
     card = RejectorCard(
         name="margin",
@@ -28,8 +28,8 @@ class Margin:
     )
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn nothing."""
+        """Do nothing."""
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
-        """The smaller the lead, the nearer to 1/2, shape (N,)."""
+        """Return values that fall with the lead, from 1/2, shape (N,)."""
         return with_withheld(predictions, lambda answers: np.array([1 / (2 + margin(item)) for item in answers]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`margin_nms`: by how much the first candidate leads the best one that is another place."""
+"""`margin_nms`: lead of the first candidate over the best one at another place."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from sasgeo_bench import Prediction, RejectorCard
 
 
 class MarginNms:
-    """The lead over the best candidate apart from the first, made a number from 0 to 1/2."""
+    """Lead over the best candidate at another place, as a number from 0 to 1/2."""
 
     card = RejectorCard(
         name="margin_nms",
@@ -28,8 +28,8 @@ class MarginNms:
     )
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn nothing."""
+        """Do nothing."""
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
-        """The smaller the lead, the nearer to 1/2, shape (N,)."""
+        """Return values that fall with the lead, from 1/2, shape (N,)."""
         return with_withheld(predictions, lambda answers: np.array([1 / (2 + margin_nms(item)) for item in answers]))

@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`prior_centre`: the control that answers with what was known before."""
+"""`prior_centre`: control that answers with the prior alone."""
 
-from sasgeo_baselines.answers import is_blind, offsets_m, ranked_candidates
-from sasgeo_baselines.places import at_place, middle_m, points_of
-from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region
+from sasgeo_bench.matching.controls.answers import (
+    at_place,
+    is_blind,
+    middle_m,
+    offsets_m,
+    points_of,
+    ranked_candidates,
+)
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.tasks.query import Query
 
 
 class PriorCentre:
-    """The middle of the prior's disc with its heading, or of the map; the candidate nearest to the middle of all."""
+    """Answers with the centre of the prior's disc, or of the map; of candidates, the one nearest to their mean."""
 
     card = MatcherCard(
         name="prior_centre",
@@ -24,12 +32,12 @@ class PriorCentre:
         self._region: Region | None = None
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Keep the map, for queries without a disc."""
+        """Keep the map for queries without a disc."""
         del learned
         self._region = region
 
     def match(self, query: Query, *, top_k: int) -> Match:
-        """Answer without looking."""
+        """Return the centre of the prior."""
         if self._region is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)

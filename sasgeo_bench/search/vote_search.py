@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dense search: all places, headings and scales at a coarse cell by FFT, then the best modes at the map's own."""
+"""Search by mean votes: all places, headings and scales on coarse cells by FFT, the best of them on the map's own."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -10,39 +10,41 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.chart import Chart
-from sasgeo_baselines.view import NOWHERE, Patch, Samples, View
-from sasgeo_baselines.voting import ByPlanes, ByRows
-from sasgeo_bench import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.search.chart import Chart
+from sasgeo_bench.search.plan import Mode, place_m, thinned
+from sasgeo_bench.search.space import Disc
+from sasgeo_bench.search.view import NOWHERE, Patch, Samples, View
+from sasgeo_bench.search.votes import ByPlanes, ByRows
 
 _FEW: Final = 32  # places a side: more cost less by transforms of planes
-_TILE: Final = 256  # places a side that are searched at once; larger ones take more memory and save no time
-_NOTHING: Final = 1e-6  # known cells: less is the rounding of a transform
-_SPREAD: Final = 2.0  # standard deviations of heading and scale that are searched
-_MARGIN_M: Final = 12.0  # how far a mode may move while it is refined
-_WIDEN: Final = 0.05  # how far its scale may leave those that were searched
+_TILE: Final = 256  # places a side of a tile: larger ones take more memory and save no time
+_NOTHING: Final = 1e-6  # known cells: less is rounding of the transform
+_SPREAD: Final = 2.0  # searched standard deviations of heading and scale
+_MARGIN_M: Final = 12.0  # a mode may move so far while it is refined
+_WIDEN: Final = 0.05  # its scale may exceed the searched ones by so much
 _ROUNDS: Final = 8  # of steps of one size
-_SOME_CELLS: Final = 96  # a side: enough to climb by
+_SOME_CELLS: Final = 96  # a side: enough for the first steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """How a search is done.
+class VotePlan:
+    """Settings of a search by votes.
 
     Parameters
     ----------
     coarse_m, coarse_wide_m, wide_m2 : float
-        Side of a coarse cell; another for areas beyond `wide_m2`, square metres.
+        Side of a coarse cell, up to an area of `wide_m2` and beyond it, metres and square metres.
     yaw_step_deg, scale_step : float
-        Largest step between headings and scales that are tried.
+        Largest step between searched headings and scales.
     apart_m : float
         Least distance between two modes.
     least_overlap : float
-        Share of what the view knows that the map must know for a pose to be looked at.
+        Share of the cells known to the view that the map must know at a pose.
     modes, finals : int
-        Modes that are refined at all, and to the last.
+        Modes that are refined on coarse cells, and of them on the map's own.
     around_m : float
-        How far around a candidate the view may lie.
+        Radius around a candidate within which the view may lie.
     """
 
     coarse_m: float = 4.0
@@ -58,60 +60,27 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mode:
-    """A pose and its score."""
-
-    pose: Pose
-    score: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
-    """What a search comes back with.
+class Voted:
+    """Result of a search by votes.
 
     Parameters
     ----------
     modes : list of Mode or None
-        The best of the places, best first; or one for each candidate, None where the map shows too little.
+        Best places, best first; or one for each candidate, None where the map shows too little.
     null_score : float
-        By how many standard deviations the best coarse score exceeds those of the places apart from it, which are
-        wrong if it is right; 0 where there are none.
+        Standard deviations by which the best coarse score exceeds those of distant places, which are wrong if it is
+        right; 0 where there are none.
     """
 
     modes: list[Mode | None]
     null_score: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Disc:
-    """Where a view may lie; anywhere, if there is no centre."""
-
-    center_m: tuple[float, float] | None
-    radius_m: float
-
-    def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each of some places, shape (N, 2), lies within.
-
-        Examples
-        --------
-        >>> Disc(center_m=(0.0, 0.0), radius_m=5.0).holds(np.array([(3.0, 4.0), (4.0, 4.0)])).tolist()
-        [True, False]
-        """
-        if self.center_m is None:
-            return np.ones(len(points_m), dtype=bool)
-        return np.asarray(np.hypot(*(points_m - self.center_m).T) <= self.radius_m)
-
-    def has(self, pose: Pose) -> bool:
-        """Whether a pose lies within."""
-        return self.center_m is None or math.dist((pose.easting_m, pose.northing_m), self.center_m) <= self.radius_m
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Tile:
-    """A square of places, row by row, and the map under all views from there.
+    """Square of places, row by row, and the map under all views from there.
 
-    `layers` has shape (B + 1, side, side), `points_m` (n * n, 2); `allowed`, of shape (n * n,), is False for places
-    outside of what is searched.
+    `layers` has shape (B + 1, side, side), `points_m` (n * n, 2); `allowed`, shape (n * n,), marks searched places.
     """
 
     layers: NDArray[np.float32]
@@ -121,19 +90,19 @@ class _Tile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Votes:
-    """For each place of a tile its best score, and which of the turns (heading and scale) it has it from."""
+    """Best score of each place of a tile, and the index of its turn (heading and scale)."""
 
     score: NDArray[np.float64]
     turn: NDArray[np.int64]
 
 
-def turns(prior: Prior, plan: Plan) -> tuple[Pose, ...]:
-    """Headings and scales to be tried, as poses at the origin.
+def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
+    """Return headings and scales to search, as poses at the origin.
 
     Examples
     --------
     >>> known = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=3.0, scale_sigma=0.0)
-    >>> [pose.yaw_deg for pose in turns(known, Plan())]
+    >>> [pose.yaw_deg for pose in turns(known, VotePlan())]
     [354.0, 357.0, 0.0, 3.0, 6.0]
     """
     scales = [1 + offset for offset in _steps(min(_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
@@ -141,34 +110,27 @@ def turns(prior: Prior, plan: Plan) -> tuple[Pose, ...]:
     return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)
 
 
-def is_any_heading(prior: Prior) -> bool:
-    """Whether all headings are to be tried.
-
-    Examples
-    --------
-    >>> is_any_heading(Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=60.0, scale_sigma=0.0))
-    False
-    """
+def _is_any_heading(prior: Prior) -> bool:
     return prior.yaw_sigma_deg is None or _SPREAD * prior.yaw_sigma_deg >= 180  # noqa: PLR2004
 
 
-def _yaws_deg(prior: Prior, plan: Plan) -> list[float]:
-    """Headings to be tried; where all are, each has three others at right angles."""
-    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or is_any_heading(prior):
+def _yaws_deg(prior: Prior, plan: VotePlan) -> list[float]:
+    """Return headings to search; of all headings, each has three others at right angles."""
+    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or _is_any_heading(prior):
         count = 4 * math.ceil(90 / plan.yaw_step_deg)
         return [360 * index / count for index in range(count)]
     return [prior.yaw_deg + offset for offset in _steps(_SPREAD * prior.yaw_sigma_deg, plan.yaw_step_deg)]
 
 
 def _steps(reach: float, step: float) -> list[float]:
-    """From -reach to reach through 0 in equal steps no larger than `step`."""
+    """Return -reach to reach through 0 in equal steps of at most `step`."""
     count = math.ceil(reach / step - 1e-9)
     return [reach * index / count for index in range(-count, count + 1)] if count else [0.0]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """One pass of refinement: samples of the view, first steps (m, degrees, 1), how often halved."""
+    """One pass of refinement: samples of the view, first steps (m, degrees, 1), and number of halvings."""
 
     samples: Samples
     steps: tuple[float, float, float]
@@ -176,15 +138,15 @@ class _Level:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """The search for one view on one map."""
+class VoteSearch:
+    """Search for one view on one map."""
 
     chart: Chart
     view: View
     prior: Prior
-    plan: Plan
+    plan: VotePlan
 
-    def places(self, count: int) -> Found:
+    def places(self, count: int) -> Voted:
         """Find the best modes within the prior; none where no pose shows enough of the map."""
         plan, factor = self.plan, self._factor()
         tiles = self._tiles_of_prior(factor)
@@ -194,12 +156,12 @@ class Search:
         rough = ranked(self._rough(mode, limit) for mode in coarse)
         fine = ranked(self._fine(mode, limit) for mode in rough[: max(plan.finals, count + 1)])
         null_score = above_others(votes.score, points_m, apart_m=plan.apart_m)
-        return Found(modes=[*_thinned(fine, plan.apart_m)], null_score=null_score)
+        return Voted(modes=[*thinned(fine, plan.apart_m)], null_score=null_score)
 
-    def candidates(self, poses: Sequence[Pose]) -> Found:
+    def candidates(self, poses: Sequence[Pose]) -> Voted:
         """Score every candidate by the best pose near it.
 
-        Those that the coarse search puts behind `plan.modes` others keep its score, below all that were refined.
+        Candidates behind the first `plan.modes` of the coarse search keep their order, below all refined ones.
         """
         factor = self._cells(self.plan.coarse_m)
         tiles = [self._tile_around(pose, factor) for pose in poses]
@@ -210,14 +172,14 @@ class Search:
         fine: dict[int, Mode] = {}
         for at, mode in enumerate(rough):
             if mode is not None and mode.score >= cut:
-                disc = Disc(center_m=(poses[at].easting_m, poses[at].northing_m), radius_m=self.plan.around_m)
+                disc = Disc(center_m=place_m(poses[at]), radius_m=self.plan.around_m)
                 fine[at] = self._fine(self._rough(mode, disc), disc)
         lowest = min((mode.score for mode in fine.values()), default=0.0)
         modes = [
             fine.get(at, mode and replace(mode, score=lowest - (cut - mode.score))) for at, mode in enumerate(rough)
         ]
         joined, points_m = _joined(tiles, votes)
-        return Found(modes=modes, null_score=above_others(joined.score, points_m, apart_m=self.plan.apart_m))
+        return Voted(modes=modes, null_score=above_others(joined.score, points_m, apart_m=self.plan.apart_m))
 
     # Where
 
@@ -225,13 +187,13 @@ class Search:
         return max(1, round(size_m / self.chart.grid.cell_size_m))
 
     def _factor(self) -> int:
-        """Map cells a side of a coarse cell."""
+        """Return map cells a side of a coarse cell."""
         top, left, bottom, right = self._box()
         area_m2 = max(bottom - top, 0) * max(right - left, 0) * self.chart.grid.cell_size_m**2
         return self._cells(self.plan.coarse_wide_m if area_m2 > self.plan.wide_m2 else self.plan.coarse_m)
 
     def _box(self) -> tuple[int, int, int, int]:
-        """Top, left, bottom and right cell of the places to be searched: the disc's box on the map, or all of it."""
+        """Return the top, left, bottom and right cell of the searched places: the box of the disc, or the whole map."""
         rows, cols = self.chart.grid.shape
         if self.prior.center_m is None or self.prior.radius_m is None:
             return 0, 0, rows, cols
@@ -240,12 +202,12 @@ class Search:
         return max(row - reach, 0), max(col - reach, 0), min(row + reach + 1, rows), min(col + reach + 1, cols)
 
     def _limit(self, factor: int) -> Disc:
-        """The prior's disc and a coarse cell around it."""
+        """Return the disc of the prior, wider by a coarse cell."""
         around_m = factor * self.chart.grid.cell_size_m
         return Disc(center_m=self.prior.center_m, radius_m=(self.prior.radius_m or 0.0) + around_m)
 
     def _half(self, factor: int) -> int:
-        """Coarse cells from the middle of a template to its rim."""
+        """Return coarse cells from the middle of a template to its rim."""
         largest = self._turns[-1].scale
         return math.ceil(self.view.reach_m * largest / (factor * self.chart.grid.cell_size_m)) + 1
 
@@ -261,17 +223,15 @@ class Search:
         return [self._tile(row, col, count, factor, limit) for row, col in starts]
 
     def _tile_around(self, pose: Pose, factor: int) -> _Tile:
-        """Places around a candidate, on a lattice that hangs on it: the same map gives the same votes anywhere."""
-        place_m = (pose.easting_m, pose.northing_m)
-        row, col = self.chart.grid.to_cells(np.array([place_m]))[0].tolist()
+        """Return places around a candidate, on a lattice tied to it: equal maps give equal votes anywhere."""
+        row, col = self.chart.grid.to_cells(np.array([place_m(pose)]))[0].tolist()
         reach = math.ceil(self.plan.around_m / (factor * self.chart.grid.cell_size_m))
         back = reach * factor + factor // 2
-        return self._tile(
-            row - back, col - back, 2 * reach + 1, factor, Disc(center_m=place_m, radius_m=self.plan.around_m)
-        )
+        disc = Disc(center_m=place_m(pose), radius_m=self.plan.around_m)
+        return self._tile(row - back, col - back, 2 * reach + 1, factor, disc)
 
     def _tile(self, row: int, col: int, count: int, factor: int, disc: Disc) -> _Tile:
-        """Tile of `count` coarse cells a side, the first of them at a cell of the map."""
+        """Return a tile of `count` coarse cells a side that begins at a cell of the map."""
         half = self._half(factor)
         side = count + 2 * half
         layers = self.chart.pooled(row - half * factor, col - half * factor, side, factor, self.view.bands)
@@ -288,7 +248,7 @@ class Search:
         return turns(self.prior, self.plan)
 
     def _vote(self, tiles: Sequence[_Tile], factor: int) -> list[_Votes]:
-        """Best score and turn for every place of every tile; each template is transformed once for all tiles."""
+        """Return the best score and turn of every place; each template is transformed once for all tiles."""
         votes = [
             _Votes(score=np.full(len(tile.points_m), NOWHERE), turn=np.zeros(len(tile.points_m), dtype=np.int64))
             for tile in tiles
@@ -322,17 +282,17 @@ class Search:
         return votes
 
     def _quarters(self, places: int, tiles: int) -> int:
-        """How many headings at right angles share a template: 4 where all are tried and windows take little memory."""
-        return 4 if is_any_heading(self.prior) and (places <= _FEW or tiles == 1) else 1
+        """Return how many headings share a template: 4 if all are searched and windows take little memory, else 1."""
+        return 4 if _is_any_heading(self.prior) and (places <= _FEW or tiles == 1) else 1
 
     def _batches(self, quarters: int, at_once: int) -> list[NDArray[np.int64]]:
-        """Indices of turns, shape (some, quarters): each with those that are right angles from it."""
+        """Return indices of turns, shape (some, quarters): each with those at right angles to it."""
         index = np.arange(len(self._turns)).reshape(-1, quarters, len(_yaws_deg(self.prior, self.plan)) // quarters)
         together = index.transpose(0, 2, 1).reshape(-1, quarters)
         return np.split(together, range(at_once, len(together), at_once))
 
     def _best(self, tile: _Tile, votes: _Votes) -> Mode | None:
-        """Best place of a tile, if there is any."""
+        """Return the best place of a tile, if there is any."""
         at = int(np.argmax(votes.score))
         return self._mode(tile.points_m[at], votes, at) if votes.score[at] > NOWHERE else None
 
@@ -342,7 +302,7 @@ class Search:
         return Mode(pose=pose, score=float(votes.score[at]))
 
     def _peaks(self, votes: _Votes, points_m: NDArray[np.float64], *, most: int) -> list[Mode]:
-        """Best modes, none nearer to a better one than `apart_m`."""
+        """Return the best modes, none nearer to a better one than `apart_m`."""
         left = votes.score.copy()
         easting_m, northing_m = points_m.T.copy()
         found: list[Mode] = []
@@ -359,10 +319,12 @@ class Search:
 
     @cached_property
     def _levels(self) -> tuple[_Level, _Level, _Level]:
-        """How a mode is refined: on blurred squares, then on the map itself by some cells, then by all of them."""
+        """Return the passes of refinement: blurred squares, then some cells of the view on the map, then all."""
         cell_m, blur_m = self.chart.grid.cell_size_m, self.plan.coarse_m
         yaw_deg, scale = self.plan.yaw_step_deg, self.plan.scale_step
-        blurred = self.view.samples(self.view.blurred(blur_m), stride=self._stride(blur_m))
+        blurred = self.view.samples(
+            self.view.blurred(blur_m), stride=max(1, round(blur_m / self.view.grid.cell_size_m))
+        )
         some = self.view.samples(self.view.template, stride=max(1, round(max(self.view.grid.shape) / _SOME_CELLS)))
         every = self.view.samples(self.view.template, stride=1)
         return (
@@ -371,35 +333,30 @@ class Search:
             _Level(samples=every, steps=(cell_m / 4, yaw_deg / 16, scale / 16), halvings=1),
         )
 
-    def _stride(self, size_m: float) -> int:
-        """How many cells of the view a size spans."""
-        return max(1, round(size_m / self.view.grid.cell_size_m))
-
     def _rough(self, mode: Mode, disc: Disc) -> Mode:
-        """Climb from a coarse mode to a better one nearby, on blurred squares."""
+        """Refine a coarse mode on blurred squares."""
         patch = self._patch(mode, factor=self._cells(self.plan.coarse_m / 2))
         return self._climbed(mode, self._levels[0], patch, disc)
 
     def _fine(self, mode: Mode, disc: Disc) -> Mode:
-        """Climb on the map itself."""
+        """Refine a mode on the map's own cells."""
         patch = self._patch(mode, factor=1)
         for level in self._levels[1:]:
             mode = self._climbed(mode, level, patch, disc)
         return mode
 
     def _patch(self, mode: Mode, *, factor: int) -> Patch:
-        """The map under a view that moves a little."""
-        place_m = (mode.pose.easting_m, mode.pose.northing_m)
+        """Read the map under a view and a margin around it."""
         half_m = self.view.reach_m * (self._turns[-1].scale + _WIDEN) + 2 * _MARGIN_M
-        return Patch.around(self.chart, self.view.bands, place_m, half_m, factor=factor)
+        return Patch.around(self.chart, self.view.bands, place_m(mode.pose), half_m, factor=factor)
 
     def _climbed(self, mode: Mode, level: _Level, patch: Patch, disc: Disc) -> Mode:
         low, high = self._turns[0].scale - _WIDEN, self._turns[-1].scale + _WIDEN
-        near = Disc(center_m=(mode.pose.easting_m, mode.pose.northing_m), radius_m=_MARGIN_M)
+        near = Disc(center_m=place_m(mode.pose), radius_m=_MARGIN_M)
 
         @cache
         def score_of(pose: Pose) -> float:
-            """Score a pose of the mode's neighbourhood, NOWHERE beyond it; the climb comes by some poses twice."""
+            """Score a pose, NOWHERE beyond the neighbourhood; some poses are visited twice."""
             if not (low <= pose.scale <= high and near.has(pose) and disc.has(pose)):
                 return NOWHERE
             return patch.score(level.samples, pose, least_overlap=self.plan.least_overlap)
@@ -411,12 +368,12 @@ class Search:
 
 
 def _turned_back(layers: NDArray[np.float32], quarters: int) -> NDArray[np.float32]:
-    """Squares turned counter-clockwise by 0, 1, .. right angles, for a template that is to be turned clockwise."""
+    """Turn squares counter-clockwise by 0, 1, .. right angles, in place of turning the template clockwise."""
     return np.stack([np.rot90(layers, k, (1, 2)) for k in range(quarters)])
 
 
 def _joined(tiles: Sequence[_Tile], parts: Sequence[_Votes]) -> tuple[_Votes, NDArray[np.float64]]:
-    """Votes and places of all tiles in one."""
+    """Join votes and places of all tiles."""
     score = np.concatenate([np.zeros(0), *(part.score for part in parts)])
     turn = np.concatenate([np.zeros(0, dtype=np.int64), *(part.turn for part in parts)])
     points_m = np.concatenate([np.zeros((0, 2)), *(tile.points_m for tile in tiles)])
@@ -424,7 +381,7 @@ def _joined(tiles: Sequence[_Tile], parts: Sequence[_Votes]) -> tuple[_Votes, ND
 
 
 def above_others(score: NDArray[np.float64], points_m: NDArray[np.float64], *, apart_m: float) -> float:
-    """By how many standard deviations the best score exceeds those at least `apart_m` away from it; else 0.
+    """Return the lead of the best score over those at least `apart_m` away, in their standard deviations; else 0.
 
     Examples
     --------
@@ -440,7 +397,7 @@ def above_others(score: NDArray[np.float64], points_m: NDArray[np.float64], *, a
 
 
 def _climb(best: Mode, score_of: Callable[[Pose], float], steps: Sequence[float]) -> Mode:
-    """Step along place, heading and scale, one at a time, as long as that is better."""
+    """Step along place, heading and scale, one at a time, while the score improves."""
     metres, degrees, scale = steps
     for _ in range(_ROUNDS):
         before = best
@@ -457,15 +414,5 @@ def _climb(best: Mode, score_of: Callable[[Pose], float], steps: Sequence[float]
 
 
 def ranked(modes: Iterable[Mode]) -> list[Mode]:
-    """Best first; equals keep their order."""
+    """Sort modes, best first; ties keep their order."""
     return sorted((mode for mode in modes if mode.score > NOWHERE), key=lambda mode: -mode.score)
-
-
-def _thinned(modes: Sequence[Mode], apart_m: float) -> list[Mode]:
-    """Without those that came to lie beside a better one."""
-    kept: list[Mode] = []
-    for mode in modes:
-        here = (mode.pose.easting_m, mode.pose.northing_m)
-        if not any(math.dist(here, (other.pose.easting_m, other.pose.northing_m)) < apart_m for other in kept):
-            kept.append(mode)
-    return kept

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`fft_vote`: every place, heading and scale within the prior, voted for by three-state correlation."""
+"""`fft_vote`: three-state correlation at every place, heading and scale within the prior."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.chart import Chart
-from sasgeo_baselines.dense_matcher import DenseMatcher
-from sasgeo_baselines.voting import Gains, make_template
-from sasgeo_bench import Evidence, MatcherCard, Region
+from sasgeo_bench.matching.controls.dense_matcher import DenseMatcher
+from sasgeo_bench.matching.matcher import MatcherCard
+from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.search.chart import Chart
+from sasgeo_bench.search.votes import VoteGains, make_template
 
 
 class FftVote(DenseMatcher):
-    """Exhaustive three-state voting, one for every class and cell: the reference that others are held against."""
+    """Exhaustive three-state voting, one vote for each class and cell: the reference search of every board."""
 
     card = MatcherCard(
         name="fft_vote",
@@ -31,9 +33,9 @@ class FftVote(DenseMatcher):
     )
 
     def read(self, region: Region) -> Chart:
-        """Take the map as it is."""
+        """Return the map unchanged."""
         return Chart.of(region)
 
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Three states, one vote each."""
-        return make_template(evidence.cells, Gains.uniform(len(evidence.classes)))
+        """Return the template with gains of 1."""
+        return make_template(evidence.cells, VoteGains.uniform(len(evidence.classes)))

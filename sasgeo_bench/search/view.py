@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A view made ready for voting: its template in its own frame, turned onto the map's lattice, sampled, and scored."""
+"""Templates of a view: turned onto the map lattice, sampled, and scored at single poses."""
 
 import math
 from dataclasses import dataclass
@@ -9,10 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.chart import FULL, Chart
-from sasgeo_bench import Evidence, Grid, Pose, inverse
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, inverse
+from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.search.chart import Chart
+from sasgeo_bench.search.field import FULL
 
-NOWHERE = -math.inf  # the score of a pose that shows too little of the map
+NOWHERE = -math.inf  # score of a pose with too little of the map in view
 _AT_ONCE: Final = 16384  # samples
 
 Number = TypeVar("Number", np.float32, np.uint8)
@@ -20,10 +23,10 @@ Number = TypeVar("Number", np.float32, np.uint8)
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """The template of a view (`voting.make_template`) and the bands of the map it speaks of.
+    """Template of a view (`votes.make_template`) and the map bands that it weighs.
 
-    `template` is float32 of shape (B + 2, rows, cols), `grid` the view's lattice with its origin in the middle of the
-    view (right and up as east and north), `bands` the places of its classes among those of the map, shape (B,).
+    `template` is float32 of shape (B + 2, rows, cols), `grid` the lattice of the view with its origin in the middle
+    (right and up as east and north), `bands` the indices of its classes among those of the map, shape (B,).
     """
 
     template: NDArray[np.float32]
@@ -32,7 +35,7 @@ class View:
 
     @classmethod
     def of(cls, evidence: Evidence, template: NDArray[np.float64], bands: NDArray[np.int64]) -> Self:
-        """Take the frame of a view; `template` is made of it, for the classes in `bands`."""
+        """Make the lattice of a view for its template, of the classes in `bands`."""
         (rows, cols), (width_m, height_m) = evidence.shape, evidence.size_m
         cell_m = evidence.cell_size_m
         grid = Grid(epsg=0, west_m=-width_m / 2, north_m=height_m / 2, cell_size_m=cell_m, rows=rows, cols=cols)
@@ -40,18 +43,18 @@ class View:
 
     @property
     def reach_m(self) -> float:
-        """Half a diagonal at scale 1."""
+        """Half a diagonal at scale 1, metres."""
         return math.hypot(self.grid.rows, self.grid.cols) * self.grid.cell_size_m / 2
 
     def blurred(self, size_m: float) -> NDArray[np.float32]:
-        """Mean of the template over squares of about a size, shape (B + 2, rows, cols)."""
+        """Return means of the template over squares of about a size, shape (B + 2, rows, cols)."""
         size = 2 * round(size_m / self.grid.cell_size_m / 2) + 1
         return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.template])
 
     def turned(self, blurred: NDArray[np.float32], pose: Pose, *, half: int, step_m: float) -> NDArray[np.float32]:
-        """Lay a blurred template onto a north-up lattice around its middle, shape (B + 2, 2 half + 1, 2 half + 1).
+        """Resample a blurred template onto a north-up lattice around its middle, shape (B + 2, 2 half + 1, 2 half + 1).
 
-        `pose` says heading and scale; its place is not looked at.
+        Only heading and scale of `pose` matter.
         """
         side = 2 * half + 1
         steps_m, zeros = np.arange(-half, half + 1) * step_m, np.zeros(side)
@@ -67,7 +70,7 @@ class View:
         return laid.reshape(-1, side, side)
 
     def samples(self, template: NDArray[np.float32], *, stride: int) -> "Samples":
-        """Every `stride`-th cell of a template, with its place in the view."""
+        """Return every `stride`-th cell of a template, with its place in the view."""
         first = stride // 2
         rows, cols = np.arange(first, self.grid.rows, stride), np.arange(first, self.grid.cols, stride)
         zeros = np.zeros(1, dtype=np.int64)
@@ -86,9 +89,9 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """Cells of a template: offsets from the middle of the view, weights, and how many classes are known in each.
+    """Cells of a template: offsets from the middle of the view, weights, and the number of known classes in each.
 
-    `weights` are interleaved as the cells of a `Patch` are, `counts` has their first two axes.
+    `weights` are interleaved as the cells of a `Patch` are; `counts` has their first two axes.
     """
 
     up_m: NDArray[np.float64]
@@ -100,9 +103,9 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True)
 class Patch:
-    """A square of the map, cell after cell: `cells` has shape (rows * cols, bands), `known_band` is that of knowing.
+    """Square of the map, cell after cell: `cells` has shape (rows * cols, bands), `known_band` marks known cells.
 
-    They hold `full` where the map has a class for certain: the map's own cells are kept as small as they are.
+    A cell holds `full` where a class is certain: cells of the map's own size stay uint8.
     """
 
     cells: NDArray[np.float32] | NDArray[np.uint8]
@@ -116,7 +119,7 @@ class Patch:
     ) -> Self:
         """Read the square of at least `half_m` to each side of a place, in cells of `factor` map cells a side.
 
-        Where cells are larger than the map's, each is the mean of the nine around it.
+        Cells larger than those of the map are means of the nine cells around each.
         """
         row, col = chart.grid.to_cells(np.array([place_m]))[0].tolist()
         half = math.ceil(half_m / chart.grid.cell_size_m / factor)
@@ -131,9 +134,9 @@ class Patch:
         return cls(cells=cells.reshape(-1, cells.shape[-1]), full=full, known_band=len(bands), grid=grid)
 
     def score(self, samples: Samples, pose: Pose, *, least_overlap: float) -> float:
-        """Score a pose on this square by the samples of a view: Eq. (8) over the number of known cells.
+        """Return Eq. (8) of a pose, summed over the samples of a view and divided by the number of known cells.
 
-        `NOWHERE` where less than a share of what the view knows is known to the map; the square must hold the view.
+        `NOWHERE` where the map knows less than a share of the cells that the view knows. The square must hold the view.
         """
         # A pose is an affine map, so three points give it, and each sample lies at a sum of two numbers.
         corners = pose.to_map(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
@@ -142,7 +145,7 @@ class Patch:
         across = (right - middle)[:, None] * samples.right_m
         total = counted = 0.0
         for rows in _blocks(*samples.counts.shape):
-            # Nothing lies left of the square or above it, so to cut off is to round down.
+            # No index is negative, so truncation rounds down.
             col, row = (along[:, rows, None] + across[:, None, :]).astype(np.int32)
             found = self.cells.take(row * self.grid.cols + col, axis=0).astype(np.float32, copy=False)
             total += float(np.vdot(found, samples.weights[rows]))
@@ -154,13 +157,13 @@ class Patch:
 
 
 def _blocks(rows: int, cols: int) -> list[slice]:
-    """Rows of a view, as many at a time as stay in the cache while they are looked up."""
+    """Cut the rows of a view into parts that stay in the cache during look-up."""
     step = max(1, _AT_ONCE // cols)
     return [slice(start, start + step) for start in range(0, rows, step)]
 
 
 def _interleaved(bands: NDArray[Number]) -> NDArray[Number]:
-    """Cell by cell, shape (rows, cols, B'): with bands of zeros up to a power of two, which NumPy looks up faster."""
+    """Interleave bands, shape (rows, cols, B'), padded with zeros to a power of two, which NumPy looks up faster."""
     spare: int = (1 << (len(bands) - 1).bit_length()) - len(bands)
     merged = cv2.merge([*bands, *np.zeros((spare, *bands.shape[1:]), dtype=bands.dtype)])
     return np.asarray(merged, dtype=bands.dtype).reshape(*bands.shape[1:], -1)

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`random`: the control that guesses, by the query's id alone."""
+"""`random`: control that guesses, seeded by the id of the query."""
 
 import hashlib
 import math
 
 import numpy as np
 
-from sasgeo_baselines.answers import is_blind, ranked_candidates
-from sasgeo_baselines.places import middle_m
-from sasgeo_bench import MOST_CANDIDATES, WITHHELD, Grid, Match, MatcherCard, Pose, Query, Region
+from sasgeo_bench.bounds import MOST_CANDIDATES
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.controls.answers import is_blind, middle_m, ranked_candidates
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.tasks.query import Query
 
 
 class RandomPlaces:
-    """Places spread evenly over the prior's disc, or the map, with headings of the prior; candidates shuffled."""
+    """Draws places uniformly over the prior's disc, or the map, with headings of the prior; shuffles candidates."""
 
     card = MatcherCard(
         name="random",
@@ -29,12 +33,12 @@ class RandomPlaces:
         self._grid: Grid | None = None
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Keep the map's outline, for queries without a disc."""
+        """Keep the outline of the map for queries without a disc."""
         del learned
         self._grid = region.grid
 
     def match(self, query: Query, *, top_k: int) -> Match:
-        """Guess."""
+        """Return random poses."""
         if self._grid is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
@@ -66,11 +70,5 @@ class RandomPlaces:
 
 
 def generator(query_id: str) -> np.random.Generator:
-    """Chance for one query: the same for the same id, whatever was asked before.
-
-    Examples
-    --------
-    >>> bool(generator("one").random() == generator("one").random())
-    True
-    """
+    """Return the random generator of a query; it depends on the id alone."""
     return np.random.default_rng(int.from_bytes(hashlib.sha256(query_id.encode()).digest()[:16], "big"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chart: a region's layers as degrees of presence, made ready for reading squares of them at any coarseness."""
+"""Layers of a region as degrees of presence, read as squares in cells of any size."""
 
 import math
 from dataclasses import dataclass
@@ -9,16 +9,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Grid, Pose, Region
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.search.field import FULL
 
-FULL: Final = 255  # present without doubt; degrees are kept in steps of 1/255
-_NOTHING: Final = 6.5  # times the reach: less than 1e-9 is left
+_NOTHING: Final = 6.5  # times the reach: less than 1e-9 remains
 _DECIMALS: Final = 6  # of a place within its cell: the same on every copy of a piece of map
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """What a dense matcher reads of a map.
+    """Layers of a map as a dense matcher reads them.
 
     Parameters
     ----------
@@ -27,9 +30,9 @@ class Chart:
     classes : tuple of str
         Class names in band order.
     degree : ndarray of uint8, shape (C, rows, cols)
-        0 where a class is absent or nothing is known, up to `FULL` where it is present.
+        0 where a class is absent or the map is unknown, `FULL` where it is present.
     known : ndarray of uint8, shape (rows, cols)
-        `FULL` where the map says anything, else 0.
+        `FULL` where the map is known, else 0.
     """
 
     grid: Grid
@@ -56,47 +59,33 @@ class Chart:
         )
 
     def used(self) -> NDArray[np.bool_]:
-        """Which classes the map holds at all, shape (C,)."""
+        """Return which classes the map holds, shape (C,)."""
         return np.asarray(self.degree.reshape(len(self.degree), -1).max(axis=1) > 0)
 
     def square(self, row: int, col: int, size: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Degrees 0..1 of some classes, then of knowing, in a square that may reach beyond the map: there all is 0.
+        """Read a square of classes and, last, known cells, 0..1, shape (bands + 1, size, size); 0 beyond the map.
 
-        The result has shape (bands + 1, size, size); its first cell is (row, col) of the map.
+        Its first cell is (row, col) of the map.
         """
         return np.divide(self.steps(row, col, size, bands), np.float32(FULL), dtype=np.float32)
 
     def steps(self, row: int, col: int, size: int, bands: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Read a `square` as it is kept, in steps of 1 / `FULL`."""
+        """Read a `square` as stored, 0..`FULL`."""
         return np.stack([_window(layer, row, col, size) for layer in self._layers(bands)])
 
     def pooled(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Mean degrees over blocks of `factor` cells a side, shape (bands + 1, size, size)."""
+        """Return means over blocks of `factor` cells a side, shape (bands + 1, size, size)."""
         if factor == 1:
             return self.square(row, col, size, bands)
-        cuts = (self._cut(layer, row, col, size * factor) for layer in self._layers(bands))
+        cuts = (_window(layer, row, col, size * factor) / np.float32(FULL) for layer in self._layers(bands))
         return np.stack([cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) for cut in cuts])
 
     def under(
         self, pose: Pose, shape: tuple[int, int], bands: NDArray[np.int64], *, cell_size_m: float
     ) -> NDArray[np.uint8]:
-        """Show some classes as a perfect view from a pose would: the cells of `evidence.observe`, read from here.
+        """Return a perfect view of some classes from a pose, as `evidence.observe` does, shape (B, rows, cols).
 
-        Parameters
-        ----------
-        pose : Pose
-            Of the view.
-        shape : tuple of int
-            Its rows and columns.
-        bands : ndarray of int64, shape (B,)
-            Which classes.
-        cell_size_m : float
-            Metres a side of a view cell for scale 1.
-
-        Returns
-        -------
-        ndarray of uint8, shape (B, rows, cols)
-            ABSENT, PRESENT or UNKNOWN; beyond the map everything is UNKNOWN.
+        `shape` is that of the view, `cell_size_m` the side of its cells at scale 1. Beyond the map all is UNKNOWN.
         """
         place = self.grid.to_uv(np.array([(pose.easting_m, pose.northing_m)]))[0]
         whole = np.floor(place)
@@ -119,21 +108,17 @@ class Chart:
         return [*(self.degree[band] for band in bands), self.known]
 
     def blocks(self, row: int, col: int, size: int, factor: int, bands: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Some classes, then knowing, in a square of blocks of `factor` cells a side: 1 where any cell of one has it.
+        """Read classes and, last, known cells in blocks of `factor` cells a side: 1 where any cell of a block has it.
 
-        The result has shape (bands + 1, size, size); its first block begins at (row, col) of the map. Lines stay whole
-        that way, and houses closer than a block grow together.
+        The result has shape (bands + 1, size, size) and begins at (row, col) of the map. Lines stay connected; houses
+        closer than a block merge.
         """
         windows = (_window(layer, row, col, size * factor) for layer in self._layers(bands))
-        return np.stack([np.minimum(largest(window, factor), 1) for window in windows])
-
-    def _cut(self, layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.float32]:
-        """Square of one layer, 0..1."""
-        return np.asarray(np.divide(_window(layer, row, col, size), np.float32(FULL)), dtype=np.float32)
+        return np.stack([np.minimum(block_max(window, factor), 1) for window in windows])
 
 
 def _window(layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[np.uint8]:
-    """Square of one layer; 0 beyond it."""
+    """Cut a square of one layer, 0 beyond it."""
     found = np.zeros((size, size), dtype=np.uint8)
     rows, cols = layer.shape
     top, left, bottom, right = max(row, 0), max(col, 0), min(row + size, rows), min(col + size, cols)
@@ -142,12 +127,12 @@ def _window(layer: NDArray[np.uint8], row: int, col: int, size: int) -> NDArray[
     return found
 
 
-def largest(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Largest value of each block of `factor` cells a side; cells left over at the right and below are left out.
+def block_max(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Return the largest value of each block of `factor` cells a side; incomplete blocks are dropped.
 
     Examples
     --------
-    >>> largest(np.array([[0, 1, 0, 0, 1], [0, 0, 0, 0, 1]], dtype=np.uint8), 2).tolist()
+    >>> block_max(np.array([[0, 1, 0, 0, 1], [0, 0, 0, 0, 1]], dtype=np.uint8), 2).tolist()
     [[1, 0]]
     """
     rows, cols = (count // factor * factor for count in layer.shape)
@@ -158,19 +143,7 @@ def largest(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float32]:
-    """Presence that fades with the distance D to the nearest present cell: exp(-D^2 / (2 reach^2)).
-
-    Parameters
-    ----------
-    present : ndarray of bool, shape (rows, cols)
-        Where a class is.
-    reach_cells : float
-        Distance, in cells, at which 0.61 is left.
-
-    Returns
-    -------
-    ndarray of float32, shape (rows, cols)
-        1 where it is present, 0 everywhere if it is nowhere.
+    """Return exp(-D^2 / (2 reach^2)) of the distance D to the nearest present cell, shape (rows, cols); 0 without any.
 
     Examples
     --------
@@ -182,7 +155,7 @@ def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float3
     distance = cv2.distanceTransform(
         np.where(present, ABSENT, PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
     )
-    # D^2 is whole, so a table holds all there is; NumPy's exp rounds by where in memory an array happens to lie.
+    # D^2 is whole, so a table holds all values; rounding in NumPy's exp depends on memory alignment.
     squared = np.rint(np.minimum(distance, _NOTHING * reach_cells) ** 2).astype(np.int64)
     table = [math.exp(-k / (2 * reach_cells**2)) for k in range(int(squared.max()) + 1)]
     return np.asarray(np.array(table, dtype=np.float32)[squared], dtype=np.float32)

@@ -102,8 +102,11 @@ def takes(options: Callable[Words, Object]) -> Callable[[Callable[[Object], Resu
     """
 
     def decorate(function: Callable[[Object], Result]) -> Callable[Words, Result]:
+        """Return the function with the words of the options object as its keywords."""
+
         @wraps(function)
         def called(*args: Words.args, **words: Words.kwargs) -> Result:
+            """Build the options object, and call the function with it."""
             return function(options(*args, **words))
 
         kinds = flags_of(cast("type", options))
@@ -133,6 +136,7 @@ def with_flags(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def called(**words: Any) -> None:  # noqa: ANN401 - whatever the flags hold
+        """Build the options objects from the flags, and call the command with them."""
         made = {name: kind(**{flag: words.pop(flag) for flag in flags_of(kind)}) for name, kind in objects.items()}
         command(**made, **words)
 

@@ -167,6 +167,11 @@ def text_of(cell: Cell) -> str:
     return " ".join((cell.text, *(f"({mark.text})" for mark in cell.marks if mark.tone != "plain")))
 
 
+def sort_key(value: float) -> float | None:
+    """Return a number as the key of a cell; None for NaN."""
+    return None if math.isnan(value) else value
+
+
 def text_cells(*texts: str) -> tuple[Cell, ...]:
     """Return cells of plain text.
 

@@ -8,20 +8,11 @@ from typing import Any
 import pandas as pd
 
 from sasgeo_bench.errors import counted, named
-from sasgeo_bench.leaderboard.board_tables import (
-    Book,
-    contrast_table,
-    control_table,
-    cost_table,
-    falsifier_table,
-    rejection_tables,
-    sections_of,
-    seed_table,
-    step_tables,
-)
+from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of, step_tables
 from sasgeo_bench.leaderboard.columns import NOTE, TERMS
 from sasgeo_bench.leaderboard.reproduction import seed_lines
 from sasgeo_bench.leaderboard.tables import Table, text_of
+from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Verdict, verdict_frame

@@ -9,18 +9,12 @@ from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader
 
-from sasgeo_bench.leaderboard.board_tables import (
-    Book,
-    control_table,
-    cost_table,
-    rejection_tables,
-    sections_of,
-    seed_table,
-)
+from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE
 from sasgeo_bench.leaderboard.reproduction import seed_lines
 from sasgeo_bench.leaderboard.tables import file_stem
 from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
+from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.publishing.site_board import contrasts_of
 from sasgeo_bench.publishing.site_pages import (
     figures_by_kind,

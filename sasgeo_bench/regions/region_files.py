@@ -101,10 +101,12 @@ def read_region(folder: Path, *, around: Callable[[], AbstractContextManager[obj
         _check_file(folder / name, manifest.files[name])
 
     def features() -> "gpd.GeoDataFrame":
+        """Read the features when they are first used."""
         with around():
             return check_features(_read_geometry(folder / FEATURES))
 
     def graph() -> MapGraph:
+        """Read the graph when it is first used."""
         with around():
             return MapGraph(nodes=_read_geometry(folder / NODES), edges=read_frame(folder / EDGES, mend=_MEND))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who was asked what, and what they answered: the entries of a board with their answers to its tasks."""
+"""Entries of a board with their answers to its tasks: read, validate and score them."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,11 +26,11 @@ MOST_NAMED: Final = 3  # runs that are left out; the others are counted
 
 @dataclass(frozen=True, kw_only=True)
 class Told:
-    """One contestant and its answers to the tasks of a board.
+    """One entry and its answers to the tasks of a board.
 
-    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
-    file is asked all tasks, and brings those that it holds an answer to; a submission is asked those that it names.
-    `entry` has only the runs that count.
+    `asked` are the folders of tasks whose queries it was asked, answered or not; `held` are those it brings to a board
+    that names no tasks. A file is asked all tasks and brings those it answers; a submission is asked the tasks it
+    names. `entry` holds only the runs that count.
     """
 
     entry: Entry
@@ -48,29 +48,29 @@ def read_told(
     tell: Callable[[str], None],
     failures: Failures,
 ) -> list[Told]:
-    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves.
+    """Return the answers of all entries; skip runs of other queries, or refuse them where the user named them.
 
     Parameters
     ----------
     entries : sequence of Entry
-        Who.
+        Entries of the board.
     folders : sequence of Path
-        Of tasks; without any, those that runs were made on, and that files hold answers to.
+        Task folders; if empty, those that runs were made on and that files answer.
     root : Path
-        Where tasks/ is.
+        Parent of tasks/.
     named : sequence of Path
         Folders and files that the user named.
     tell : callable
-        Gets a line for what is left out.
+        Receives a line about skipped runs.
     failures : Failures
-        Takes note of those whose answers cannot be read, who are then left out.
+        Records entries whose answers cannot be read; they are skipped.
 
     Raises
     ------
     StoreError
-        If a run that is named by itself answers none of the queries.
+        If a run that the user named answers none of the queries.
     ConfigError
-        If nobody answers any task.
+        If no entry answers any task.
     """
     files: dict[str, dict[str, Prediction]] = {}
     for entry in entries:
@@ -110,7 +110,7 @@ def read_told(
 
 
 def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None) -> tuple[Told, list[Path]]:
-    """A contestant with its answers; the folders of those of its runs that answer none of the tasks."""
+    """Return an entry with its answers, and the folders of its runs that answer none of the tasks."""
     if rows is None:
         return _read_runs(entry, tasks)
     held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
@@ -118,7 +118,7 @@ def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Predictio
 
 
 def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
-    """Folders of the tasks that a file or a submission is asked."""
+    """Return the folders of the tasks that a file or a submission is asked."""
     if entry.submission is None:
         return frozenset(task.folder for task in tasks)
     named = {(item.suite, item.region) for item in entry.submission.tasks}
@@ -130,7 +130,7 @@ def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
 
 
 def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Path]]:
-    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
+    """Return an entry with the answers of its runs, and the folders of runs that answer none of the tasks."""
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
     rows: dict[str, Prediction] = {}
     runs: list[tuple[Path, Mapping[str, Any]]] = []
@@ -155,14 +155,14 @@ def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Pat
 
 
 def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Mapping[str, Any]:
-    """What a run took, of its processor seconds the share of the answers that count."""
+    """Return the run record with CPU time scaled to the fraction of answers that count."""
     if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
         return about
     return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
 
 
 def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
-    """Task folders that runs were made on."""
+    """Return the task folders that runs were made on."""
     names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
     folders = [root / "tasks" / suite / region for suite, region in names]
     return [folder for folder in folders if (folder / task_files.TASK).is_file()]
@@ -176,25 +176,25 @@ def score_told(
     by_region: Collection[str],
     failures: Failures,
 ) -> dict[str, pd.DataFrame]:
-    """Scored rows by contestant, of those whose answers can be scored.
+    """Return scored rows by entry name; `failures` records entries that cannot be scored.
 
     Parameters
     ----------
     told : sequence of Told
-        Contestants with their answers.
+        Entries with their answers.
     tasks : sequence of ScoredTask
-        What was asked, with truths.
+        Queries with truths.
     split : Split, optional
-        Says which blocks are one place.
+        Assigns blocks to places.
     by_region : collection of str
-        Suites whose regions are resampled, not their blocks.
+        Suites that are resampled by region instead of by block.
     failures : Failures
-        Takes note of the others.
+        Records the entries that are skipped.
 
     Raises
     ------
     StoreError, ConfigError
-        The first fault, if nobody is left.
+        The first fault, if no entry is left.
     """
     folders, found = [task.folder for task in tasks], {}
     for item in told:
@@ -210,12 +210,12 @@ def score_told(
 
 
 def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse a file or submission that is not what the tasks ask for; queries without a row are misses.
+    """Check a file or submission against the tasks; a query without a row is a miss, not a fault.
 
     Raises
     ------
     ConfigError
-        With the first fault, and how many there are.
+        With the first fault, and the number of faults.
     StoreError
         If it cannot be read.
     """
@@ -232,7 +232,7 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
 
 
 def _scored(told: Told, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]) -> pd.DataFrame:
-    """All tasks that one contestant was asked, one row for each query."""
+    """Return one row per query of all tasks that an entry was asked."""
     place_of = {} if split is None else split.place_of
     frames = []
     for task in tasks:

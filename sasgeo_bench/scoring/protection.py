@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that say whether protection levels hold: a Stanford diagram counted for each method, risk and alert limit."""
+"""Rows of protection levels: Stanford diagrams counted for each method, risk and alert limit."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -33,32 +33,26 @@ COLUMNS: Final = (
 def protection_frame(
     matcher: str, scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
 ) -> pd.DataFrame:
-    """How the protection levels of one matcher fared, all suites of localization together.
+    """Return how the protection levels of one matcher held, pooled over all suites of localization.
 
     Parameters
     ----------
     matcher : str
-        Its name.
+        Name.
     scores : pandas.DataFrame
-        Its scored rows.
+        Scored rows.
     predictions : mapping of str to Prediction
-        The same answers by query id, with levels among their diagnostics (`sasgeo.protection.PROTECTION`).
+        The same answers by query id, with levels in their diagnostics (`sasgeo.protection.PROTECTION`).
     split : Split, optional
-        Says which places calibrate conformal levels; without, there are none. Of a hold-out split the test part counts.
+        Assigns the places that calibrate conformal levels; without it there are none. Of a hold-out split the test part
+        counts.
 
     Returns
     -------
     pandas.DataFrame
-        A row for each prior group, method, risk and alert limit, columns those of `COLUMNS`; none where no answer tells
-        a level. Shares are of all queries, an answer without a level is unavailable, one where the place is absent has
-        an infinite error. Intervals are Wilson's of as many trials as there are sites. `supports` says in words what
-        misleading ones among the available support.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.scoring.score import score_task
-    >>> len(protection_frame("mine", score_task([], [], {}), {}))
-    0
+        A row for each prior group, method, risk and alert limit, with the columns `COLUMNS`; empty if no answer has a
+        level. Shares are of all queries: an answer without a level is unavailable, one at an absent place has an
+        infinite error. Intervals are Wilson's over sites. `supports` states in words which risk the counts support.
     """
     rows = [
         {"matcher": matcher, "prior_group": item.prior_group, **row}
@@ -70,16 +64,16 @@ def protection_frame(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ToldLevels:
-    """Protection levels of one method at one risk, beside the errors; arrays have shape (N,).
+    """Protection levels of one method at one risk, with the errors; arrays have shape (N,).
 
     Parameters
     ----------
     prior_group, method : str
-        Of which queries, and how the levels are found.
+        Prior group of the queries, and method of the levels.
     risk : float
-        The levels are stated for.
+        Risk that the levels are stated for.
     level_m, error_m : ndarray of float
-        Metres; infinite where there is none, see `protection_frame`.
+        Metres; infinite if missing, see `protection_frame`.
     sites : ndarray of str
         `pair_id` of each query.
     """
@@ -95,18 +89,9 @@ class ToldLevels:
 def told_levels(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
 ) -> Iterator[ToldLevels]:
-    """Protection levels of one matcher, query by query; parameters as of `protection_frame`.
+    """Yield the protection levels of one matcher per query, for each prior group, risk and method with a level.
 
-    Yields
-    ------
-    ToldLevels
-        For each prior group, risk and method of which some answer tells a level.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.scoring.score import score_task
-    >>> list(told_levels(score_task([], [], {}), {}))
-    []
+    Parameters are those of `protection_frame`.
     """
     usable = scores[(scores["status"] != NOT_APPLICABLE) & (scores["track"] == "localization")]
     for prior_group, group in usable.groupby("prior_group", sort=True):
@@ -122,7 +107,7 @@ def _levels_of_group(
     sites = group["pair_id"].to_numpy(str)
 
     def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ToldLevels:
-        """The queries that count."""
+        """Select the queries that count."""
         return ToldLevels(
             prior_group=prior_group,
             method=method,
@@ -143,13 +128,13 @@ def _levels_of_group(
 
 
 def _errors_m(group: pd.DataFrame) -> Floats:
-    """Error of each query; infinite without an answer, and for an answer where nothing is right."""
+    """Return the error of each query; infinite without an answer, and for an answer at an absent place."""
     error_m = group["position_error_m"].to_numpy(float)
     return np.where(np.isnan(error_m), np.inf, error_m)
 
 
 def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
-    """A level or scale that each answer tells; infinite where there is none, or what is told cannot be one."""
+    """Return the level or scale in each answer's diagnostics; infinite if missing or not positive."""
     answered = zip(group["query_id"], group["is_answered"], strict=True)
     told = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
     values = np.array(told, dtype=np.float64)
@@ -159,7 +144,7 @@ def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str)
 def _conformal(
     group: pd.DataFrame, split: Split, scale_m: Floats, error_m: Floats, risk: float
 ) -> tuple[Floats, Bools]:
-    """Levels by a factor that is fitted on other places, and which queries have one that could be fitted."""
+    """Return levels by a factor fitted on other places, and a mask of the queries with a fit."""
     level_m, is_fitted = np.full(len(group), np.inf), np.zeros(len(group), dtype=bool)
     for turn in turns(group, split):
         known = turn.calibration & np.isfinite(scale_m)
@@ -170,7 +155,7 @@ def _conformal(
 
 
 def _counted(told: ToldLevels) -> Iterator[dict[str, Any]]:
-    """A row for each alert limit; none where nothing was tested."""
+    """Yield a row for each alert limit; none without queries."""
     if not len(told.level_m):
         return
     sites = effective_count(np.unique(told.sites, return_inverse=True)[1])
@@ -190,6 +175,6 @@ def _shares(counts: StanfordCounts) -> dict[str, float]:
 
 
 def _supports(counts: StanfordCounts, risk: float) -> str:
-    """What the misleading ones among the available support, both counted in sites."""
+    """Return what the misleading ones among the available support, both counted in sites."""
     available = counts.available.value * counts.trials
     return statement(min(counts.misleading.value * counts.trials, available), available, risk=risk)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What rejectors say of the answers of many contestants, and the figures of it, by several processes."""
+"""Outputs of rejectors for the answers of many entries, with their metrics, in parallel processes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from sasgeo_bench.tasks.split import Split
 
 @dataclass(frozen=True, kw_only=True)
 class Judging:
-    """Answers of one contestant that rejectors are to judge.
+    """Answers of one entry to evaluate with rejectors.
 
     Parameters
     ----------
@@ -27,11 +27,11 @@ class Judging:
     predictions : mapping of str to Prediction
         Its answers, by query.
     rules : mapping of str to Rule
-        Rejectors by name; its own word is always among them.
+        Rejectors by name; its own confidence is always added.
     split : Split, optional
-        Says which places calibrate.
+        Assigns calibration places.
     is_taught : bool
-        Whether it has learnt from other places of the split.
+        True if it was trained on other places of the split.
     """
 
     matcher: str
@@ -44,7 +44,11 @@ class Judging:
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """What came of it: by rejector what it says (`judge`), rows of the board, why some were not applied, or failed."""
+    """Result for one entry.
+
+    By rejector: the rows of `judge`, and the errors of those that failed. Then rows of the board, and lines that say
+    why rejectors were not applied.
+    """
 
     matcher: str
     said: Mapping[str, pd.DataFrame]
@@ -54,30 +58,12 @@ class Judged:
 
 
 def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]:
-    """Have all of them judged, by several processes if there are several jobs; no figure hangs on how many there are.
-
-    Parameters
-    ----------
-    judgings : sequence of Judging
-        One for each contestant.
-    jobs : int
-        Processes.
-
-    Yields
-    ------
-    Judged
-        One for each, in their order.
-
-    Examples
-    --------
-    >>> list(carry_out([], jobs=2))
-    []
-    """
+    """Yield the result of each task in order; the number of processes does not affect it."""
     yield from spread(judged, judgings, jobs=jobs)
 
 
 def judged(judging: Judging) -> Judged:
-    """What the rejectors say of one contestant, its own word among them; no row where one is not applied."""
+    """Apply all rejectors to one entry, and its own confidence; a rejector that is not applied has no rows."""
     said, rows, lines, failed = {}, [], [], {}
     for name in (OWN, *judging.rules):
         try:
@@ -95,7 +81,7 @@ def judged(judging: Judging) -> Judged:
 
 
 def _said(judging: Judging, name: str) -> pd.DataFrame:
-    """What a rejector says of the answers, or a matcher itself."""
+    """Return the rows of a rejector, or of the matcher's own confidence."""
     if name == OWN:
         return own_word(judging.scores, judging.split, is_taught=judging.is_taught)
     rule = judging.rules[name]
@@ -103,6 +89,6 @@ def _said(judging: Judging, name: str) -> pd.DataFrame:
 
 
 def _figures(judging: Judging, name: str, frame: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the board; its own word is taken for a probability."""
+    """Return rows of the board; a matcher's own confidence counts as a probability."""
     is_calibrated = name == OWN or judging.rules[name].card.is_calibrated
     return to_frame(list(integrity_rows(judging.matcher, name, frame, is_calibrated=is_calibrated)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions held against truths: one scored row for every query, whether it was answered or not."""
+"""Scored rows: one for every query of a task, answered or not."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,36 +27,36 @@ _NO_ERROR: Final[Errors] = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
-    """One query of one matcher, scored.
+    """One scored query of one matcher.
 
     Parameters
     ----------
     query_id, track, suite, suite_version, part, region, prior_group, view_cells, cell_size_m
         Of the query.
     pool : int
-        Candidates to choose from; 0 for localization.
+        Number of candidates; 0 for localization.
     place : str
-        What stays together in the split; the region where no split is given.
+        Unit of the split; the region without a split.
     block, pair_id, role, kind, strength, strength_unit, scene
         Of the truth; so are unknown_share, changed_share, feature_density and alias_index.
     is_present : bool
-        Whether there is something to be right about.
+        The place is on the map.
     status : str
-        Of the prediction, or "missing". "not applicable" only where all queries of the same suite, track and prior
-        group are: else whoever answers could choose what to be asked.
+        Of the prediction, or "missing". "not applicable" must cover all queries of a suite, track and prior group, so
+        that a submission cannot choose its queries.
     is_answered : bool
-        Whether there is a fix that could be accepted.
+        There is a fix that could be accepted.
     above, tied, right : int
         Rank of the right candidate (`ranking.Rank`); 0, 0, 0 for a miss and for localization.
     position_error_m, yaw_error_deg, log_scale_error : float
-        Of the first pose, for localization of a place that is present; infinite without an answer, else NaN.
+        Of the first pose, for localization of a present place; infinite without an answer, else NaN.
     is_right : bool
-        Whether the fix lies within `FIX_M` of where the view was taken (Eq. 12); never for an absent place. In
-        retrieval, too: a pick beside the right candidate is no false fix if it is that near, though no hit.
+        The fix lies within `FIX_M` of the true position (Eq. 12); never for an absent place. In retrieval too: a wrong
+        candidate within that distance is no hit, but no false fix either.
     confidence : float
-        What the matcher says; NaN where it does not.
+        Of the prediction; NaN if missing.
     latency_s : float
-        NaN where it is not known.
+        NaN if unknown.
     """
 
     query_id: str
@@ -121,17 +121,12 @@ def score_task(
     Returns
     -------
     pandas.DataFrame
-        A row for each query, the columns those of `Score`, in the order of the queries.
+        A row for each query in order, with the columns of `Score`.
 
     Raises
     ------
     MetricError
         If a query has no truth or a prediction belongs to no query.
-
-    Examples
-    --------
-    >>> score_task([], [], {}).columns[0]
-    'query_id'
     """
     by_id = {truth.query_id: truth for truth in truths}
     asked = list(heads)
@@ -153,7 +148,7 @@ def score_task(
 
 
 def _errors(truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
-    """Metres, degrees and logarithm of the scale of each first pose; NaN where there is no pose to be right about."""
+    """Return metres, degrees and logarithm of the scale of each first pose; NaN without a true pose."""
     found = [_NO_ERROR] * len(truths)
     asked = [(at, truth.pose) for at, truth in enumerate(truths) if truth.is_present and truth.pose is not None]
     errors = pose_errors([first_pose(told[at]) for at, _ in asked], [pose for _, pose in asked])
@@ -211,7 +206,7 @@ def _score(
 
 
 def _rank(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
-    """Rank of the right candidate; the full comparison only where another candidate lies on the same spot."""
+    """Return the rank of the right candidate; compare all candidates only if another one shares its position."""
     right = candidates[truth.candidate]
     twins = sum(_is_at(other, right, within_m=2 * SAME_PLACE_M) for other in candidates)
     if twins > 1:
@@ -227,20 +222,9 @@ def _is_at(pose: Pose, place: Pose, *, within_m: float = SAME_PLACE_M) -> bool:
 
 
 def settle_not_applicable(scores: pd.DataFrame) -> pd.DataFrame:
-    """Take "not applicable" for a miss where not all queries of the same suite, track and prior group are.
+    """Return the rows with "not applicable" as "missing" unless it covers a whole suite, track and prior group.
 
-    A card names what a matcher needs, and that is the same for all of them; a file that leaves out single queries would
-    choose what it is asked.
-
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Of one matcher, all tasks.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A copy with the status "missing" where it was claimed for a part.
+    A card's requirements are the same for all of these; a file that omits single queries would choose its queries.
     """
     claimed = scores["status"] == NOT_APPLICABLE
     group = [scores["suite"], scores["track"], scores["prior_group"]]

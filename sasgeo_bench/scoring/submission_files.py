@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A submission on disk: `submission.json` and one file of predictions; it may be anyone's, so nothing in it is trusted.
+"""Submissions on disk: `submission.json` and one file of predictions, by authors who are not trusted.
 
-All that is cheap to look at is looked at before anything is read: names, links, sizes, then hashes, then the shape of
-the table.
+Cheap checks come first: names, links, sizes, then hashes, then the shape of the table.
 """
 
 import os
@@ -43,7 +42,7 @@ def read_card(path: Path) -> Card:
     StoreError
         If it cannot be read.
     ConfigError
-        If something in it is wrong; all faults on one line.
+        If a field is wrong; all faults on one line.
     """
     text = _text_of(path, _MOST_CARD_BYTES, "a card (submit --example-card prints one)")
     return parse_toml(text, Card, source=str(path))
@@ -65,42 +64,36 @@ def _text_of(path: Path, most_bytes: int, noun: str) -> str:
 
 
 def predictions_name(name: str) -> str:
-    """Path of the predictions inside a submission.
-
-    Examples
-    --------
-    >>> predictions_name("mine")
-    'predictions/mine.parquet'
-    """
+    """Return the path of the predictions inside a submission."""
     return f"{PREDICTIONS}/{name}.parquet"
 
 
 def write_submission(
     folder: Path, said: Submission, predictions: Sequence[Prediction], asked: Mapping[str, str]
 ) -> Submission:
-    """Write a submission, whole or not at all; the same answers give the same bytes.
+    """Write a submission completely or not at all; the same answers give the same bytes.
 
     Parameters
     ----------
     folder : Path
-        To write, named as the card is; an older submission there is replaced.
+        Has the name of the card; an older submission there is replaced.
     said : Submission
-        What `submission.json` says, but for the files.
+        Content of `submission.json`, without the files.
     predictions : sequence of Prediction
         The answers.
     asked : mapping of str to str
-        By query id, the hash of what each answers.
+        Hash of each answered query, by query id.
 
     Returns
     -------
     Submission
-        What `submission.json` says.
+        Content of `submission.json`.
 
     Raises
     ------
     StoreError
-        If the folder holds something else or has another name, the predictions are too large, or the disk refuses; what
-        was there is as it was.
+        If the folder holds something else or has another name, the predictions are too large, or writing fails; the
+        folder is then unchanged.
     """
     if folder.name != said.card.name:
         message = f"{folder} must be named as the card is, {said.card.name!r}: name another folder"
@@ -141,18 +134,12 @@ def _check_bytes(folder: Path, size: int) -> None:
 
 
 def is_submission(folder: Path) -> bool:
-    """Whether a folder says that it is a submission.
-
-    Examples
-    --------
-    >>> is_submission(Path("nowhere"))
-    False
-    """
+    """Return True if a folder holds a `submission.json`."""
     return os.path.lexists(folder / SAID)
 
 
 def list_submissions(folder: Path) -> tuple[Path, ...]:
-    """A submission itself, or all that lie in a folder, by name; what is hidden, and its README, are none.
+    """Return a submission itself, or all in a folder by name, without hidden files and the README.
 
     Raises
     ------
@@ -173,14 +160,14 @@ def list_submissions(folder: Path) -> tuple[Path, ...]:
 
 
 def read_submission(folder: Path) -> Submission:
-    """What a submission says, after its folder was held against it.
+    """Read a submission after checking its folder.
 
     Raises
     ------
     StoreError
-        If a file is missing, unknown, a link, too large or not what its hash says, or holds no predictions.
+        If a file is missing, unknown, a link, too large, differs from its hash, or holds no predictions.
     ConfigError
-        If something that `submission.json` says is wrong; all faults on one line.
+        If a field of `submission.json` is wrong; all faults on one line.
     """
     _check_names(folder, {SAID, PREDICTIONS})
     said = _read_said(folder / SAID)
@@ -200,7 +187,7 @@ def read_submission(folder: Path) -> Submission:
 
 
 def _check_names(folder: Path, expected: set[str]) -> None:
-    """Refuse a folder that holds anything but what it must, and every link: it may lead anywhere."""
+    """Refuse a folder with other names than expected, and every link: it may lead anywhere."""
     if folder.is_symlink() or not folder.is_dir():
         message = f"{folder} is no folder of a submission: make it by 'submit'"
         raise StoreError(message)
@@ -218,7 +205,7 @@ def _check_names(folder: Path, expected: set[str]) -> None:
 
 
 def _is_plain(entry: os.DirEntry[str]) -> bool:
-    """Whether it is a file, or the folder of the predictions; a link, pipe or device is neither."""
+    """Return True for a file or the predictions folder, False for a link, pipe or device."""
     is_folder = entry.name == PREDICTIONS
     return entry.is_dir(follow_symlinks=False) if is_folder else entry.is_file(follow_symlinks=False)
 
@@ -249,7 +236,7 @@ def _check_file(path: Path, said: FileSaid) -> None:
 
 
 def _check_table(path: Path) -> None:
-    """Refuse a table of another shape, and one that unpacks to more than anyone has to say."""
+    """Refuse a table of another shape, and one that decompresses to overlong texts."""
     with open_table(path, mend="submit again") as source:
         _check_schema(path, source.schema_arrow)
     with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:

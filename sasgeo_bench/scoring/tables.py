@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scored rows of some matchers -> the leaderboard: figures with intervals, denominators and ranks."""
+"""The leaderboard from scored rows: metrics with intervals, denominators and ranks."""
 
-import hashlib
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,13 +12,12 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Bools, Floats, Ints
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
 from sasgeo_bench.scoring.cost import Costs
-from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
+from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.intervals import Interval, bootstrap_means, effective_count, share_interval
 from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
-from sasgeo_bench.scoring.pose import error_quantile
 from sasgeo_bench.scoring.power import sensitivity
 from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, is_unranked, side_by_side, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
@@ -36,16 +34,16 @@ def leaderboard(
     apart: Collection[str] = (),
     done: Callable[[], None] = lambda: None,
 ) -> pd.DataFrame:
-    """Figures of every matcher on every suite, track, prior group and stratum.
+    """Return the metrics of every matcher on every suite, track, prior group and stratum.
 
     Parameters
     ----------
     scored : mapping of str to pandas.DataFrame
         By matcher, from `score.score_task`; all hold the same queries.
     draws : int
-        Of the bootstrap.
+        Number of bootstrap draws.
     apart : collection of str
-        Matchers that have figures and no rank, and are nobody's rivals; controls are so in any case.
+        Matchers without a rank, which are nobody's rivals; controls are always so.
     done : callable
         Called after each suite, track and prior group.
 
@@ -65,7 +63,7 @@ def leaderboard(
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """The frames with their rows in one order."""
+    """Return the frames with their rows in one order."""
     frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
     first = next(iter(frames.values()), None)
     for name, frame in frames.items():
@@ -76,7 +74,7 @@ def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 
 
 def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str, str], dict[str, pd.DataFrame]]]:
-    """Suite, track and prior group, with the rows of each matcher."""
+    """Yield suite, track and prior group, with the rows of each matcher."""
     if not frames:
         return
     first = next(iter(frames.values()))
@@ -90,8 +88,8 @@ def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str
 class _Group:
     """Queries of one suite, track and prior group as columns: shape (N,), or (N, M) for M matchers.
 
-    What is the same in every part of them is worked out once: values of metrics by name, errors by column, and codes
-    of blocks, places and sites in the order of their names.
+    It caches what all strata share: values of metrics by name, errors by column, and codes of blocks, places and sites
+    in the order of their names.
     """
 
     key: tuple[str, str, str]
@@ -108,13 +106,12 @@ class _Group:
 
     @classmethod
     def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
-        """Columns of the rows of some matchers, of which some stand beside the ranks."""
+        """Return the columns of some matchers' rows; `unranked` matchers are no rivals."""
         first = next(iter(frames.values()))
         columns = dict.fromkeys(quantile.column for quantile in QUANTILES)
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
 
         def beside(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
-            """A column of each matcher, side by side."""
             return np.column_stack([np.asarray(column(frame)) for frame in frames.values()])
 
         return cls(
@@ -138,7 +135,7 @@ def _floats(frame: pd.DataFrame, name: str) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Cell:
-    """Some queries of a group: `chosen` are their numbers in it."""
+    """Queries of a group: `chosen` are their positions in it."""
 
     group: _Group
     stratum: str
@@ -147,12 +144,11 @@ class _Cell:
 
     @property
     def seed(self) -> int:
-        """Of these queries alone, so that all matchers are drawn alike."""
-        text = "/".join((*self.group.key, self.stratum))
-        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+        """Return the seed, a function of the queries alone, so that all matchers share draws."""
+        return seed_of_text("/".join((*self.group.key, self.stratum)))
 
     def keys(self) -> list[RowKey]:
-        """Return what the rows of each matcher share."""
+        """Return the row key of each matcher."""
         suite, track, prior_group = self.group.key
         blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
         return [
@@ -195,7 +191,7 @@ def _rows_of_group(
 
 
 def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -> Row:
-    """The one row of a matcher that cannot."""
+    """Return the only row of a matcher that cannot do the task."""
     suite, track, prior_group = key
     primary = primary_of(track)
     row_key = RowKey.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
@@ -203,7 +199,7 @@ def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -
 
 
 def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
-    """Means that share a denominator, by the same draws."""
+    """Yield rows of means that share a denominator and draws."""
     group, count = cell.group, len(cell.group.names)
     keys, sites = cell.keys(), group.sites[cell.chosen]
     trials = effective_count(sites)
@@ -225,9 +221,9 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Below:
-    """A quantile of the errors of one matcher (its number), and which errors lie below it.
+    """A quantile of the errors of one matcher (its index), and which errors lie below it.
 
-    Errors that equal it count in proportion, so that the mean is the quantile's share even where many are infinite.
+    Errors equal to it count in proportion, so that the mean is the quantile's share even where many are infinite.
     """
 
     matcher: int
@@ -237,30 +233,30 @@ class _Below:
 
 
 def _thresholds(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[_Below]:
-    """Quantiles of errors, whose intervals are those of the share below them, read backwards (Woodruff 1952)."""
+    """Yield quantiles of errors; their intervals invert those of the share below them (Woodruff 1952)."""
     is_pose = cell.group.key[1] == "localization" and any(metric.is_primary for metric in metrics)
     if not is_pose or cell.stratum not in _WHOLE:
         return
     for at in range(len(cell.group.names)):
         for quantile in QUANTILES:
             errors = cell.group.errors[quantile.column][cell.chosen, at]
-            value = error_quantile(errors, quantile.share)
+            value = weighted_quantile(errors, quantile.share)
             is_below, is_equal = errors < value, errors == value
             part = np.clip((quantile.share - is_below.mean()) / is_equal.mean(), 0.0, 1.0)
             yield _Below(matcher=at, quantile=quantile, value=value, is_below=is_below + part * is_equal)
 
 
 def _inverse(errors: Floats, share: float) -> float:
-    """Least error that a share of the queries does not exceed; 0 and infinity beyond the shares there are."""
+    """Return the least error that a share of the queries does not exceed; 0 and infinity beyond the range of shares."""
     if math.isnan(share):
         return math.nan
-    return error_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
+    return weighted_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
 
 
 def _ranked(
     cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, table: Floats, means: Floats, trials: float
 ) -> Iterator[Row]:
-    """Rows of one metric; of the primary one with ranks."""
+    """Yield the rows of one metric, with ranks for the primary one."""
     names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
     found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
     is_decidable = metric.is_primary and keys[0].blocks >= LEAST_BLOCKS
@@ -280,7 +276,7 @@ def _ranked(
 
 
 def _ranks(group: _Group, values: Sequence[float], means: Floats, metric: MeanMetric) -> dict[str, RankInterval]:
-    """Rank intervals of all rivals."""
+    """Return the rank intervals of all rivals."""
     chosen = [group.names.index(name) for name in group.rivals]
     if not chosen:
         return {}
@@ -289,7 +285,7 @@ def _ranks(group: _Group, values: Sequence[float], means: Floats, metric: MeanMe
 
 
 def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
-    """Least difference from the best other rival that would be found."""
+    """Return the detectable difference from the best other rival."""
     others = [group.names.index(other) for other in group.rivals if other != name]
     if not others or name not in group.rivals:
         return math.nan

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions held against the tasks they answer: every violation by row and column, found and expected."""
+"""Validation of predictions against the tasks they answer: every violation with row, column, found and expected."""
 
 import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ _NO_ROW: Final = "no row for "
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Violation:
-    """One fault: the file, the row's number in it (from 0; -1 for the whole file), the column, found and expected."""
+    """One fault: file, row index (-1 for the whole file), column, found and expected."""
 
     file: str
     row: int
@@ -40,11 +40,11 @@ class Violation:
 
     @property
     def is_missing_row(self) -> bool:
-        """Whether it says that a query has no row."""
+        """Return True if the fault is a query without a row."""
         return self.found.startswith(_NO_ROW)
 
     def to_text(self) -> str:
-        """One line.
+        """Return the fault in one line.
 
         Examples
         --------
@@ -56,20 +56,15 @@ class Violation:
 
 
 def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
-    """Hold predictions against tasks.
+    """Yield the violations of predictions in the order of the rows, queries without a row last.
 
     Parameters
     ----------
     path : Path
-        A predictions file, or a run's folder of parts, newest first; there a query may have been asked again.
+        A predictions file, or a run's folder of parts, newest first, where a newer row replaces an older one.
     tasks : sequence of Path
-        Task folders that it should answer, and no others; rows of a run's folder that say they answer something else
-        are passed over (`set_aside` counts them).
-
-    Yields
-    ------
-    Violation
-        In the order of the rows; queries without a row come last, unless a file could not be read by its columns.
+        Task folders that it should answer, and no others. Rows of a run's folder that state other queries are skipped
+        (`set_aside` counts them).
 
     Raises
     ------
@@ -108,26 +103,20 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 def submission_faults(
     folder: Path, said: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
 ) -> Iterator[Violation]:
-    """Hold a submission against the tasks of a board; its folder and hashes are `read_submission`'s business.
+    """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
     Parameters
     ----------
     folder : Path
-        Of the submission.
+        Of the submission; `read_submission` has checked its files.
     said : Submission
         From `read_submission`.
     tasks : sequence of Path, optional
-        Task folders of the board; those that the submission does not name are passed over. Without any, the rows are
-        held against nothing.
+        Task folders of the board, of which those that the submission names count. Without tasks, rows are not checked.
     board : str
-        Id of the board; empty where nobody says it.
+        Id of the board; empty if unknown.
     places : collection of str
-        Of the board's split; without any, what the card says of training is not looked at.
-
-    Yields
-    ------
-    Violation
-        Faults of what it says, then of its rows; last, as of a file, the queries without a row, which are misses.
+        Places of the board's split; if empty, declared training places are not checked.
 
     Raises
     ------
@@ -164,7 +153,7 @@ def submission_faults(
 
 
 def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
-    """What a submission says of itself that does not fit a board."""
+    """Yield the fields of a submission that do not fit a board."""
     if said.task_version not in TASK_VERSIONS:
         yield Violation(
             file=SAID,
@@ -193,7 +182,7 @@ def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iter
 
 
 def set_aside(path: Path, tasks: Sequence[Path]) -> int:
-    """How many answers of a run's folder are to queries that the tasks do not hold, or do not hold as they were.
+    """Return how many answers of a run's folder are to queries that the tasks do not hold in this form.
 
     Raises
     ------
@@ -223,7 +212,7 @@ def _name_of(task: Path) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Asked:
-    """A query, and where its answers may lie; None for retrieval, which says it by candidates, or without a map."""
+    """A query and the bounds of its answers; None for retrieval, which is checked by candidates, or without a map."""
 
     head: Head
     bounds_m: Bounds | None
@@ -234,7 +223,7 @@ def _asked_of(tasks: Sequence[Path]) -> dict[str, _Asked]:
 
 
 def _queries(task: Path) -> Iterator[_Asked]:
-    """Queries of a task that this program can read; what was seen is no matter, and stored results hold none of it."""
+    """Yield the queries of a task; views are not read, since stored results lack them."""
     _, region = _name_of(task)
     bounds_m = _bounds_m(task.resolve().parents[2] / "regions" / region)
     by_group: dict[str, Bounds] = {}
@@ -246,7 +235,7 @@ def _queries(task: Path) -> Iterator[_Asked]:
 
 
 def _bounds_m(region: Path) -> Bounds | None:
-    """Where a region lies; None where its map is not beside the tasks."""
+    """Return the bounds of a region; None if its map is missing."""
     try:
         return read_manifest(region).bounds_m
     except StoreError:
@@ -254,14 +243,14 @@ def _bounds_m(region: Path) -> Bounds | None:
 
 
 def _reach_m(bounds_m: Bounds, group: PriorGroup) -> Bounds:
-    """The region, and what a disc of a prior can hold beyond its rim: at most its diameter."""
+    """Return the bounds of a region, extended by the diameter of the prior's disc."""
     more_m = 2 * (group.radius_m or 0.0)
     west, south, east, north = bounds_m
     return west - more_m, south - more_m, east + more_m, north + more_m
 
 
 def _faults_by_row(file: str, table: pa.Table) -> dict[int, list[Violation]]:
-    """Numbers, names and texts out of their bounds."""
+    """Return numbers, names and texts out of their bounds, by row."""
     found: dict[int, list[Violation]] = {}
     for one in row_faults(table):
         wrong = Violation(file=file, row=one.row, column=one.column, found=one.found, expected=one.expected)
@@ -307,7 +296,7 @@ def _row_faults(
 
 
 def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) -> Iterator[Violation]:
-    """What is wrong with the answer itself."""
+    """Yield the faults of the answer itself."""
     try:
         prediction = prediction_of(item)
         match = Match(
@@ -324,7 +313,7 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) 
 
 
 def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:
-    """Refuse a place neither in the region nor where a prior's disc may reach: it is of another map or CRS."""
+    """Refuse a position outside the region and the reach of the prior's disc: another map or CRS."""
     if query.bounds_m is None:
         return
     west, south, east, north = query.bounds_m

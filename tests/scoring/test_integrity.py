@@ -11,7 +11,7 @@ from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.integrity import integrity_rows
 from sasgeo_bench.scoring.integrity_metric import aurc
-from sasgeo_bench.scoring.intervals import statistic_interval, wilson
+from sasgeo_bench.scoring.intervals import bootstrap_statistic, percentile_interval, wilson
 from sasgeo_bench.scoring.rejection import OWN, answers_of, own_word, turns, why_not
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.tasks.split import SplitFile, make_split
@@ -63,7 +63,7 @@ def test_its_intervals_are_those_of_any_figure():
     assert (rows[(rows["suite"] == "all suites") & (rows["metric"] == "aurc")]["value"] == found["value"]).all()
     some = answers_of(table)
     drawn = ClusterDraws(blocks=table["block"].tolist(), seed=1, draws=1000)
-    slow = statistic_interval(lambda mass: aurc(some, mass), drawn)
+    slow = percentile_interval(aurc(some), bootstrap_statistic(lambda mass: aurc(some, mass), drawn))
     assert (found["lo"], found["hi"]) == pytest.approx((slow.lo, slow.hi), abs=0.02)
 
 

@@ -181,21 +181,21 @@ def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["hig
     rows, cols = np.triu_indices(len(figures), 1)
     if not len(rows):
         return found
-    apart = sign * (figures[rows] - figures[cols])
-    lo, hi = _bounds(sign * (table[:, rows] - table[:, cols]), apart)
+    gaps = sign * (figures[rows] - figures[cols])
+    lo, hi = _bounds(sign * (table[:, rows] - table[:, cols]), gaps)
     found[rows, cols], found[cols, rows] = lo > _NOTHING, hi < -_NOTHING
     return found
 
 
-def _bounds(draws: Floats, apart: Floats) -> tuple[Floats, Floats]:
+def _bounds(draws: Floats, gaps: Floats) -> tuple[Floats, Floats]:
     """Return simultaneous intervals of P differences, shape (P,) each, from draws of shape (D, P)."""
     spread = draws.std(axis=0)
     varies = spread > _NOTHING
     if not varies.any():
-        return apart, apart
-    largest = (np.abs(draws[:, varies] - apart[varies]) / spread[varies]).max(axis=1)
+        return gaps, gaps
+    largest = (np.abs(draws[:, varies] - gaps[varies]) / spread[varies]).max(axis=1)
     reach = float(np.quantile(largest, LEVEL, method="inverted_cdf")) * np.where(varies, spread, 0.0)
-    return apart - reach, apart + reach
+    return gaps - reach, gaps + reach
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,7 @@ MOST_NAMED: Final = 3  # runs that are left out; the others are counted
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told:
+class EntryAnswers:
     """One entry and its answers to the tasks of a board.
 
     `asked` are the folders of tasks whose queries it was asked, answered or not; `held` are those it brings to a board
@@ -39,7 +39,7 @@ class Told:
     asked: frozenset[Path]
 
 
-def read_told(
+def read_entry_answers(
     entries: Sequence[Entry],
     folders: Sequence[Path],
     *,
@@ -47,23 +47,12 @@ def read_told(
     named: Sequence[Path],
     tell: Callable[[str], None],
     failures: Failures,
-) -> list[Told]:
+) -> list[EntryAnswers]:
     """Return the answers of all entries; skip runs of other queries, or refuse them where the user named them.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Entries of the board.
-    folders : sequence of Path
-        Task folders; if empty, those that runs were made on and that files answer.
-    root : Path
-        Parent of tasks/.
-    named : sequence of Path
-        Folders and files that the user named.
-    tell : callable
-        Receives a line about skipped runs.
-    failures : Failures
-        Records entries whose answers cannot be read; they are skipped.
+    Without `folders`, the tasks are those that runs were made on and that files answer; `root` is the parent of tasks/.
+    `named` are the paths that the user named, `tell` receives a line about skipped runs. `failures` records entries
+    whose answers cannot be read.
 
     Raises
     ------
@@ -80,24 +69,24 @@ def read_told(
     is_chosen = bool(folders)
     found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
-    told: list[Told] = []
+    answers: list[EntryAnswers] = []
     stale: list[Path] = []
     for entry in (entry for entry in entries if entry.name not in failures.found):
         with failures.of(entry.name):
-            item, others = _told(entry, tasks, files.get(entry.name))
+            item, others = _entry_answers(entry, tasks, files.get(entry.name))
             stale += others
-            told += [item] if item.asked else []
-    if not told and failures.first is not None:
+            answers += [item] if item.asked else []
+    if not answers and failures.first is not None:
         raise failures.first
     refused = next((source for source in stale if source in named), None)
-    if refused is not None or (stale and not told):
+    if refused is not None or (stale and not answers):
         holder = "these tasks do" if is_chosen else "its task does"
         message = (
             f"{refused or stale[0]} holds answers to other queries than {holder} now: "
             "run again (what is answered already is kept), or make the old queries again"
         )
         raise StoreError(message)
-    if not told:
+    if not answers:
         message = (
             f"there is nothing to score: no task in {root / 'tasks'} is answered "
             "(--out names another root, --tasks the tasks themselves)"
@@ -106,15 +95,17 @@ def read_told(
     if stale:
         listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
         tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
-    return told
+    return answers
 
 
-def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None) -> tuple[Told, list[Path]]:
+def _entry_answers(
+    entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None
+) -> tuple[EntryAnswers, list[Path]]:
     """Return an entry with its answers, and the folders of its runs that answer none of the tasks."""
     if rows is None:
         return _read_runs(entry, tasks)
     held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-    return Told(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
+    return EntryAnswers(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
 
 
 def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
@@ -129,7 +120,7 @@ def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
     return {item.query_id: item for source in entry.sources for item in prediction_files.read_predictions(source)}
 
 
-def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Path]]:
+def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[EntryAnswers, list[Path]]:
     """Return an entry with the answers of its runs, and the folders of runs that answer none of the tasks."""
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
     rows: dict[str, Prediction] = {}
@@ -151,7 +142,7 @@ def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Pat
         asked.add(task.folder)
         runs.append((source, _share_of(about, found)))
     mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
-    return Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
+    return EntryAnswers(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
 
 
 def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Mapping[str, Any]:
@@ -168,8 +159,8 @@ def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
     return [folder for folder in folders if (folder / task_files.TASK).is_file()]
 
 
-def score_told(
-    told: Sequence[Told],
+def score_entries(
+    answers: Sequence[EntryAnswers],
     tasks: Sequence[ScoredTask],
     *,
     split: Split | None,
@@ -178,18 +169,7 @@ def score_told(
 ) -> dict[str, pd.DataFrame]:
     """Return scored rows by entry name; `failures` records entries that cannot be scored.
 
-    Parameters
-    ----------
-    told : sequence of Told
-        Entries with their answers.
-    tasks : sequence of ScoredTask
-        Queries with truths.
-    split : Split, optional
-        Assigns blocks to places.
-    by_region : collection of str
-        Suites that are resampled by region instead of by block.
-    failures : Failures
-        Records the entries that are skipped.
+    `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block.
 
     Raises
     ------
@@ -197,7 +177,7 @@ def score_told(
         The first fault, if no entry is left.
     """
     folders, found = [task.folder for task in tasks], {}
-    for item in told:
+    for item in answers:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
@@ -231,15 +211,17 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
         raise ConfigError(message)
 
 
-def _scored(told: Told, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]) -> pd.DataFrame:
+def _scored(
+    answers: EntryAnswers, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]
+) -> pd.DataFrame:
     """Return one row per query of all tasks that an entry was asked."""
     place_of = {} if split is None else split.place_of
     frames = []
     for task in tasks:
-        if task.folder not in told.asked:
+        if task.folder not in answers.asked:
             continue
         names = [head.query_id for head in task.heads]
-        mine = {name: told.predictions[name] for name in names if name in told.predictions}
+        mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)
         frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in by_region else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -113,12 +113,12 @@ COLUMNS: Final = tuple(field.name for field in fields(Finding))
 def hold_contrasts(
     contrasts: Sequence[Contrast],
     scores: Mapping[str, pd.DataFrame],
-    judged: Mapping[tuple[str, str], pd.DataFrame],
+    rejections: Mapping[tuple[str, str], pd.DataFrame],
     *,
     draws: int = DRAWS,
     failed: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Test every registered contrast, in order.
+    """Test every registered contrast, in order; a contrast without queries, or with a failed side, has p = 1.
 
     Parameters
     ----------
@@ -126,26 +126,21 @@ def hold_contrasts(
         All registered contrasts and no others: Holm's adjustment covers them.
     scores : mapping of str to pandas.DataFrame
         Scored rows by matcher.
-    judged : mapping of (matcher, rejector) to pandas.DataFrame
+    rejections : mapping of (matcher, rejector) to pandas.DataFrame
         From `rejection.judge`.
     draws : int
         Number of bootstrap draws.
     failed : collection of str
         Matchers, and "matcher x rejector", that failed and so are not on the board.
 
-    Returns
-    -------
-    tuple of Finding
-        A contrast without queries, or with a side that failed, has p = 1 and a verdict that says so.
-
     Raises
     ------
     ConfigError
         If a contrast names a method that is not on the board, and none failed.
     """
-    there = scores.keys() | {" x ".join(key) for key in judged}
+    there = scores.keys() | {" x ".join(key) for key in rejections}
     found = [
-        _tested(contrast, scores, judged, draws)
+        _tested(contrast, scores, rejections, draws)
         if not failed or {contrast.first, contrast.second} <= there
         else replace(_nothing(contrast), verdict=_undecided(contrast, there, failed))
         for contrast in contrasts
@@ -164,10 +159,10 @@ def _undecided(contrast: Contrast, there: Collection[str], failed: Collection[st
 def _tested(
     contrast: Contrast,
     scores: Mapping[str, pd.DataFrame],
-    judged: Mapping[tuple[str, str], pd.DataFrame],
+    rejections: Mapping[tuple[str, str], pd.DataFrame],
     draws: int,
 ) -> Finding:
-    first, second = _pair(contrast, scores, judged)
+    first, second = _pair(contrast, scores, rejections)
     if first.empty:
         return _nothing(contrast)
     is_mean = contrast.metric == "primary"
@@ -175,11 +170,11 @@ def _tested(
 
 
 def _pair(
-    contrast: Contrast, scores: Mapping[str, pd.DataFrame], judged: Mapping[tuple[str, str], pd.DataFrame]
+    contrast: Contrast, scores: Mapping[str, pd.DataFrame], rejections: Mapping[tuple[str, str], pd.DataFrame]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of both sides for the same queries in the same order."""
     is_mean = contrast.metric == "primary"
-    known: Mapping[str, pd.DataFrame] = scores if is_mean else {" x ".join(key): item for key, item in judged.items()}
+    known = scores if is_mean else {" x ".join(key): rows for key, rows in rejections.items()}
     return both_on(contrast, known, _stressed if is_mean else _unfalsified)
 
 
@@ -222,7 +217,7 @@ class PlaceDifference:
 def by_place(
     contrast: Contrast,
     scores: Mapping[str, pd.DataFrame],
-    judged: Mapping[tuple[str, str], pd.DataFrame],
+    rejections: Mapping[tuple[str, str], pd.DataFrame],
     *,
     draws: int = SLOW_DRAWS,
 ) -> tuple[PlaceDifference, ...]:
@@ -230,7 +225,7 @@ def by_place(
 
     Parameters and errors are those of `hold_contrasts`; draws are resampled within each place.
     """
-    first, second = _pair(contrast, scores, judged)
+    first, second = _pair(contrast, scores, rejections)
     places = first["place"].to_numpy(str)
     return tuple(
         _at_place(contrast, first[places == place], second[places == place], str(place), draws)
@@ -339,7 +334,7 @@ def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, 
         second_only=exact.second_only,
         p_exact=exact.p_value,
         p_clustered=clustered.p_value,
-        detectable=sensitivity(ours, theirs, blocks).detectable if drawn.blocks_count >= LEAST_BLOCKS else math.nan,
+        detectable=sensitivity(ours, theirs, blocks) if drawn.blocks_count >= LEAST_BLOCKS else math.nan,
     )
 
 

@@ -19,28 +19,20 @@ ORACLE: Final = "oracle_pose"
 REFERENCE: Final = "fft_vote"  # the plainest search there is: a view without error it must find
 ALPHA: Final = 1e-4  # of each test against chance: a board holds dozens of them
 NEARLY_ALL: Final = 0.9
+_AT_CHANCE: Final = {
+    SHUFFLED: "shuffled map at chance",
+    TURNED: "turned map at chance",
+    TWINS: "identical twins tie",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Result of one control.
+    """Result of one control, as "shuffled map at chance", for one matcher on n queries.
 
-    Parameters
-    ----------
-    control : str
-        As in "shuffled map at chance".
-    matcher : str
-        Name of the matcher.
-    n : int
-        Number of queries.
-    found : float
-        Number of right answers (a tie counts by its chance), or of answers where none is expected.
-    expected : float
-        The expected number: by chance, at least, or at most, as `control` says.
-    p : float
-        Chance of as many or more under pure chance; NaN without a test.
-    holds : bool
-        True if the control holds.
+    `found` counts right answers (a tie by its chance), or answers where none is expected. `expected` is their number by
+    chance, at least, or at most, as `control` says. `p` is the chance of as many or more under pure chance; NaN without
+    a test.
     """
 
     control: str
@@ -131,34 +123,20 @@ def at_least(count: float, each: Floats) -> float:
 
 def _by_chance(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
     """Check that no matcher beats chance where the map holds no information: it would come from elsewhere."""
-    for kind, name in (
-        (SHUFFLED, "shuffled map at chance"),
-        (TURNED, "turned map at chance"),
-        (TWINS, "identical twins tie"),
-    ):
+    for kind, name in _AT_CHANCE.items():
         mine = controls[controls["kind"] == kind]
-        if not len(mine):
-            continue
-        found = float(hits(mine).sum())
-        each = np.full(len(mine), 0.5) if kind == TWINS else chances(mine)
-        p = at_least(found, each)
-        yield Verdict(
-            control=name,
-            matcher=matcher,
-            n=len(mine),
-            found=found,
-            expected=float(each.sum()),
-            p=p,
-            holds=p >= ALPHA,
-        )
+        if len(mine):
+            found = float(hits(mine).sum())
+            each = np.full(len(mine), 0.5) if kind == TWINS else chances(mine)
+            p = at_least(found, each)
+            yield _verdict(name, matcher, len(mine), found, float(each.sum()), holds=p >= ALPHA, p=p)
 
 
 def _withheld(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
     """Check that a matcher gives no answer to an empty view."""
     blind = controls[controls["kind"] == BLIND]
     if len(blind):
-        answered = float(blind["is_answered"].sum())
-        yield _exact("blind views withheld", matcher, len(blind), found=answered, expected=0.0)
+        yield _exact("blind views withheld", matcher, len(blind), float(blind["is_answered"].sum()), 0.0)
 
 
 def _nearly_all(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
@@ -166,29 +144,24 @@ def _nearly_all(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
     clear = controls[controls["kind"] == NOISE_FREE]
     if len(clear):
         found, least = float(hits(clear).sum()), NEARLY_ALL * len(clear)
-        yield Verdict(
-            control="views without error found, at least",
-            matcher=matcher,
-            n=len(clear),
-            found=found,
-            expected=least,
-            p=math.nan,
-            holds=found >= least,
-        )
+        name = "views without error found, at least"
+        yield _verdict(name, matcher, len(clear), found, least, holds=found >= least)
 
 
 def _perfect(matcher: str, asked: pd.DataFrame) -> Iterator[Verdict]:
     """Check that the oracle is always right and withholds absent places; otherwise scorer or truth is at fault."""
     present, absent = asked[is_present(asked)], asked[~is_present(asked)]
     if len(present):
-        found = float(hits(present).sum())
-        yield _exact("oracle always right", matcher, len(present), found=found, expected=float(len(present)))
+        yield _exact("oracle always right", matcher, len(present), float(hits(present).sum()), float(len(present)))
     if len(absent):
-        found = float(absent["is_answered"].sum())
-        yield _exact("oracle withholds absent places", matcher, len(absent), found=found, expected=0.0)
+        yield _exact("oracle withholds absent places", matcher, len(absent), float(absent["is_answered"].sum()), 0.0)
 
 
-def _exact(control: str, matcher: str, n: int, *, found: float, expected: float) -> Verdict:
-    return Verdict(
-        control=control, matcher=matcher, n=n, found=found, expected=expected, p=math.nan, holds=found == expected
-    )
+def _exact(control: str, matcher: str, n: int, found: float, expected: float) -> Verdict:
+    return _verdict(control, matcher, n, found, expected, holds=found == expected)
+
+
+def _verdict(
+    control: str, matcher: str, n: int, found: float, expected: float, *, holds: bool, p: float = math.nan
+) -> Verdict:
+    return Verdict(control=control, matcher=matcher, n=n, found=found, expected=expected, p=p, holds=holds)

@@ -54,8 +54,8 @@ class Entry:
         """Return the training places that the entry declares itself; None if it declares nothing."""
         if self.submission is not None:
             return list(self.submission.card.places)
-        said = self.runs[0]["matcher"].get("trained_on") if self.runs else None
-        return [str(place) for place in said] if isinstance(said, list) else None
+        places = self.runs[0]["matcher"].get("trained_on") if self.runs else None
+        return [str(place) for place in places] if isinstance(places, list) else None
 
     @property
     def is_taught(self) -> bool:
@@ -66,9 +66,10 @@ class Entry:
         """Return each training by the runner once: its source, its training places and the tasks asked under it."""
         found: dict[str, dict[str, Any]] = {}
         for about in self.runs:
-            said = LearnedSaid.of(about)
-            if said is not None:
-                one = found.setdefault(said.key, {**asdict(said), "trained_on": list(said.trained_on), "asked": []})
+            training = LearnedSaid.of(about)
+            if training is not None:
+                fields = asdict(training) | {"trained_on": list(training.trained_on), "asked": []}
+                one = found.setdefault(training.key, fields)
                 one["asked"].append(f"{about['suite']}/{about['region']}")
         return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
@@ -78,19 +79,9 @@ def find_entries(
 ) -> tuple[Entry, ...]:
     """Return the entries found in folders of runs, files of predictions and submissions, by name.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Folders that contain runs at any depth, and files of predictions.
-    submissions : sequence of Path
-        Folders of submissions.
-    failures : Failures, optional
-        Records runs and submissions that cannot be read; they are skipped.
-
-    Returns
-    -------
-    tuple of Entry
-        Two versions of one matcher are two entries, with the version in their names, and the hash if versions agree.
+    Runs may lie at any depth. Two versions of one matcher are two entries, with the version in their names, and the
+    hash if versions agree. `failures` records runs and submissions that cannot be read; without it, the first one
+    raises.
 
     Raises
     ------
@@ -136,7 +127,7 @@ def find_entries(
     entries += files
     entries += _all_submitted(submissions, failures)
     listed = [entry.name for entry in entries]
-    # No submission passes for a version of what is there: "mine" beside "mine 1" would be told apart by no reader.
+    # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
     twice = next(
         (
             one.name
@@ -238,15 +229,15 @@ def _check_free(name: str, path: Path) -> None:
 
 
 def _submitted(folder: Path) -> Entry:
-    said = read_submission(folder)
-    _check_free(said.card.name, folder)
+    submission = read_submission(folder)
+    _check_free(submission.card.name, folder)
     return Entry(
-        name=said.card.name,
-        version=said.card.version,
+        name=submission.card.name,
+        version=submission.card.version,
         hash="",
         how=AS_SUBMITTED,
-        sources=(folder / predictions_name(said.card.name),),
-        submission=said,
+        sources=(folder / predictions_name(submission.card.name),),
+        submission=submission,
     )
 
 
@@ -254,17 +245,18 @@ def _read_run(path: Path) -> dict[str, Any]:
     """Read a `run.json` and check every field that a board uses: its author is not trusted."""
     about = prediction_files.read_run(path.parent) or {}
     card = about.get("matcher")
-    said = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
+    stated = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
     if isinstance(card, dict):
-        said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
-    fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
+        stated |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
+    wrong = (f"{name} is {value!r}" for name, value in stated.items() if not value or type(value) is not str)
+    fault = next(wrong, None)
     try:
-        check_identity(str(said["matcher.name"]), str(said["matcher.version"]))
+        check_identity(str(stated["matcher.name"]), str(stated["matcher.version"]))
         run_cost(about)
         LearnedSaid.of(about)
     except (MatchError, MetricError) as error:
         fault = fault or str(error)
-    if said["matcher.name"] == ORACLE != about.get("spec", ORACLE):
+    if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):
         fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
     if fault is not None:
         message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"

@@ -15,7 +15,7 @@ from sasgeo_bench.scoring.integrity_metric import drawn_areas
 from sasgeo_bench.scoring.intervals import Interval, effective_count, share_interval
 from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS, RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.rejection import answers_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, side_by_side
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads
 
 AS_DRAWN: Final = "as drawn"
 _CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take twice the time
@@ -23,20 +23,12 @@ SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
 _NO_DRAWS: Final = np.empty(0)
 
 
-def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
-    """Yield every integrity metric of a matcher with a rejector.
+def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
+    """Yield every integrity metric of a matcher with a rejector, from rows of `rejection.judge` or `own_confidence`.
 
-    The rows cover each suite, track and prior group, and all suites of a track and prior group together. The latter
-    also come with present places reweighted to a share of 0.9, 0.7 and 0.5.
-
-    Parameters
-    ----------
-    matcher, rejector : str
-        Names.
-    judged : pandas.DataFrame
-        From `rejection.judge` or `rejection.own_word`.
-    is_calibrated : bool
-        False skips the metrics that need probabilities.
+    They cover each suite, track and prior group, and all suites of a track and prior group together. The latter also
+    come with present places reweighted to a share of 0.9, 0.7 and 0.5. Without `is_calibrated`, skip metrics that need
+    probabilities.
     """
     parts = [
         (
@@ -51,11 +43,11 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_cali
             ),
             part,
         )
-        for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True)
+        for (track, prior_group), whole in rows.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
     metrics = [metric for metric in REJECTION if is_calibrated or not metric.needs_chances]
-    yield from side_by_side(lambda item: _rows(*item, metrics), parts)
+    yield from in_threads(lambda item: _rows(*item, metrics), parts)
 
 
 def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -> Iterator[Row]:

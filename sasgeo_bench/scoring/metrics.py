@@ -7,7 +7,7 @@ To add a metric, write its function and add one row to `METRICS`.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -407,7 +407,6 @@ COSTS: Final = (
 )
 METRICS: Final[tuple[Metric, ...]] = (*_MEANS, *QUANTILES, *REJECTION, *THRESHOLDS, *COSTS)
 _BY_NAME: Final = {metric.name: metric for metric in METRICS}
-M = TypeVar("M", bound=Metric)
 
 
 def metric_of(name: str) -> Metric:

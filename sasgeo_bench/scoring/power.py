@@ -3,7 +3,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Final
 
@@ -138,27 +137,11 @@ def detectable_difference(
     return math.sqrt(discordant_share) * root / (pairs + high**2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sensitivity:
-    """Sensitivity of a suite to the difference of two methods.
+def sensitivity(first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints) -> float:
+    """Return the minimum detectable difference of two methods on a suite; infinite if even the largest would be missed.
 
-    `discordant_share` is the share of queries on which just one method is right, `correlation` that of the differences
-    within blocks, `detectable` the least difference of shares that would be found (infinite if none).
-    """
-
-    queries: int
-    blocks: int
-    discordant_share: float
-    correlation: float
-    design_effect: float
-    detectable: float
-
-
-def sensitivity(first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints) -> Sensitivity:
-    """Return the minimum detectable difference of two methods on a suite.
-
-    `first` and `second` are hits in [0, 1], shape (N,), for the same queries. A correlation that cannot be estimated is
-    NaN and counts as 0.
+    `first` and `second` are hits in [0, 1], shape (N,), for the same queries. A correlation that cannot be estimated
+    counts as 0.
 
     Raises
     ------
@@ -168,24 +151,15 @@ def sensitivity(first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Int
     Examples
     --------
     >>> blocks = [str(at // 50) for at in range(1800)]
-    >>> found = sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks)
-    >>> round(found.discordant_share, 4), round(found.detectable, 4)
-    (0.0633, 0.0166)
+    >>> round(sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks), 4)
+    0.0166
     """
     ours = check_column(first, "first")
-    apart = ours - check_column(second, "second", len(ours))
+    gaps = ours - check_column(second, "second", len(ours))
     sizes, _ = block_codes(blocks, len(ours))
     if not len(sizes):
         message = "no queries, so no difference can be detected: draw some first"
         raise MetricError(message)
-    correlation = intraclass_correlation(apart, blocks)
+    correlation = intraclass_correlation(gaps, blocks)
     effect = design_effect(sizes, 0.0 if math.isnan(correlation) else correlation)
-    share = float(np.abs(apart).mean())
-    return Sensitivity(
-        queries=len(ours),
-        blocks=len(sizes),
-        discordant_share=share,
-        correlation=correlation,
-        design_effect=effect,
-        detectable=detectable_difference(len(ours) / effect, share),
-    )
+    return detectable_difference(len(ours) / effect, float(np.abs(gaps).mean()))

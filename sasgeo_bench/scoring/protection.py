@@ -35,47 +35,24 @@ def protection_frame(
 ) -> pd.DataFrame:
     """Return how the protection levels of one matcher held, pooled over all suites of localization.
 
-    Parameters
-    ----------
-    matcher : str
-        Name.
-    scores : pandas.DataFrame
-        Scored rows.
-    predictions : mapping of str to Prediction
-        The same answers by query id, with levels in their diagnostics (`sasgeo.protection.PROTECTION`).
-    split : Split, optional
-        Assigns the places that calibrate conformal levels; without it there are none. Of a hold-out split the test part
-        counts.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for each prior group, method, risk and alert limit, with the columns `COLUMNS`; empty if no answer has a
-        level. Shares are of all queries: an answer without a level is unavailable, one at an absent place has an
-        infinite error. Intervals are Wilson's over sites. `supports` states in words which risk the counts support.
+    There is a row for each prior group, method, risk and alert limit; none if no answer has a level in its diagnostics
+    (`sasgeo.protection.PROTECTION`). Shares are of all queries: an answer without a level is unavailable, one at an
+    absent place has an infinite error. Intervals are Wilson's over sites. `supports` states which risk the counts
+    support. `split` assigns the places that calibrate conformal levels; of a hold-out split the test part counts.
     """
     rows = [
         {"matcher": matcher, "prior_group": item.prior_group, **row}
-        for item in told_levels(scores, predictions, split)
+        for item in protection_levels(scores, predictions, split)
         for row in _counted(item)
     ]
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ToldLevels:
+class ProtectionLevels:
     """Protection levels of one method at one risk, with the errors; arrays have shape (N,).
 
-    Parameters
-    ----------
-    prior_group, method : str
-        Prior group of the queries, and method of the levels.
-    risk : float
-        Risk that the levels are stated for.
-    level_m, error_m : ndarray of float
-        Metres; infinite if missing, see `protection_frame`.
-    sites : ndarray of str
-        `pair_id` of each query.
+    Levels and errors in metres are infinite if missing; `sites` is the `pair_id` of each query.
     """
 
     prior_group: str
@@ -86,9 +63,9 @@ class ToldLevels:
     sites: Strings
 
 
-def told_levels(
+def protection_levels(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
-) -> Iterator[ToldLevels]:
+) -> Iterator[ProtectionLevels]:
     """Yield the protection levels of one matcher per query, for each prior group, risk and method with a level.
 
     Parameters are those of `protection_frame`.
@@ -100,15 +77,15 @@ def told_levels(
 
 def _levels_of_group(
     prior_group: str, group: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None
-) -> Iterator[ToldLevels]:
+) -> Iterator[ProtectionLevels]:
     is_holdout = split is not None and split.spec.kind == "holdout"
     is_tested = (group["part"] == "test").to_numpy(bool) if is_holdout else np.ones(len(group), dtype=bool)
     error_m = _errors_m(group)
     sites = group["pair_id"].to_numpy(str)
 
-    def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ToldLevels:
+    def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ProtectionLevels:
         """Select the queries that count."""
-        return ToldLevels(
+        return ProtectionLevels(
             prior_group=prior_group,
             method=method,
             risk=risk,
@@ -118,11 +95,11 @@ def _levels_of_group(
         )
 
     for risk in RISKS:
-        told = {method: _told(group, predictions, level_name(method, risk)) for method in METHODS}
-        for method, level_m in told.items():
+        levels = {method: _diagnostic(group, predictions, level_name(method, risk)) for method in METHODS}
+        for method, level_m in levels.items():
             if np.isfinite(level_m).any():
                 yield of(method, risk, level_m, is_tested)
-        scale_m = _told(group, predictions, SCALE)
+        scale_m = _diagnostic(group, predictions, SCALE)
         if split is not None and np.isfinite(scale_m).any():
             yield of(CONFORMAL, risk, *_conformal(group, split, scale_m, error_m, risk))
 
@@ -133,11 +110,11 @@ def _errors_m(group: pd.DataFrame) -> Floats:
     return np.where(np.isnan(error_m), np.inf, error_m)
 
 
-def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
+def _diagnostic(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
     """Return the level or scale in each answer's diagnostics; infinite if missing or not positive."""
     answered = zip(group["query_id"], group["is_answered"], strict=True)
-    told = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
-    values = np.array(told, dtype=np.float64)
+    levels = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
+    values = np.array(levels, dtype=np.float64)
     return np.asarray(np.where(values > 0, values, np.inf))
 
 
@@ -154,16 +131,16 @@ def _conformal(
     return level_m, is_fitted
 
 
-def _counted(told: ToldLevels) -> Iterator[dict[str, Any]]:
+def _counted(levels: ProtectionLevels) -> Iterator[dict[str, Any]]:
     """Yield a row for each alert limit; none without queries."""
-    if not len(told.level_m):
+    if not len(levels.level_m):
         return
-    sites = effective_count(np.unique(told.sites, return_inverse=True)[1])
+    sites = effective_count(np.unique(levels.sites, return_inverse=True)[1])
     for limit_m in ALERT_LIMITS_M:
-        counts = stanford_counts(told.level_m, told.error_m, limit_m, trials=sites)
-        row = {"method": told.method, "risk": told.risk, "alert_limit_m": limit_m}
-        row |= {"n": len(told.level_m), "sites": sites}
-        yield row | _shares(counts) | {"supports": _supports(counts, told.risk)}
+        counts = stanford_counts(levels.level_m, levels.error_m, limit_m, trials=sites)
+        row = {"method": levels.method, "risk": levels.risk, "alert_limit_m": limit_m}
+        row |= {"n": len(levels.level_m), "sites": sites}
+        yield row | _shares(counts) | {"supports": _supports(counts, levels.risk)}
 
 
 def _shares(counts: StanfordCounts) -> dict[str, float]:

@@ -14,8 +14,7 @@ from sasgeo_bench.scoring.base import Floats, check_column, weighted_mean
 from sasgeo_bench.scoring.calibration import stanford
 from sasgeo_bench.scoring.intervals import LEVEL, Interval, wilson
 
-# More digits than a count can say read as if it said them.
-_DIGITS: Final = 2
+_DIGITS: Final = 2  # more would claim a precision that counts do not have
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,15 +66,15 @@ def stanford_counts(
     [5, 2, 1, 2]
     """
     areas = stanford(protection_level_m, position_error_m, alert_limit_m)
-    worth = float(len(areas.nominal)) if trials is None else trials
+    count = float(len(areas.nominal)) if trials is None else trials
 
     def share(which: ArrayLike) -> Interval:
         value = weighted_mean(which)
-        return wilson(0.0, 0.0) if math.isnan(value) else wilson(min(value * worth, worth), worth, level=level)
+        return wilson(0.0, 0.0) if math.isnan(value) else wilson(min(value * count, count), count, level=level)
 
     misleading = areas.misleading | areas.hazardous
     return StanfordCounts(
-        trials=worth,
+        trials=count,
         available=share(areas.nominal | misleading),
         unavailable=share(areas.unavailable | areas.unavailable_misleading),
         misleading=share(misleading),
@@ -110,10 +109,10 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
         message = f"risk and confidence must lie in (0, 1), got {risk!r} and {confidence!r}"
         raise MetricError(message)
     at_most = upper_rate(failures, trials, confidence=confidence)
-    said = f"{failures:.4g} of {trials:.4g} support below "
+    claim = f"{failures:.4g} of {trials:.4g} support below "
     sure = f" ({100 * confidence:g} % confidence)"
     if at_most < risk:
-        return f"{said}{100 * risk:g} %{sure}"
+        return f"{claim}{100 * risk:g} %{sure}"
     if failures == trials:  # none of none, too
         return f"{failures:.4g} of {trials:.4g} support no bound{sure}"
     # Rounded up: below 2.951 % is not below 2.95 %.
@@ -121,23 +120,15 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     shown = math.ceil(100 * at_most * scale) / scale
     least_trials = math.ceil(math.log(1.0 - confidence) / math.log1p(-risk))
     takes = f", which takes {least_trials} without one" if failures == 0 else ""
-    return f"{said}{shown:g} % and not below {100 * risk:g} %{takes}{sure}"
+    return f"{claim}{shown:g} % and not below {100 * risk:g} %{takes}{sure}"
 
 
 def conformal_factor(position_error_m: ArrayLike, scale_m: ArrayLike, risk: float) -> float:
-    """Return the factor on a scale that the error of a new answer exceeds with at most the given risk.
+    """Return the factor on a scale that the error of a new answer exceeds with at most the given risk in (0, 1).
 
-    It is the ceil((N + 1) (1 - risk))-th least ratio of error to scale; infinite where that is more than N, or falls
-    among infinite errors.
-
-    Parameters
-    ----------
-    position_error_m : array_like, shape (N,)
-        Of calibration answers; infinite where the place is absent.
-    scale_m : array_like, shape (N,)
-        Each answer's own estimate of its uncertainty, positive.
-    risk : float
-        In (0, 1).
+    It is the ceil((N + 1) (1 - risk))-th least ratio of error to scale over N calibration answers; infinite where that
+    is more than N, or falls among infinite errors (absent places). The scale is each answer's estimate of its
+    uncertainty.
 
     Raises
     ------

@@ -80,16 +80,10 @@ class Turn:
 
 
 def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Iterator[Turn]:
-    """Yield every use of a split for some scored rows; each row is tested at most once, and no place calibrates itself.
+    """Yield every use of a split for scored rows; each row is tested at most once, and no place calibrates itself.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Columns place and part.
-    split : Split
-        Hold-out: one turn, by the part of each query. Cross-fit: one for each place on the board.
-    is_taught : bool
-        True if the matcher was trained on other places: then only the fold's own calibration places calibrate.
+    A hold-out split has one turn, by the part of each query; a cross-fit one for each place on the board. With
+    `is_taught`, for a matcher that was trained on other places, only the fold's own calibration places calibrate.
     """
     place, part = scores["place"].to_numpy(), scores["part"].to_numpy()
     if split.spec.kind == "holdout":
@@ -109,18 +103,8 @@ def judge(
 ) -> pd.DataFrame:
     """Return a rejector's output for the answers of one matcher, each from a fit on other places.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Of one matcher; each track and prior group has its own fit, over all suites.
-    predictions : mapping of str to Prediction
-        The same answers by query id.
-    make : callable
-        Makes a new rejector.
-    split : Split
-        Assigns calibration places.
-    is_taught : bool
-        True if the matcher was trained on other places of the split.
+    Each track and prior group has its own fit, over all suites. `make` makes a new rejector; `is_taught` is as in
+    `turns`.
 
     Returns
     -------
@@ -176,7 +160,7 @@ def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:
     return "no other place of the board calibrates"
 
 
-def own_word(scores: pd.DataFrame, split: Split | None = None, *, is_taught: bool = False) -> pd.DataFrame:
+def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taught: bool = False) -> pd.DataFrame:
     """Return a matcher's own confidences in the form of `judge`, as a rejector without a fit.
 
     The columns are `p_right`, always a probability, and `accepted_<risk>`, NaN where no place calibrates. Only tracks

@@ -136,7 +136,7 @@ class Row(RowKey):
 COLUMNS: Final = tuple(field.name for field in fields(Row))
 
 
-def side_by_side(
+def in_threads(
     make: Callable[[Item], Iterable[Row]], items: Iterable[Item], done: Callable[[], None] = lambda: None
 ) -> list[Row]:
     """Return the rows of all items in order, made by a few threads; call `done` in this thread after each item.
@@ -186,7 +186,7 @@ def to_frame(rows: list[Row]) -> pd.DataFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Contestant:
+class EntryLabel:
     """Shared fields of an entry's rows: version, hash of code and settings ("" for a file), source of the answers.
 
     `set_apart` is the reason for excluding it from ranks; None if it is ranked.
@@ -198,7 +198,7 @@ class Contestant:
     set_apart: str | None = None
 
 
-def with_contestants(board: pd.DataFrame, contestants: Mapping[str, Contestant]) -> pd.DataFrame:
+def with_entry_labels(board: pd.DataFrame, contestants: Mapping[str, EntryLabel]) -> pd.DataFrame:
     """Return the board with the columns version, hash, how, is_control and set_apart after the matcher.
 
     The hash is missing for a file, and `set_apart` for ranked entries.

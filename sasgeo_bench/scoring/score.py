@@ -96,6 +96,10 @@ class Score:
 
 
 COLUMNS: Final = tuple(field.name for field in fields(Score))
+_HEAD_COLUMNS: Final = tuple(field.name for field in fields(Head) if field.name in COLUMNS)
+_TRUTH_COLUMNS: Final = tuple(
+    field.name for field in fields(Truth) if field.name in COLUMNS and field.name not in _HEAD_COLUMNS
+)
 
 
 def score_task(
@@ -105,23 +109,10 @@ def score_task(
     *,
     place_of: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
-    """Score the predictions of one task.
+    """Score the predictions of one task: a row for each query in order, with the columns of `Score`.
 
-    Parameters
-    ----------
-    heads : iterable of Head
-        Every query of the task.
-    truths : iterable of Truth
-        Of the same queries.
-    predictions : mapping of str to Prediction
-        By query id; a query without one is a miss.
-    place_of : mapping of str to str, optional
-        Block -> place of the split.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for each query in order, with the columns of `Score`.
+    `heads` and `truths` cover the same queries; a query without a prediction is a miss. `place_of` maps blocks to
+    places of the split.
 
     Raises
     ------
@@ -138,20 +129,20 @@ def score_task(
     if foreign is not None:
         message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
         raise MetricError(message)
-    told = [predictions.get(head.query_id) for head in asked]
-    errors = _errors([by_id[head.query_id] for head in asked], told)
+    answers = [predictions.get(head.query_id) for head in asked]
+    errors = _errors([by_id[head.query_id] for head in asked], answers)
     rows = [
         _score(head, by_id[head.query_id], prediction, error, place_of or {})
-        for head, prediction, error in zip(asked, told, errors, strict=True)
+        for head, prediction, error in zip(asked, answers, errors, strict=True)
     ]
     return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
 
 
-def _errors(truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
+def _errors(truths: Sequence[Truth], answers: Sequence[Prediction | None]) -> list[Errors]:
     """Return metres, degrees and logarithm of the scale of each first pose; NaN without a true pose."""
     found = [_NO_ERROR] * len(truths)
     asked = [(at, truth.pose) for at, truth in enumerate(truths) if truth.is_present and truth.pose is not None]
-    errors = pose_errors([first_pose(told[at]) for at, _ in asked], [pose for _, pose in asked])
+    errors = pose_errors([first_pose(answers[at]) for at, _ in asked], [pose for _, pose in asked])
     columns = (errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist())
     for (at, _), *error in zip(asked, *columns, strict=True):
         found[at] = (error[0], error[1], error[2])
@@ -168,29 +159,10 @@ def _score(
         rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS
     base = base_of(head.region)
     return Score(
-        query_id=head.query_id,
-        track=head.track,
-        suite=head.suite,
-        suite_version=head.suite_version,
-        part=head.part,
-        region=head.region,
+        **{name: getattr(head, name) for name in _HEAD_COLUMNS},
+        **{name: getattr(truth, name) for name in _TRUTH_COLUMNS},
         place=place_of.get(truth.block, base),
-        block=truth.block,
-        prior_group=head.prior_group,
-        view_cells=head.view_cells,
-        cell_size_m=head.cell_size_m,
         pool=len(head.candidates),
-        pair_id=truth.pair_id,
-        role=truth.role,
-        kind=truth.kind,
-        strength=truth.strength,
-        strength_unit=truth.strength_unit,
-        unknown_share=truth.unknown_share,
-        changed_share=truth.changed_share,
-        feature_density=truth.feature_density,
-        alias_index=truth.alias_index,
-        scene=truth.scene,
-        is_present=truth.is_present,
         status=MISSING if prediction is None else prediction.status,
         is_answered=first_pose(prediction) is not None,
         above=rank.above,

@@ -45,11 +45,15 @@ def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
         for kind, mine in stress.groupby("kind", sort=True):
             if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
                 continue
-            said = {**dict(zip(GROUP, key, strict=True)), "kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
+            columns = {
+                **dict(zip(GROUP, key, strict=True)),
+                "kind": kind,
+                "strength_unit": mine["strength_unit"].iloc[0],
+            }
             steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})
             for strength, size in steps:
                 name = step_name(str(kind), strength, size)
-                yield {**said, "stratum": name, "strength": strength, "view_cells": size}
+                yield {**columns, "stratum": name, "strength": strength, "view_cells": size}
             for size in sorted({size for _, size in steps} & {*sizes}):
                 name = control_name(size) if len(sizes) > 1 else CONTROL
-                yield {**said, "stratum": name, "strength": 0.0, "view_cells": size}
+                yield {**columns, "stratum": name, "strength": 0.0, "view_cells": size}

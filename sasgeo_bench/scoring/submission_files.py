@@ -24,12 +24,12 @@ from sasgeo_bench.running.prediction_rows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.tasks.task_rows import ASKED
 from sasgeo_bench.texts import json_text
 
-SAID: Final = "submission.json"
+SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"
-README: Final = "README.md"  # beside submissions, and no submission
+README: Final = "README.md"  # may lie among submissions
 MOST_BYTES: Final = 20_000_000  # of the predictions
 _MOST_CARD_BYTES: Final = 100_000
-_MOST_SAID_BYTES: Final = 5_000_000
+_MOST_SUBMISSION_BYTES: Final = 5_000_000
 _TEXTS: Final = ("query_id", "status", "message", ASKED)
 _LEVEL: Final = 19
 
@@ -69,25 +69,12 @@ def predictions_name(name: str) -> str:
 
 
 def write_submission(
-    folder: Path, said: Submission, predictions: Sequence[Prediction], asked: Mapping[str, str]
+    folder: Path, submission: Submission, predictions: Sequence[Prediction], asked: Mapping[str, str]
 ) -> Submission:
-    """Write a submission completely or not at all; the same answers give the same bytes.
+    """Write a submission completely or not at all, and return it with its files; the same answers give the same bytes.
 
-    Parameters
-    ----------
-    folder : Path
-        Has the name of the card; an older submission there is replaced.
-    said : Submission
-        Content of `submission.json`, without the files.
-    predictions : sequence of Prediction
-        The answers.
-    asked : mapping of str to str
-        Hash of each answered query, by query id.
-
-    Returns
-    -------
-    Submission
-        Content of `submission.json`.
+    The folder has the name of the card; an older submission there is replaced. `asked` holds the hash of each answered
+    query, by query id.
 
     Raises
     ------
@@ -95,8 +82,8 @@ def write_submission(
         If the folder holds something else or has another name, the predictions are too large, or writing fails; the
         folder is then unchanged.
     """
-    if folder.name != said.card.name:
-        message = f"{folder} must be named as the card is, {said.card.name!r}: name another folder"
+    if folder.name != submission.card.name:
+        message = f"{folder} must be named as the card is, {submission.card.name!r}: name another folder"
         raise StoreError(message)
     if os.path.lexists(folder) and not is_submission(folder) and (not folder.is_dir() or any(folder.iterdir())):
         message = f"{folder} holds something else than a submission, which would be lost: name another folder"
@@ -105,17 +92,17 @@ def write_submission(
         {**prediction_row(item), ASKED: asked[item.query_id]}
         for item in sorted(predictions, key=lambda item: item.query_id)
     ]
-    name = predictions_name(said.card.name)
+    name = predictions_name(submission.card.name)
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
             (scratch / PREDICTIONS).mkdir()
             table = pa.Table.from_pylist(rows, schema=RUN_SCHEMA)
             write_table(table, scratch / name, compression_level=_LEVEL, write_statistics=False)
             record = file_record(scratch / name)
-            _check_bytes(folder, record.bytes)
-            whole = said.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
+            _check_bytes(folder / name, record.bytes)
+            whole = submission.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
             text = json_text(whole.model_dump(mode="json"))
-            (scratch / SAID).write_text(text, encoding="utf-8")
+            (scratch / SUBMISSION).write_text(text, encoding="utf-8")
     except SasgeoError:
         raise
     except OSError as error:
@@ -124,10 +111,10 @@ def write_submission(
     return whole
 
 
-def _check_bytes(folder: Path, size: int) -> None:
+def _check_bytes(path: Path, size: int) -> None:
     if size > MOST_BYTES:
         message = (
-            f"{folder}: the predictions have {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer "
+            f"{path} has {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer "
             "candidates to each query (run --top-k)"
         )
         raise StoreError(message)
@@ -135,7 +122,7 @@ def _check_bytes(folder: Path, size: int) -> None:
 
 def is_submission(folder: Path) -> bool:
     """Return True if a folder holds a `submission.json`."""
-    return os.path.lexists(folder / SAID)
+    return os.path.lexists(folder / SUBMISSION)
 
 
 def list_submissions(folder: Path) -> tuple[Path, ...]:
@@ -154,7 +141,7 @@ def list_submissions(folder: Path) -> tuple[Path, ...]:
     found = tuple(path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.name != README)
     other = next((path for path in found if not is_submission(path)), None)
     if other is not None:
-        message = f"{other} is no submission, for it holds no {SAID}: remove it, or make it by 'submit'"
+        message = f"{other} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'"
         raise StoreError(message)
     return found
 
@@ -169,21 +156,20 @@ def read_submission(folder: Path) -> Submission:
     ConfigError
         If a field of `submission.json` is wrong; all faults on one line.
     """
-    _check_names(folder, {SAID, PREDICTIONS})
-    said = _read_said(folder / SAID)
-    name = predictions_name(said.card.name)
-    if folder.resolve().name != said.card.name:
-        message = f"{folder} holds the submission {said.card.name!r}: name the folder so"
+    _check_names(folder, {SUBMISSION, PREDICTIONS})
+    submission = _read_document(folder / SUBMISSION)
+    name = predictions_name(submission.card.name)
+    if folder.resolve().name != submission.card.name:
+        message = f"{folder} holds the submission {submission.card.name!r}: name the folder so"
         raise StoreError(message)
-    if list(said.files) != [name]:
-        message = (
-            f"{folder / SAID} speaks of the files {', '.join(said.files) or 'none'}, expected {name}: submit again"
-        )
+    if list(submission.files) != [name]:
+        listed = ", ".join(submission.files) or "none"
+        message = f"{folder / SUBMISSION} speaks of the files {listed}, expected {name}: submit again"
         raise StoreError(message)
     _check_names(folder / PREDICTIONS, {Path(name).name})
-    _check_file(folder / name, said.files[name])
+    _check_file(folder / name, submission.files[name])
     _check_table(folder / name)
-    return said
+    return submission
 
 
 def _check_names(folder: Path, expected: set[str]) -> None:
@@ -210,8 +196,8 @@ def _is_plain(entry: os.DirEntry[str]) -> bool:
     return entry.is_dir(follow_symlinks=False) if is_folder else entry.is_file(follow_symlinks=False)
 
 
-def _read_said(path: Path) -> Submission:
-    content = read_json(path, mend="submit again", most_bytes=_MOST_SAID_BYTES)
+def _read_document(path: Path) -> Submission:
+    content = read_json(path, mend="submit again", most_bytes=_MOST_SUBMISSION_BYTES)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         message = f"{path} has schema version {version!r}, this version reads {SCHEMA_VERSION}: submit again"
@@ -219,18 +205,13 @@ def _read_said(path: Path) -> Submission:
     return check_document(content, Submission, source=str(path))
 
 
-def _check_file(path: Path, said: FileSaid) -> None:
-    size = path.stat().st_size
-    if size > MOST_BYTES:
-        message = (
-            f"{path} has {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer candidates to each query"
-        )
-        raise StoreError(message)
+def _check_file(path: Path, expected: FileSaid) -> None:
+    _check_bytes(path, path.stat().st_size)
     found = file_record(path)
-    if (found.sha256, found.bytes) != (said.sha256, said.bytes):
+    if (found.sha256, found.bytes) != (expected.sha256, expected.bytes):
         message = (
-            f"{path} is not what {SAID} says: {found.bytes} bytes, SHA-256 {found.sha256}, "
-            f"expected {said.bytes} bytes, {said.sha256}: submit again"
+            f"{path} is not what {SUBMISSION} says: {found.bytes} bytes, SHA-256 {found.sha256}, "
+            f"expected {expected.bytes} bytes, {expected.sha256}: submit again"
         )
         raise StoreError(message)
 

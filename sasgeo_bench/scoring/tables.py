@@ -19,7 +19,7 @@ from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.intervals import Interval, bootstrap_means, effective_count, share_interval
 from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
 from sasgeo_bench.scoring.power import sensitivity
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, is_unranked, side_by_side, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS, strata
 
@@ -31,10 +31,10 @@ def leaderboard(
     scored: Mapping[str, pd.DataFrame],
     *,
     draws: int = DRAWS,
-    apart: Collection[str] = (),
+    excluded: Collection[str] = (),
     done: Callable[[], None] = lambda: None,
 ) -> pd.DataFrame:
-    """Return the metrics of every matcher on every suite, track, prior group and stratum.
+    """Return the metrics of every matcher on every suite, track, prior group and stratum, with the columns of `Row`.
 
     Parameters
     ----------
@@ -42,15 +42,10 @@ def leaderboard(
         By matcher, from `score.score_task`; all hold the same queries.
     draws : int
         Number of bootstrap draws.
-    apart : collection of str
+    excluded : collection of str
         Matchers without a rank, which are nobody's rivals; controls are always so.
     done : callable
         Called after each suite, track and prior group.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns as the fields of `Row`.
 
     Raises
     ------
@@ -58,8 +53,8 @@ def leaderboard(
         If two matchers were scored on different queries.
     """
     groups = _groups(_aligned(scored))
-    beside = frozenset({*apart, *filter(is_unranked, scored)})
-    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws, beside), groups, done))
+    unranked = frozenset({*excluded, *filter(is_unranked, scored)})
+    return to_frame(in_threads(lambda item: _rows_of_group(*item, draws, unranked), groups, done))
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -111,7 +106,7 @@ class _Group:
         columns = dict.fromkeys(quantile.column for quantile in QUANTILES)
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
 
-        def beside(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
+        def stacked(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
             return np.column_stack([np.asarray(column(frame)) for frame in frames.values()])
 
         return cls(
@@ -122,10 +117,10 @@ class _Group:
             blocks=codes[0],
             places=codes[1],
             sites=codes[2],
-            is_answered=beside(lambda frame: frame["is_answered"].to_numpy(bool)),
-            is_missing=beside(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
-            measured={metric.name: beside(metric.values) for metric in means_of(key[1])},
-            errors={name: beside(partial(_floats, name=name)) for name in columns},
+            is_answered=stacked(lambda frame: frame["is_answered"].to_numpy(bool)),
+            is_missing=stacked(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
+            measured={metric.name: stacked(metric.values) for metric in means_of(key[1])},
+            errors={name: stacked(partial(_floats, name=name)) for name in columns},
         )
 
 
@@ -169,7 +164,7 @@ class _Cell:
 
 
 def _rows_of_group(
-    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, beside: Collection[str]
+    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str]
 ) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
     for name, frame in frames.items():
@@ -177,7 +172,7 @@ def _rows_of_group(
             yield _not_applicable(name, key, frame)
     if not able:
         return
-    group = _Group.of(key, able, beside)
+    group = _Group.of(key, able, unranked)
     counted = {metric.name: metric.counts(group.first) for metric in means_of(key[1])}
     for stratum, inside in strata(group.first):
         by_count: dict[bytes, list[MeanMetric]] = {}
@@ -290,7 +285,7 @@ def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
     if not others or name not in group.rivals:
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
-    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks).detectable
+    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks)
 
 
 def cost_rows(matcher: str, costs: Costs) -> Iterator[Row]:

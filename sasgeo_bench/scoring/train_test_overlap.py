@@ -21,22 +21,22 @@ def set_apart(entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], spli
     """
     found = {}
     for entry in entries:
-        places = [] if is_unranked(entry.name) else sorted(set(_taught_and_asked(entry, scores[entry.name], split)))
+        places = [] if is_unranked(entry.name) else sorted(set(_overlaps(entry, scores[entry.name], split)))
         if places:
             what = places[0] if len(places) == 1 else named(places, "place")
             found[entry.name] = f"trained on {what}, which it is tested on"
     return found
 
 
-def _taught_and_asked(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterator[str]:
+def _overlaps(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterator[str]:
     """Yield places that the answers about them were trained on."""
     for place in dict.fromkeys(scores["place"]):
         if place in _declared(entry, str(place), split):
             yield str(place)
     for about in entry.runs:
-        said = LearnedSaid.of(about)
+        learned = LearnedSaid.of(about)
         is_mine = (scores["suite"] == about["suite"]) & (scores["region"] == about["region"])
-        yield from set() if said is None else set(scores.loc[is_mine, "place"]) & set(said.trained_on)
+        yield from set() if learned is None else set(scores.loc[is_mine, "place"]) & set(learned.trained_on)
 
 
 def _declared(entry: Entry, place: str, split: Split | None) -> Sequence[str]:

@@ -17,7 +17,7 @@ from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import differing_columns, prediction_of, row_faults
-from sasgeo_bench.scoring.submission_files import SAID, predictions_name
+from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.tasks.task_rows import ASKED
@@ -28,7 +28,7 @@ _ANSWERED: Final = "ok"
 _NO_ROW: Final = "no row for "
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Violation:
     """One fault: file, row index (-1 for the whole file), column, found and expected."""
 
@@ -58,13 +58,8 @@ class Violation:
 def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     """Yield the violations of predictions in the order of the rows, queries without a row last.
 
-    Parameters
-    ----------
-    path : Path
-        A predictions file, or a run's folder of parts, newest first, where a newer row replaces an older one.
-    tasks : sequence of Path
-        Task folders that it should answer, and no others. Rows of a run's folder that state other queries are skipped
-        (`set_aside` counts them).
+    `path` is a predictions file, or a run's folder of parts, where a newer row replaces an older one. It should answer
+    the tasks and no others. Rows of a run's folder that state other queries are skipped (`set_aside` counts them).
 
     Raises
     ------
@@ -89,7 +84,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
         table = prediction_files.read_part(file)
         differing = differing_columns(table)
         for column, found, expected in differing:
-            yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
+            yield Violation(file.name, -1, column, found, f"a column of {expected}")
         unread += bool(differing)
         wrong = {} if differing else _faults_by_row(file.name, table)
         for row, item in enumerate([] if differing else table.to_pylist()):
@@ -101,41 +96,30 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def submission_faults(
-    folder: Path, said: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
+    folder: Path, submission: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
 ) -> Iterator[Violation]:
     """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the submission; `read_submission` has checked its files.
-    said : Submission
-        From `read_submission`.
-    tasks : sequence of Path, optional
-        Task folders of the board, of which those that the submission names count. Without tasks, rows are not checked.
-    board : str
-        Id of the board; empty if unknown.
-    places : collection of str
-        Places of the board's split; if empty, declared training places are not checked.
+    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `board` is the board's id,
+    empty if unknown. `places` are those of its split; if empty, declared training places are not checked. Files and
+    hashes are checked by `read_submission`.
 
     Raises
     ------
     StoreError
         If a file cannot be read, or a task is of another version.
     """
-    yield from _said_faults(said, board, places)
-    if tasks is None or said.task_version not in TASK_VERSIONS:
+    yield from _card_faults(submission, board, places)
+    if tasks is None or submission.task_version not in TASK_VERSIONS:
         return
-    named = {(item.suite, item.region) for item in said.tasks}
+    named = {(item.suite, item.region) for item in submission.tasks}
     mine = [task for task in tasks if _name_of(task) in named]
     lost = sorted(named - {_name_of(task) for task in mine})
     for suite, region in lost:
-        yield Violation(
-            file=SAID, row=-1, column="tasks", found=f"{suite}/{region}", expected="tasks that the board holds"
-        )
+        yield Violation(SUBMISSION, -1, "tasks", f"{suite}/{region}", "tasks that the board holds")
     queries, asked = _asked_of(mine), _asked(mine)
     seen: dict[str, str] = {}
-    file = folder / predictions_name(said.card.name)
+    file = folder / predictions_name(submission.card.name)
     table = prediction_files.read_part(file)
     wrong = _faults_by_row(file.name, table)
     for row, item in enumerate(table.to_pylist()):
@@ -143,42 +127,34 @@ def submission_faults(
         yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
         if name in asked and item[ASKED] != asked[name]:
             yield Violation(
-                file=file.name,
-                row=row,
-                column=ASKED,
-                found=f"an answer to query {name} as it was drawn otherwise",
-                expected=f"{asked[name]}, for answers belong to queries: run and submit again",
+                file.name,
+                row,
+                ASKED,
+                f"an answer to query {name} as it was drawn otherwise",
+                f"{asked[name]}, for answers belong to queries: run and submit again",
             )
     yield from _missing(file.name, queries, seen)
 
 
-def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
+def _card_faults(submission: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
     """Yield the fields of a submission that do not fit a board."""
-    if said.task_version not in TASK_VERSIONS:
+    if submission.task_version not in TASK_VERSIONS:
         yield Violation(
-            file=SAID,
-            row=-1,
-            column="task_version",
-            found=str(said.task_version),
-            expected=f"{TASK_VERSION}: run and submit again",
+            SUBMISSION, -1, "task_version", str(submission.task_version), f"{TASK_VERSION}: run and submit again"
         )
-    if board and said.board != board:
-        yield Violation(file=SAID, row=-1, column="board", found=repr(said.board), expected=repr(board))
-    for place in said.card.places if places else ():
+    if board and submission.board != board:
+        yield Violation(SUBMISSION, -1, "board", repr(submission.board), repr(board))
+    for place in submission.card.places if places else ():
         if place not in places:
             near = difflib.get_close_matches(place, places, n=1)
             hint = f", did you mean {near[0]!r}?" if near else ": what else taught it goes into trained_elsewhere"
-            yield Violation(
-                file=SAID, row=-1, column="trained_on", found=repr(place), expected=f"places of the split{hint}"
-            )
+            yield Violation(SUBMISSION, -1, "trained_on", repr(place), f"places of the split{hint}")
 
 
 def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iterator[Violation]:
     for name in queries:
         if name not in seen:
-            yield Violation(
-                file=file, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
-            )
+            yield Violation(file, -1, "query_id", f"{_NO_ROW}{name}", "one for every query")
 
 
 def set_aside(path: Path, tasks: Sequence[Path]) -> int:
@@ -202,7 +178,7 @@ def set_aside(path: Path, tasks: Sequence[Path]) -> int:
 
 
 def _asked(tasks: Sequence[Path]) -> dict[str, str]:
-    return {name: said for task in tasks for name, said in task_files.read_asked(task).items()}
+    return {name: digest for task in tasks for name, digest in task_files.read_asked(task).items()}
 
 
 def _name_of(task: Path) -> tuple[str, str]:
@@ -253,7 +229,7 @@ def _faults_by_row(file: str, table: pa.Table) -> dict[int, list[Violation]]:
     """Return numbers, names and texts out of their bounds, by row."""
     found: dict[int, list[Violation]] = {}
     for one in row_faults(table):
-        wrong = Violation(file=file, row=one.row, column=one.column, found=one.found, expected=one.expected)
+        wrong = Violation(file, one.row, one.column, one.found, one.expected)
         found.setdefault(one.row, []).append(wrong)
     return found
 
@@ -268,14 +244,10 @@ def _row_faults(
 ) -> Iterator[Violation]:
     name = item["query_id"]
     if name not in queries:
-        yield Violation(
-            file=file, row=row, column="query_id", found=repr(name), expected="the id of a query of the tasks"
-        )
+        yield Violation(file, row, "query_id", repr(name), "the id of a query of the tasks")
         return
     if name in seen:
-        yield Violation(
-            file=file, row=row, column="query_id", found=f"{name} again ({seen[name]})", expected="each query once"
-        )
+        yield Violation(file, row, "query_id", f"{name} again ({seen[name]})", "each query once")
         return
     seen[name] = f"{file}, row {row}"
     if wrong:
@@ -284,13 +256,7 @@ def _row_faults(
     if item["status"] != _ANSWERED:
         if item["candidates"]:
             count = len(item["candidates"])
-            yield Violation(
-                file=file,
-                row=row,
-                column="candidates",
-                found=counted(count, "pose"),
-                expected=f"none with {item['status']}",
-            )
+            yield Violation(file, row, "candidates", counted(count, "pose"), f"none with {item['status']}")
         return
     yield from _answer_faults(file, row, item, queries[name])
 
@@ -309,7 +275,7 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) 
         _check_inside(match.poses, query)
     except MatchError as error:
         found, _, expected = str(error).partition(", expected ")
-        yield Violation(file=file, row=row, column="candidates", found=found, expected=expected or "an answer")
+        yield Violation(file, row, "candidates", found, expected or "an answer")
 
 
 def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:

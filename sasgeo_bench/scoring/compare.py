@@ -16,22 +16,14 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, block_codes, check_column
 from sasgeo_bench.scoring.intervals import LEVEL
 
-# Fewer blocks rank nobody and decide nothing: an exact test of their signs cannot reach 5 %, 2 / 2^5 being more.
+# With fewer blocks there are no ranks and no decisions: an exact sign test cannot reach 5 %, since 2 / 2^5 > 5 %.
 LEAST_BLOCKS: Final = 6
-_NOTHING: Final = 1e-12  # a difference of means this small is one of rounding
+_NOTHING: Final = 1e-12  # smaller differences of means are rounding errors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairedTest:
-    """Result of a paired test of two methods on the same queries.
-
-    Parameters
-    ----------
-    first_only, second_only : int
-        Discordant queries: right by the first method only, or by the second only.
-    p_value : float
-        Two-sided; 1 without discordant queries.
-    """
+    """Discordant queries, which only one of two methods got right, and the two-sided p-value (1 without any)."""
 
     first_only: int
     second_only: int
@@ -131,7 +123,7 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """
     wrong = next((name for name, value in p_values.items() if not 0 <= value <= 1), None)
     if wrong is not None:
-        message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; a contrast that was not tested has 1"
+        message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; an untested contrast has 1"
         raise MetricError(message)
     if not p_values:
         return {}

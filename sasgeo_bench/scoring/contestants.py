@@ -21,7 +21,7 @@ from sasgeo_bench.scoring.validate import submission_faults, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import Split
 
-MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+MOST_NAMED: Final = 3  # skipped runs in a message; the others are counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ def read_entry_answers(
         holder = "these tasks do" if is_chosen else "its task does"
         message = (
             f"{refused or stale[0]} holds answers to other queries than {holder} now: "
-            "run again (what is answered already is kept), or make the old queries again"
+            "run again (existing answers are kept), or make the old queries again"
         )
         raise StoreError(message)
     if not answers:
@@ -182,7 +182,7 @@ def score_entries(
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
             scored = _scored(item, tasks, split, by_region)
-            hold_controls({item.entry.name: scored})  # so that whoever it fails with is known
+            hold_controls({item.entry.name: scored})  # so that an error names the entry
             found[item.entry.name] = scored
     if not found and failures.first is not None:
         raise failures.first

@@ -29,7 +29,7 @@ from sasgeo_bench.scoring.power import sensitivity
 from sasgeo_bench.scoring.rejection import answers_of
 
 ALPHA: Final = 0.05
-LESS_THAN_MATTERS: Final = ", by less than would matter"  # ends a verdict
+LESS_THAN_MATTERS: Final = ", by less than would matter"  # suffix of a verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

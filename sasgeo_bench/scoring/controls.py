@@ -16,8 +16,8 @@ from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
 ORACLE: Final = "oracle_pose"
-REFERENCE: Final = "fft_vote"  # the plainest search there is: a view without error it must find
-ALPHA: Final = 1e-4  # of each test against chance: a board holds dozens of them
+REFERENCE: Final = "fft_vote"  # the simplest search: it must find a view without error
+ALPHA: Final = 1e-4  # level of each test against chance; a board has dozens
 NEARLY_ALL: Final = 0.9
 _AT_CHANCE: Final = {
     SHUFFLED: "shuffled map at chance",

@@ -20,18 +20,8 @@ BYTES_PER_MB: Final = 1e6
 class RunCost:
     """Cost of a run on one map; NaN where `run.json` does not state it.
 
-    Parameters
-    ----------
-    prepare_s : float
-        Duration of `prepare`, without answers.
-    peak_rss_mb : float
-        Peak memory of the matcher's process and its children (1 MB = 10^6 bytes).
-    index_mb : float
-        Files that the matcher wrote for the map.
-    map_mb : float
-        Files of the region.
-    cpu_s : float
-        CPU time of all answers together.
+    `prepare_s` excludes answers, `peak_rss_mb` includes child processes (1 MB = 10^6 bytes), `index_mb` are the
+    matcher's files and `map_mb` the region's, `cpu_s` is that of all answers together.
     """
 
     prepare_s: float

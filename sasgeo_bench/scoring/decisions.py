@@ -51,7 +51,7 @@ class Answers:
     is_answered: Bools
     is_right: Bools
     is_present: Bools
-    tie: Ints = field(init=False)  # group of equal confidence, 0 the most confident; the unanswered are the last group
+    tie: Ints = field(init=False)  # group of equal confidence, 0 the highest; queries without an answer are the last
     steps: Floats = field(init=False)  # confidence of each group; -inf for answers without one
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Floats, Ints, block_codes
 
 DRAWS: Final = 10_000
-_CHUNK_CELLS: Final = 2**21  # draws times queries held at once: 16 MB a column of numbers, some ten columns at most
+_CHUNK_CELLS: Final = 2**21  # draws x queries in memory at once: 16 MB per column, about ten columns at most
 
 
 def seed_of_text(text: str) -> int:
@@ -70,7 +70,7 @@ class ClusterDraws:
     count: int = field(init=False)  # of queries
     blocks_count: int = field(init=False)
     _sites_count: int = field(init=False, repr=False)
-    _site: Ints | None = field(init=False, repr=False)  # number of each query's site; None where it is the query's own
+    _site: Ints | None = field(init=False, repr=False)  # site of each query; None if each has its own
     _sizes: tuple[tuple[int, Ints, Ints], ...] = field(init=False, repr=False)  # size, blocks (K,), sites (K, size)
 
     def __post_init__(self) -> None:
@@ -134,7 +134,7 @@ class ClusterDraws:
             if size == 1 or not self.draws_within:
                 yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=None)
                 continue
-            # Of each draw and block so many sites are drawn from `size`.
+            # For each draw and block, as many sites are drawn as the block has, times its copies.
             within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=_small(size))
             yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=within)
 
@@ -144,7 +144,7 @@ def _numbered(block: Ints, sites: Sequence[str] | Ints | None) -> tuple[Ints, In
     if sites is None:
         return np.arange(len(block)), np.arange(len(block))
     _, code = block_codes(sites, len(block))
-    within = block * (1 + int(code.max(initial=0))) + code  # a site that reaches into two blocks is one in each
+    within = block * (1 + int(code.max(initial=0))) + code  # a site in two blocks counts as two
     _, first, inverse = np.unique(within, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse], np.sort(first)
 

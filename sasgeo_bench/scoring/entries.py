@@ -92,7 +92,7 @@ def find_entries(
     """
     runs: list[Path] = []
     files: list[Entry] = []
-    seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
+    seen: set[Path] = set()  # a run or file that is given twice counts once
     for path in paths:
         if path.is_file():
             if _is_new(path, seen):
@@ -137,7 +137,7 @@ def find_entries(
         None,
     )
     if twice is not None:
-        message = f"two contestants are named {twice!r}: rename the file or the submission of one"
+        message = f"two entries are named {twice!r}: rename the file or the submission of one"
         raise ConfigError(message)
     return tuple(sorted(entries, key=lambda entry: entry.name))
 

@@ -12,7 +12,7 @@ from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, both_on, mean_finding
 from sasgeo_bench.scoring.draws import DRAWS
 
-EVERY: Final = "all"  # suites, or kinds of one
+EVERY: Final = "all"  # suites, or kinds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,8 +18,8 @@ from sasgeo_bench.scoring.rejection import answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads
 
 AS_DRAWN: Final = "as drawn"
-_CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take twice the time
-SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
+_CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
+SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
 _NO_DRAWS: Final = np.empty(0)
 
 
@@ -52,7 +52,7 @@ def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibr
 
 def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -> Iterator[Row]:
     some = answers_of(part)
-    # Of the queries alone, so that two rejectors are drawn alike.
+    # The seed depends on the queries alone, so that all rejectors share draws.
     seed = seed_of_text(f"{key.suite}/{key.track}/{key.prior_group}")
     sites = np.unique(part["pair_id"], return_inverse=True)[1]
     drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)

@@ -67,7 +67,7 @@ def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval
     if trials == 0:
         return Interval(value=float("nan"), lo=0.0, hi=1.0)
     lo, hi = proportion_confint(successes, trials, alpha=1.0 - level, method="wilson")
-    # Rounding leaves 0 of n and n of n a little inside their exact ends.
+    # Rounding moves the ends of 0 of n and n of n slightly inwards.
     lo, hi = (0.0 if successes == 0 else float(lo)), (1.0 if successes == trials else float(hi))
     return Interval(value=successes / trials, lo=lo, hi=hi)
 

@@ -170,14 +170,14 @@ FALSE_ABSENT: Final = MeanMetric(
     values=_answers,
     counts=is_absent,
 )
-WITHIN: Final = _mean(  # next to the primary metric: what a wrong heading takes away
+WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metric
     name="within_25m",
     meaning="The same as success_25m whatever the heading: what counts as a fix that is not false",
     source="share of queries within metres",
     tracks=TRACKS[:1],
     values=partial(_successes, within_m=SUCCESS_M[0], within_deg=180.0),
 )
-CHANCE: Final = _mean(  # the same for every matcher, so that a board says what guessing reaches
+CHANCE: Final = _mean(  # the same for every matcher
     name="chance_1",
     meaning="What guessing among the candidates reaches",
     source="1 / number of candidates",

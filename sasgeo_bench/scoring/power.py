@@ -15,7 +15,7 @@ from sasgeo_bench.scoring.base import Ints, block_codes, check_column
 
 ALPHA: Final = 0.05
 POWER: Final = 0.8
-_NOTHING: Final = 1e-12  # a spread this small is one of rounding
+_NOTHING: Final = 1e-12  # a smaller spread is a rounding error
 
 
 def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> float:

@@ -113,7 +113,7 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     sure = f" ({100 * confidence:g} % confidence)"
     if at_most < risk:
         return f"{claim}{100 * risk:g} %{sure}"
-    if failures == trials:  # none of none, too
+    if failures == trials:  # also 0 of 0
         return f"{failures:.4g} of {trials:.4g} support no bound{sure}"
     # Rounded up: below 2.951 % is not below 2.95 %.
     scale = 10.0 ** (_DIGITS - 1 - math.floor(math.log10(100 * at_most)))

@@ -89,7 +89,7 @@ def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequ
     given: set[int] = set()
     right = []
     for pose, _ in prediction.candidates:
-        # As in `matcher.check_match`: of two candidates on one spot, the first not given yet.
+        # As in `matcher.check_match`: of two candidates at one position, the first one not used yet.
         at = next((index for index in candidates_at(pose, candidates) if index not in given), -1)
         given.add(at)
         right.append(at == truth.candidate)

@@ -22,11 +22,11 @@ from sasgeo_bench.scoring.integrity_metric import choose_threshold
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
 
-OWN: Final = "own"  # what a board calls a matcher's own confidence; no rejector can have the name
+OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
 RISKS: Final = (0.01, 0.05)
 _NUMBER: Final = r"\d+(?:\.\d+)?"
 _SAID: Final = ("p_right", "remark", "is_calibrated")
-_PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
+_PARTS: Final = 5  # folds of the calibration blocks: thresholds need answers that the rejector was not fitted on
 
 Make = Callable[[], Rejector]
 
@@ -240,7 +240,7 @@ def _fit_and_say(
         if some:
             found[is_answered] = check_p_false(rejector.p_false(some), len(some))
         remark = remark_of(rejector)
-    except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+    except (Exception, SystemExit) as error:  # a plugin must not end the program
         message = f"rejector {rejector.card.name!r} failed ({told(error)}): mend it, or leave it out"
         raise MatchError(message) from error
     return found, remark

@@ -56,7 +56,7 @@ def _evaluated(task: RejectionTask) -> RejectionResult:
         try:
             frame = _rows_of(task, name)
             rows += [_metrics(task, name, frame)] if len(frame) else []
-        except Exception as error:  # noqa: BLE001 - these answers and this rejector alone do without a figure
+        except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
             failed[name] = error
             continue
         if len(frame) or name != OWN:

@@ -15,12 +15,12 @@ from sasgeo_bench.scoring.metrics import Metric
 from sasgeo_bench.scoring.score import MISSING
 
 ALL_SUITES: Final = "all suites"
-AS_SUBMITTED: Final = "as submitted"  # how answers came: their author gave them,
-RUN_HERE: Final = "run here"  # or we ran the code, on queries of a public seed alone,
-REPRODUCED: Final = "reproduced"  # or on a private seed too, where it is not shown to do worse,
-NOT_REPRODUCED: Final = "not reproduced"  # or where it is
-UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: beside the ranks
-YARDSTICK: Final = "oracle_"  # how the names of yardsticks begin, which know what no matcher can: beside the ranks, too
+AS_SUBMITTED: Final = "as submitted"  # source of the answers: their author,
+RUN_HERE: Final = "run here"  # our run of the code, on queries of a public seed only,
+REPRODUCED: Final = "reproduced"  # or of a private seed too, where it is not shown to be worse,
+NOT_REPRODUCED: Final = "not reproduced"  # or is shown to be worse
+UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: not ranked
+YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth: not ranked either
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Item = TypeVar("Item")
@@ -182,7 +182,7 @@ def bare(value: float) -> Interval:
 def to_frame(rows: list[Row]) -> pd.DataFrame:
     """Return rows as a table with the columns of `Row`."""
     frame = pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
-    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # whole numbers, and none where none is
+    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # integers or missing
 
 
 @dataclass(frozen=True, slots=True)

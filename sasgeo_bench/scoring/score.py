@@ -16,8 +16,8 @@ from sasgeo_bench.scoring.pose import first_pose, pose_errors
 from sasgeo_bench.scoring.ranking import MISS, Rank, rank_candidate, rank_of
 from sasgeo_bench.tasks.query import Head, Truth, base_of
 
-SCORER_VERSION: Final = 4  # raised whenever the same predictions get other figures; rows of two never share a board
-FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false, on either track
+SCORER_VERSION: Final = 4  # raise it if the same predictions get other scores; a board has one version
+FIX_M: Final = 25.0  # mission tolerance e_max of Eq. 12: a fix beyond it is false, on both tracks
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"
 
@@ -153,7 +153,7 @@ def _score(
     head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, place_of: Mapping[str, str]
 ) -> Score:
     rank = MISS
-    is_right = errors[0] <= FIX_M  # a candidate's heading is given and its place was moved by chance: no errors of it
+    is_right = errors[0] <= FIX_M  # retrieval candidates have a given heading and a random offset, so no errors below
     if head.track == "retrieval":
         errors = _NO_ERROR
         rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS

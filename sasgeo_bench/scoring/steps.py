@@ -45,11 +45,8 @@ def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
         for kind, mine in stress.groupby("kind", sort=True):
             if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
                 continue
-            columns = {
-                **dict(zip(GROUP, key, strict=True)),
-                "kind": kind,
-                "strength_unit": mine["strength_unit"].iloc[0],
-            }
+            columns = dict(zip(GROUP, key, strict=True))
+            columns |= {"kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
             steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})
             for strength, size in steps:
                 name = step_name(str(kind), strength, size)

@@ -13,16 +13,14 @@ from sasgeo_bench.scoring.base import Bools
 ALL: Final = "all"
 STRESS: Final = "stress"
 CONTROL: Final = "control"
-_MOST_STEPS: Final = 24  # more are no steps: a strength drawn from a range is another one for each query
-_EDGES: Final = {  # fixed, so that boards can be compared
+_MOST_STEPS: Final = 24  # more are no steps: each query has its own random strength
+_EDGES: Final = {  # fixed, to keep boards comparable
     "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
     "changed_share": (0.0, 0.1, 0.2, 0.4, 1.0),
     "feature_density": (0.0, 0.05, 0.1, 0.2, 1.0),
     "alias_index": (0.0, 0.7, 0.8, 0.9, 1.0),
 }
-
-
-_MAPPING: Final = ("real-age",)  # suites whose maps differ mostly by how much was mapped, not by what was built
+_MAPPING: Final = ("real-age",)  # suites whose maps differ mostly in completeness, not in construction
 
 
 def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:

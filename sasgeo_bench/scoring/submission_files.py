@@ -52,7 +52,7 @@ def _text_of(path: Path, most_bytes: int, noun: str) -> str:
     try:
         with path.open("rb") as source:
             read = source.read(most_bytes + 1)
-        text = read.decode("utf-8-sig")  # some editors begin a file with a mark of its byte order
+        text = read.decode("utf-8-sig")  # some editors write a byte order mark
     except (UnicodeDecodeError, OSError) as error:
         fault = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
         message = f"{path} cannot be read ({fault}): name {noun}"
@@ -164,7 +164,7 @@ def read_submission(folder: Path) -> Submission:
         raise StoreError(message)
     if list(submission.files) != [name]:
         listed = ", ".join(submission.files) or "none"
-        message = f"{folder / SUBMISSION} speaks of the files {listed}, expected {name}: submit again"
+        message = f"{folder / SUBMISSION} lists the files {listed}, expected {name}: submit again"
         raise StoreError(message)
     _check_names(folder / PREDICTIONS, {Path(name).name})
     _check_file(folder / name, submission.files[name])
@@ -221,7 +221,7 @@ def _check_table(path: Path) -> None:
     with open_table(path, mend="submit again") as source:
         _check_schema(path, source.schema_arrow)
     with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
-        texts = source.read(columns=list(_TEXTS))  # each text once, however often it stands there
+        texts = source.read(columns=list(_TEXTS))  # each distinct text once
     for name in _TEXTS:
         known = (text for chunk in texts[name].chunks for text in chunk.dictionary if text.is_valid)
         longest = max((len(text.as_buffer()) for text in known), default=0)

@@ -21,9 +21,9 @@ from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileM
 from sasgeo_bench.scoring.power import sensitivity
 from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
+from sasgeo_bench.scoring.steps import GROUP
 from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS, strata
 
-GROUP: Final = ("suite", "track", "prior_group")
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -89,8 +89,8 @@ class _Group:
 
     key: tuple[str, str, str]
     names: tuple[str, ...]
-    rivals: tuple[str, ...]  # those of them that are ranked
-    first: pd.DataFrame  # rows of any matcher: what they say of the queries is the same in all
+    rivals: tuple[str, ...]  # the ranked ones
+    first: pd.DataFrame  # rows of any matcher: query columns are the same for all
     blocks: Ints
     places: Ints
     sites: Ints

@@ -78,7 +78,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
         parent: prediction_files.asked_in(parent, asked) for parent in {file.parent for file in files} if path.is_dir()
     }
     unread = 0
-    # In a run's folder a query stands twice where it was asked again: the newer row counts.
+    # In a run's folder a query that was asked again has two rows: the newer one counts.
     for file in reversed(files):
         before = frozenset(seen) if path.is_dir() else frozenset()
         table = prediction_files.read_part(file)
@@ -131,7 +131,7 @@ def submission_faults(
                 row,
                 ASKED,
                 f"an answer to query {name} as it was drawn otherwise",
-                f"{asked[name]}, for answers belong to queries: run and submit again",
+                f"{asked[name]}: run and submit again",
             )
     yield from _missing(file.name, queries, seen)
 
@@ -147,7 +147,7 @@ def _card_faults(submission: Submission, board: str, places: Collection[str]) ->
     for place in submission.card.places if places else ():
         if place not in places:
             near = difflib.get_close_matches(place, places, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else ": what else taught it goes into trained_elsewhere"
+            hint = f", did you mean {near[0]!r}?" if near else ": other training data belongs into trained_elsewhere"
             yield Violation(SUBMISSION, -1, "trained_on", repr(place), f"places of the split{hint}")
 
 

@@ -58,9 +58,7 @@ def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval
     >>> round(found.lo, 3), round(found.hi, 3)
     (0.52, 0.649)
     """
-    if not 0 < level < 1:
-        message = f"level must lie in (0, 1), got {level!r}"
-        raise MetricError(message)
+    _check_level(level)
     if not 0 <= successes <= trials < np.inf:
         message = f"successes must lie between 0 and the trials, got {successes!r} of {trials!r}"
         raise MetricError(message)
@@ -70,6 +68,12 @@ def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval
     # Rounding moves the ends of 0 of n and n of n slightly inwards.
     lo, hi = (0.0 if successes == 0 else float(lo)), (1.0 if successes == trials else float(hi))
     return Interval(value=successes / trials, lo=lo, hi=hi)
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        message = f"level must lie in (0, 1), got {level!r}"
+        raise MetricError(message)
 
 
 def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Interval:
@@ -145,19 +149,20 @@ def bootstrap_statistic(statistic: Statistic, drawn: ClusterDraws, weights: Arra
     return np.array([statistic(row * mass) for some in drawn.weights() for row in some], dtype=np.float64)
 
 
-def percentile_interval(value: float, draws: ArrayLike) -> Interval:
-    """Return the 95 % interval between percentiles of the draws, shape (D,), without NaN; NaN where none is left.
+def percentile_interval(value: float, draws: ArrayLike, *, level: float = LEVEL) -> Interval:
+    """Return the interval between percentiles of the draws, shape (D,), without NaN; NaN where none is left.
 
     Examples
     --------
     >>> percentile_interval(0.5, np.linspace(0.0, 1.0, 1001))
     Interval(value=0.5, lo=0.025, hi=0.975)
     """
+    _check_level(level)
     column = np.asarray(draws, dtype=np.float64)
     column = column[~np.isnan(column)]
     if not len(column):
         return Interval(value=value, lo=float("nan"), hi=float("nan"))
-    tail = (1.0 - LEVEL) / 2
+    tail = (1.0 - level) / 2
     lo, hi = np.quantile(column, [tail, 1.0 - tail], method="inverted_cdf")
     return Interval(value=value, lo=float(lo), hi=float(hi))
 
@@ -251,5 +256,5 @@ def mean_interval(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | N
     """
     column = check_column(values, "values", drawn.count)
     value = weighted_mean(column, weights)
-    draws = bootstrap_means(column, drawn, weights) if drawn.blocks_count > 1 else []
+    draws = bootstrap_means(column, drawn, weights) if drawn.blocks_count > 1 else np.empty(0)
     return percentile_interval(value, draws)

@@ -12,7 +12,7 @@ from sasgeo_bench.leaderboard.board_files import Extra, write_board
 from sasgeo_bench.leaderboard.board_plots import Page, page
 from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict, verdict_frame
-from sasgeo_bench.scoring.rows import RUN_HERE, Contestant, Row, to_frame, with_contestants
+from sasgeo_bench.scoring.rows import RUN_HERE, EntryLabel, Row, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.scoring.test_tables import scores
@@ -89,12 +89,12 @@ def about_of(entries, **changes):
 def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):
     """Write a board of these parts."""
     table = to_frame([]) if table is None else table
-    named = {entry["name"]: Contestant(entry["version"], entry["hash"], RUN_HERE) for entry in entries}
-    nobody = Contestant("1", "", RUN_HERE)
+    named = {entry["name"]: EntryLabel(entry["version"], entry["hash"], RUN_HERE) for entry in entries}
+    nobody = EntryLabel("1", "", RUN_HERE)
     write_board(
         folder,
         tables={
-            "leaderboard": with_contestants(table, dict.fromkeys(table["matcher"], nobody) | named),
+            "leaderboard": with_entry_labels(table, dict.fromkeys(table["matcher"], nobody) | named),
             "scores": pd.DataFrame() if scored is None else scored,
             "contrasts": contrast_frame(findings),
             "controls": verdict_frame(verdicts),

@@ -39,7 +39,7 @@ from sasgeo_bench.leaderboard.pooled_tables import (
 )
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.scoring.contrasts import Contrast, by_place
-from sasgeo_bench.scoring.protection import ToldLevels, told_levels
+from sasgeo_bench.scoring.protection import ProtectionLevels, protection_levels
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
 from sasgeo_bench.tasks.split import Split
@@ -153,9 +153,9 @@ def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
 
 def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named:
     """Yield a panel for each matcher and method, of few matchers, those of contrasts first."""
-    found: dict[tuple[str, float], dict[tuple[str, str], ToldLevels]] = {}
+    found: dict[tuple[str, float], dict[tuple[str, str], ProtectionLevels]] = {}
     for matcher in (name for name in shown if name in board.scores):
-        for item in told_levels(board.scores[matcher], board.predictions[matcher], split):
+        for item in protection_levels(board.scores[matcher], board.predictions[matcher], split):
             key = item.prior_group, item.risk
             rows = {name for name, _ in found.get(key, ())} | {matcher}
             if len(item.level_m) and len(rows) <= MOST_STANFORD:

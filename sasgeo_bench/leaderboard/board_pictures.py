@@ -302,7 +302,7 @@ def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_
     Parameters
     ----------
     words : mapping of (matcher, rejector) to pandas.DataFrame
-        Judged rows by query id.
+        RejectionResult rows by query id.
     matcher, query_id : str
         Whose answer to what.
     """

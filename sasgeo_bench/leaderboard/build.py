@@ -24,7 +24,7 @@ from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import LOG, Failures, log_beside, stops_all
 from sasgeo_bench.running.sandbox import joined
-from sasgeo_bench.scoring.contestants import Told, read_told, score_told
+from sasgeo_bench.scoring.contestants import EntryAnswers, read_entry_answers, score_entries
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.scoring.cost import Costs
@@ -34,8 +34,8 @@ from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame, hold_fal
 from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.scoring.protection import protection_frame
 from sasgeo_bench.scoring.rejection import OWN, Rule, remarks_of, rules_of
-from sasgeo_bench.scoring.rejector_evaluation import Judging, carry_out
-from sasgeo_bench.scoring.rows import Contestant, name_alone, to_frame, with_contestants
+from sasgeo_bench.scoring.rejector_evaluation import RejectionTask, apply_rejectors
+from sasgeo_bench.scoring.rows import EntryLabel, name_alone, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.scored_tasks import ScoredTask, read_scored_task
 from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
@@ -187,11 +187,13 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progr
     names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
     failures.found |= {name: why for name, why in request.failed.items() if name not in names}
     wanted = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
-    told = read_told(entries, wanted, root=request.root, named=request.predictions, tell=tell, failures=failures)
+    told = read_entry_answers(
+        entries, wanted, root=request.root, named=request.predictions, tell=tell, failures=failures
+    )
     folders = list(dict.fromkeys(wanted)) or sorted({folder for item in told for folder in item.held})
     tasks = [read_scored_task(folder, request.truth or request.root / "truth") for folder in folders]
     seed_of([task.about for task in tasks])
-    everything = score_told(told, tasks, split=request.split, by_region=request.by_region, failures=failures)
+    everything = score_entries(told, tasks, split=request.split, by_region=request.by_region, failures=failures)
     told = [item for item in told if item.entry.name in everything]
     predictions = {item.entry.name: item.predictions for item in told}
     verdicts = hold_controls(everything)
@@ -215,7 +217,7 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progr
     _check_rejectors(rules, entries, failures)
     remarks = _remarks(all_judged, tell)
     figures = pd.concat([item for item in rows if len(item)], ignore_index=True)
-    table = with_contestants(figures, _contestants(entries, apart))
+    table = with_entry_labels(figures, _contestants(entries, apart))
     findings = hold_contrasts(request.contrasts, scores, all_judged, draws=request.draws, failed=failures.found)
     held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failures.found]
     board = Board(
@@ -279,17 +281,17 @@ Judgement = dict[tuple[str, str], pd.DataFrame]
 
 
 def _all_judged(
-    judgings: Sequence[Judging], request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress
+    judgings: Sequence[RejectionTask], request: ScoreRequest, failures: Failures, tell: Tell, progress: Progress
 ) -> tuple[Judgement, list[pd.DataFrame]]:
     """Return the results of rejectors by matcher and rejector, and their rows of the board."""
     said: Judgement = {}
     rows: list[pd.DataFrame] = []
     progress.begin(JUDGED, len(judgings))
-    for judged in carry_out(judgings, jobs=request.jobs):
+    for judged in apply_rejectors(judgings, jobs=request.jobs):
         rows += judged.rows
         progress.advance(JUDGED, 1)
-        said |= {(judged.matcher, name): frame for name, frame in judged.said.items()}
-        for line in judged.lines:
+        said |= {(judged.matcher, name): frame for name, frame in judged.by_rejector.items()}
+        for line in judged.skipped:
             tell(line)
         for name, fault in judged.failed.items():
             failures.note(f"{judged.matcher} x {name}", fault)
@@ -343,10 +345,10 @@ def _judgings(
     predictions: Mapping[str, Mapping[str, Prediction]],
     rules: Mapping[str, Rule],
     split: Split | None,
-) -> list[Judging]:
+) -> list[RejectionTask]:
     """Return the answers of each entry that rejectors estimate."""
     return [
-        Judging(
+        RejectionTask(
             matcher=entry.name,
             scores=scores[entry.name],
             predictions=predictions[entry.name],
@@ -392,8 +394,8 @@ def _on_private(
     return found
 
 
-def _contestants(entries: Sequence[Entry], apart: Mapping[str, str]) -> dict[str, Contestant]:
-    return {entry.name: Contestant(entry.version, entry.hash, entry.how, apart.get(entry.name)) for entry in entries}
+def _contestants(entries: Sequence[Entry], apart: Mapping[str, str]) -> dict[str, EntryLabel]:
+    return {entry.name: EntryLabel(entry.version, entry.hash, entry.how, apart.get(entry.name)) for entry in entries}
 
 
 def _check_some(scores: Mapping[str, pd.DataFrame]) -> None:
@@ -442,7 +444,7 @@ def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
     return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
 
 
-def _asked_whole(told: Sequence[Told], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
+def _asked_whole(told: Sequence[EntryAnswers], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
     """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
     suites = {task.about["suite"] for task in tasks}
     found = {}
@@ -474,7 +476,7 @@ def _leaderboards(
         leaderboard(
             {name: _ranked(scores[name], suites) for name in names},
             draws=draws,
-            apart=apart,
+            excluded=apart,
             done=lambda: progress.advance(INTERVALS, 1),
         )
         for names, suites in asked_by.items()

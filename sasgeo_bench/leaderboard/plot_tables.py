@@ -13,7 +13,7 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import effective_count, wilson
-from sasgeo_bench.scoring.protection import ToldLevels
+from sasgeo_bench.scoring.protection import ProtectionLevels
 from sasgeo_bench.scoring.rejection import answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_apart, is_unranked
 from sasgeo_bench.scoring.steps import GROUP, primary_rows
@@ -130,7 +130,7 @@ def risk_frame(judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[s
     Parameters
     ----------
     judged : mapping of (matcher, rejector) to pandas.DataFrame
-        From `rejection.judge` and `rejection.own_word`.
+        From `rejection.judge` and `rejection.own_confidence`.
     shown : sequence of str
         Matchers.
 
@@ -182,7 +182,7 @@ def reliability_frame(
     Parameters
     ----------
     judged : mapping of (matcher, rejector) to pandas.DataFrame
-        From `rejection.judge` and `rejection.own_word`.
+        From `rejection.judge` and `rejection.own_confidence`.
     calibrated : collection of (matcher, rejector)
         Those that give probabilities.
     shown : sequence of str
@@ -236,7 +236,7 @@ def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[dict[str, float]]
 # --- protection levels ------------------------------------------------------------------------------------------------
 
 
-def stanford_cells(told: ToldLevels) -> pd.DataFrame:
+def stanford_cells(told: ProtectionLevels) -> pd.DataFrame:
     """Queries counted in cells of error and level, eight to a decade on each side.
 
     Returns
@@ -256,7 +256,7 @@ def _middles(values_m: Floats) -> Floats:
     return np.asarray(np.where(values_m > MOST_M, BEYOND_M, middles))
 
 
-def stanford_areas(told: ToldLevels, limit_m: float) -> dict[str, int]:
+def stanford_areas(told: ProtectionLevels, limit_m: float) -> dict[str, int]:
     """Count queries that are available, unavailable, misleading and hazardously misleading.
 
     Misleading ones are those within the alert limit, so that the four add up.
@@ -264,7 +264,7 @@ def stanford_areas(told: ToldLevels, limit_m: float) -> dict[str, int]:
     Examples
     --------
     >>> levels = {"level_m": np.array([5.0, 5.0, 5.0, 99.0]), "error_m": np.array([1.0, 9.0, 60.0, 1.0])}
-    >>> some = ToldLevels(prior_group="r", method="gauss", risk=0.01, sites=np.array(["a"] * 4), **levels)
+    >>> some = ProtectionLevels(prior_group="r", method="gauss", risk=0.01, sites=np.array(["a"] * 4), **levels)
     >>> stanford_areas(some, 25.0)
     {'available': 1, 'unavailable': 1, 'misleading': 1, 'hazardous': 1}
     """

@@ -27,7 +27,7 @@ from sasgeo_bench.leaderboard.board_plots import FAINT, GREY, Page, look_of, pag
 from sasgeo_bench.leaderboard.plot_tables import AS_DRAWN, BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, PlaceDifference
 from sasgeo_bench.scoring.metrics import primary_of
-from sasgeo_bench.scoring.protection import ToldLevels
+from sasgeo_bench.scoring.protection import ProtectionLevels
 from sasgeo_bench.scoring.rows import ALL_SUITES
 
 _DODGE: Final = 0.011  # of an axis, between two matchers at one step
@@ -370,14 +370,14 @@ def _reliable(chart: Axes, mine: pd.DataFrame) -> None:
 # --- protection levels ------------------------------------------------------------------------------------------------
 
 
-def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_m: float) -> None:
+def draw_stanford(path: Path, told: Mapping[tuple[str, str], ProtectionLevels], limit_m: float) -> None:
     """Draw protection levels against errors: a panel for each matcher and method.
 
     Parameters
     ----------
     path : Path
         A .svg or .png to write.
-    told : mapping of (matcher, method) to ToldLevels
+    told : mapping of (matcher, method) to ProtectionLevels
         Of one prior group and risk.
     limit_m : float
         Alert limit.
@@ -412,7 +412,7 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ToldLevels], limit_
             line[0].set_ylabel("protection level (m)")
 
 
-def _available(item: ToldLevels | None, limit_m: float) -> str:
+def _available(item: ProtectionLevels | None, limit_m: float) -> str:
     """Return the number of queries, and of those with a level that holds and is available."""
     if item is None:
         return "tells none"
@@ -438,7 +438,7 @@ def _stanford_axes(chart: Axes, limit_m: float) -> None:
     chart.plot([limit_m, limit_m], [LEAST_M, limit_m], color="#000000", lw=0.7, ls="--")
 
 
-def _stanford(chart: Axes, item: ToldLevels, cells: pd.DataFrame, limit_m: float, most: int) -> None:
+def _stanford(chart: Axes, item: ProtectionLevels, cells: pd.DataFrame, limit_m: float, most: int) -> None:
     chart.scatter(
         cells["error_m"],
         cells["level_m"],

@@ -250,7 +250,7 @@ def cost_frame(
     Parameters
     ----------
     judged : mapping of (matcher, rejector) to pandas.DataFrame
-        From `rejection.judge` and `rejection.own_word`.
+        From `rejection.judge` and `rejection.own_confidence`.
     calibrated : collection of (matcher, rejector)
         Those that give probabilities.
     shown : sequence of str

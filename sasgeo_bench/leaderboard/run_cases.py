@@ -20,7 +20,7 @@ from sasgeo_bench.progress import Tell
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
-from sasgeo_bench.scoring.rejection import OWN, judge, own_word, rules_of
+from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
 from sasgeo_bench.scoring.score import score_task, settle_not_applicable
 from sasgeo_bench.scoring.scored_tasks import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.tasks import task_files
@@ -161,7 +161,7 @@ def _judged(
     """Return the results of the matcher's own confidence and of some rejectors, where they apply."""
     usable = scores[~is_control(scores)].reset_index(drop=True)
     is_taught = any(LearnedSaid.of(about) is not None for about in entry.runs)
-    found = {OWN: own_word(usable, split, is_taught=is_taught)}
+    found = {OWN: own_confidence(usable, split, is_taught=is_taught)}
     for name, rule in rules_of(rejectors, split).items():
         found[name] = judge(usable, predictions, rule.make, rule.split, is_taught=is_taught)
     return {(entry.name, name): frame for name, frame in found.items() if len(frame)}

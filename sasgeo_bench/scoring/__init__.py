@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers and truths -> figures, how sure each is, and which differences are real."""
+"""Score answers against truths: metrics, confidence intervals, and tests of differences."""

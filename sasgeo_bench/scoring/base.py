@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every figure shares: its declaration, weights that are checked, weighted means and quantiles."""
+"""Checks of columns and weights, weighted means and quantiles, shared by all metrics."""
 
 from collections.abc import Sequence
 
@@ -14,26 +14,14 @@ Ints = NDArray[np.int64]
 
 
 def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:
-    """Numbers of one column, shape (N,); infinity may be among them.
+    """Return the values of a column as floats, shape (N,); infinity is allowed.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-        Numbers or truth values.
-    name : str
-        What they are called in an error.
-    count : int, optional
-        How many there must be.
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        The same as floats.
+    `count` is the expected N, `name` names the column in errors.
 
     Raises
     ------
     MetricError
-        If the shape is another, or a value is NaN.
+        If the shape differs, or a value is NaN.
 
     Examples
     --------
@@ -52,29 +40,14 @@ def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floa
 
 
 def check_weights(weights: ArrayLike | None, count: int) -> Floats:
-    """Weights of N queries, 1 each where none are given.
+    """Return the weights of N queries, shape (N,); 1 each where none are given.
 
-    Parameters
-    ----------
-    weights : array_like, shape (N,), optional
-        Finite and not negative. They are counts: a query with weight 2 is there twice.
-    count : int
-        N.
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        The weights.
+    Weights are counts: a query of weight 2 counts twice.
 
     Raises
     ------
     MetricError
-        If there are more or fewer, or one is negative or not finite.
-
-    Examples
-    --------
-    >>> check_weights(None, 2).tolist()
-    [1.0, 1.0]
+        If their number is not N, or one is negative or not finite.
     """
     if weights is None:
         return np.ones(count)
@@ -87,24 +60,14 @@ def check_weights(weights: ArrayLike | None, count: int) -> Floats:
 
 
 def block_codes(blocks: Sequence[str] | Ints, count: int) -> tuple[Ints, Ints]:
-    """Sizes of K blocks in the order of their names, shape (K,), and the number of each query's block, shape (N,).
+    """Return the sizes of K blocks, shape (K,), and the index of each query's block from 0, shape (N,).
 
-    Parameters
-    ----------
-    blocks : sequence of str or ndarray of int, length N
-        Block of each query; numbers that stand in the order of the names give the same.
-    count : int
-        N.
-
-    Returns
-    -------
-    tuple of ndarray of int
-        Sizes, and numbers from 0.
+    Blocks stand in the order of their names. Integer codes in the same order give the same result.
 
     Raises
     ------
     MetricError
-        If there are more or fewer blocks than queries.
+        If the number of blocks is not N.
 
     Examples
     --------
@@ -122,19 +85,9 @@ def block_codes(blocks: Sequence[str] | Ints, count: int) -> tuple[Ints, Ints]:
 
 
 def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> float:
-    """Mean of one value for each query.
+    """Return the mean of one value per query, shape (N,); NaN where the weights sum to 0.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-        Infinity is honoured: one infinite value of positive weight makes the mean infinite.
-    weights : array_like, shape (N,), optional
-        Not negative; a value of weight 0 does not count, even if it is infinite.
-
-    Returns
-    -------
-    float
-        NaN where nothing counts.
+    An infinite value of positive weight makes the mean infinite; a value of weight 0 never counts.
 
     Examples
     --------
@@ -150,22 +103,10 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> float:
 
 
 def weighted_quantile(values: ArrayLike, share: float, weights: ArrayLike | None = None) -> float:
-    """Least value that at least a share of the queries does not exceed.
+    """Return the least value that at least a fraction `share` in (0, 1] of the queries does not exceed.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-        Infinity is a value like any other, the greatest one.
-    share : float
-        In (0, 1]; 0.5 is the median.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        One of the values, never one in between: no mean of a finite and an infinite error is taken. NaN where nothing
-        counts.
+    The result is always one of the values, so a finite and an infinite error are never averaged; NaN where the weights
+    sum to 0.
 
     Raises
     ------
@@ -174,8 +115,8 @@ def weighted_quantile(values: ArrayLike, share: float, weights: ArrayLike | None
 
     Notes
     -----
-    The inverse of the empirical distribution function, type 1 of Hyndman and Fan (1996); with an even number of
-    queries the median is the lower of the two in the middle.
+    The inverse of the empirical distribution function, type 1 of Hyndman and Fan (1996). For an even number of queries
+    the median is the lower of the two in the middle.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which difference is real: paired tests, and ranks that say how sure they are."""
+"""Paired tests of two methods, Holm's adjustment, and rank intervals."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,31 +7,23 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, block_codes, check_column
-from sasgeo_bench.scoring.intervals import LEVEL, percentile_interval
+from sasgeo_bench.scoring.intervals import LEVEL
 
-# Fewer blocks rank nobody and decide nothing: an exact test of their signs cannot reach 5 %, 2 / 2^5 being more.
+# With fewer blocks there are no ranks and no decisions: an exact sign test cannot reach 5 %, since 2 / 2^5 > 5 %.
 LEAST_BLOCKS: Final = 6
-_NOTHING: Final = 1e-12  # a difference of means this small is one of rounding
+_NOTHING: Final = 1e-12  # smaller differences of means are rounding errors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairedTest:
-    """Two methods on the same queries.
-
-    Parameters
-    ----------
-    first_only, second_only : int
-        Discordant queries: those that only the first, or only the second, got right.
-    p_value : float
-        Two-sided; 1 where nothing is discordant.
-    """
+    """Discordant queries, which only one of two methods got right, and the two-sided p-value (1 without any)."""
 
     first_only: int
     second_only: int
@@ -49,17 +41,10 @@ def _pairs(first: ArrayLike, second: ArrayLike) -> tuple[Bools, Bools]:
 
 
 def mcnemar_exact(first: ArrayLike, second: ArrayLike) -> PairedTest:
-    """McNemar's exact test that two methods are right equally often.
+    """Test by McNemar's exact test whether two methods are right equally often.
 
-    Parameters
-    ----------
-    first, second : array_like of bool, shape (N,)
-        Which queries each method got right, in the same order.
-
-    Returns
-    -------
-    PairedTest
-        The p-value is that of a fair coin thrown once for each discordant query.
+    The inputs are hits (0 or 1), shape (N,), in the same order of queries. The p-value is that of a fair coin tossed
+    once per discordant query.
 
     Raises
     ------
@@ -68,8 +53,7 @@ def mcnemar_exact(first: ArrayLike, second: ArrayLike) -> PairedTest:
 
     Notes
     -----
-    By statsmodels. It takes queries for independent, which those of one block are not: read it beside
-    `mcnemar_clustered` and the bootstrap.
+    The test assumes independent queries, which those of one block are not: compare `mcnemar_clustered`.
 
     Examples
     --------
@@ -86,31 +70,19 @@ def mcnemar_exact(first: ArrayLike, second: ArrayLike) -> PairedTest:
 
 
 def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]) -> PairedTest:
-    """McNemar's test for queries that come in blocks.
+    """Test by McNemar's test for clustered queries whether two methods are right equally often.
 
-    Parameters
-    ----------
-    first, second : array_like of bool, shape (N,)
-        Which queries each method got right, in the same order.
-    blocks : sequence of str, length N
-        Block of each query.
-
-    Returns
-    -------
-    PairedTest
-        The p-value is NaN for fewer than two blocks.
+    The inputs are as for `mcnemar_exact`, with the block of each query. The p-value is NaN for fewer than two blocks.
 
     Raises
     ------
     MetricError
         If a value is neither 0 nor 1, or the numbers differ.
 
-    Notes
-    -----
-    Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K,
-    (K - 1) / K (sum d_k)^2 / sum d_k^2 is chi-squared with one degree of freedom. It tests the difference of the means
-    over all queries, the one we print; Durkalski et al. (2003) weigh every block alike instead. With one query in each
-    block it is McNemar's test without correction, times (K - 1) / K.
+    Notes ----- Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K, (K
+    - 1) / K (sum d_k)^2 / sum d_k^2 is chi-squared with one degree of freedom. It tests the difference of the means
+    over all queries, which boards print; Durkalski et al. (2003) give each block the same weight instead. With one
+    query per block it is McNemar's test without correction, times (K - 1) / K.
 
     Examples
     --------
@@ -135,26 +107,14 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """p-values adjusted for how many registered contrasts there are, by Holm's steps down.
+    """Return p-values adjusted for the number of registered contrasts (Holm, Scandinavian Journal of Statistics 1979).
 
-    Parameters
-    ----------
-    p_values : mapping of str to float
-        One for each registered contrast, and no others.
-
-    Returns
-    -------
-    dict of str to float
-        In the same order; a contrast holds at level a if its adjusted value is at most a.
+    A contrast holds at level a if its adjusted value is at most a. Pass every registered contrast and no others.
 
     Raises
     ------
     MetricError
-        If a value lies outside [0, 1] or is NaN: a contrast that could not be tested has p = 1.
-
-    Notes
-    -----
-    Holm, Scandinavian Journal of Statistics 1979; by statsmodels.
+        If a value lies outside [0, 1] or is NaN: a contrast without a test has p = 1.
 
     Examples
     --------
@@ -163,7 +123,7 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """
     wrong = next((name for name, value in p_values.items() if not 0 <= value <= 1), None)
     if wrong is not None:
-        message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; a contrast that was not tested has 1"
+        message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; an untested contrast has 1"
         raise MetricError(message)
     if not p_values:
         return {}
@@ -171,45 +131,28 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     return dict(zip(p_values, map(float, adjusted), strict=True))
 
 
-def distinguishable(
-    values: ArrayLike,
-    draws: ArrayLike,
-    *,
-    better: Literal["higher", "lower"],
-    level: float = LEVEL,
-    is_simultaneous: bool = True,
-) -> NDArray[np.bool_]:
-    """Which method is better than which, by paired draws.
+def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["higher", "lower"]) -> Bools:
+    """Return which method is better than which, shape (M, M), at a level of 95 % for all pairs at once.
+
+    An element is True where the method of the row is better than that of the column and the difference is significant.
 
     Parameters
     ----------
     values : array_like, shape (M,)
-        The figure of each of M methods.
+        Metric of each of M methods.
     draws : array_like, shape (D, M)
-        Their figures in the same draws, as from `bootstrap_means`.
-    better : {"higher", "lower"}
-        Which way is good.
-    level : float
-        In (0, 1).
-    is_simultaneous : bool
-        True keeps the level for all pairs at once; False for each pair alone, by percentiles, so that of many pairs
-        some will seem different by chance.
-
-    Returns
-    -------
-    ndarray of bool, shape (M, M)
-        True where the method of the row is better than that of the column, and their difference is not chance.
+        The same in D paired draws, as from `bootstrap_means`.
 
     Raises
     ------
     MetricError
-        If shapes do not fit, or a figure is not finite.
+        If shapes do not fit, or a number is not finite.
 
     Notes
     -----
-    For all pairs at once a difference counts where it exceeds c standard deviations of its draws, with c the quantile
-    at `level`, over draws, of the largest |draw - difference| / deviation of any pair (Romano and Wolf, Econometrica
-    2005; for ranks Mogstad et al., Review of Economic Studies 2024).
+    A difference counts where it exceeds c standard deviations of its draws. c is the 95 % quantile, over draws, of the
+    largest |draw - difference| / deviation of any pair (Romano and Wolf, Econometrica 2005; for ranks Mogstad et al.,
+    Review of Economic Studies 2024).
 
     Examples
     --------
@@ -230,24 +173,21 @@ def distinguishable(
     rows, cols = np.triu_indices(len(figures), 1)
     if not len(rows):
         return found
-    apart = sign * (figures[rows] - figures[cols])
-    lo, hi = _bounds(sign * (table[:, rows] - table[:, cols]), apart, level, is_simultaneous=is_simultaneous)
+    gaps = sign * (figures[rows] - figures[cols])
+    lo, hi = _bounds(sign * (table[:, rows] - table[:, cols]), gaps)
     found[rows, cols], found[cols, rows] = lo > _NOTHING, hi < -_NOTHING
     return found
 
 
-def _bounds(draws: Floats, apart: Floats, level: float, *, is_simultaneous: bool) -> tuple[Floats, Floats]:
-    """Intervals of P differences, shape (P,) each, from draws of shape (D, P)."""
-    if not is_simultaneous:
-        ends = [percentile_interval(0.0, column, level=level) for column in draws.T]
-        return np.array([end.lo for end in ends]), np.array([end.hi for end in ends])
+def _bounds(draws: Floats, gaps: Floats) -> tuple[Floats, Floats]:
+    """Return simultaneous intervals of P differences, shape (P,) each, from draws of shape (D, P)."""
     spread = draws.std(axis=0)
     varies = spread > _NOTHING
     if not varies.any():
-        return apart, apart
-    largest = (np.abs(draws[:, varies] - apart[varies]) / spread[varies]).max(axis=1)
-    reach = float(np.quantile(largest, level, method="inverted_cdf")) * np.where(varies, spread, 0.0)
-    return apart - reach, apart + reach
+        return gaps, gaps
+    largest = (np.abs(draws[:, varies] - gaps[varies]) / spread[varies]).max(axis=1)
+    reach = float(np.quantile(largest, LEVEL, method="inverted_cdf")) * np.where(varies, spread, 0.0)
+    return gaps - reach, gaps + reach
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,29 +199,14 @@ class RankInterval:
 
     @property
     def text(self) -> str:
-        """As a table prints it: "2" or "2-4".
-
-        Examples
-        --------
-        >>> RankInterval(best=2, worst=4).text
-        '2-4'
-        """
+        """Return the interval as a table prints it: "2" or "2-4"."""
         return str(self.best) if self.best == self.worst else f"{self.best}-{self.worst}"
 
 
 def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
-    """Ranks that methods can have, given which differences are real.
+    """Return the rank interval of each method from the table of `distinguishable`, shape (M, M).
 
-    Parameters
-    ----------
-    is_better : array_like of bool, shape (M, M)
-        From `distinguishable`.
-
-    Returns
-    -------
-    tuple of RankInterval
-        Of each method: one more than there are methods known to be better, up to all but those known to be worse.
-        Methods that cannot be told apart from the same others share a rank.
+    The best rank is one more than the number of better methods; the worst leaves room for all known to be worse.
 
     Raises
     ------
@@ -290,7 +215,7 @@ def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
 
     Examples
     --------
-    The first beats the third, nothing else is sure:
+    The first beats the third, nothing else is certain:
 
     >>> [rank.text for rank in rank_intervals([[0, 0, 1], [0, 0, 0], [0, 0, 0]])]
     ['1-2', '1-3', '2-3']

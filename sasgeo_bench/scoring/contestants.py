@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who was asked what, and what they answered: the entries of a board with their answers to its tasks."""
+"""Entries of a board with their answers to its tasks: read, validate and score them."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,16 +21,16 @@ from sasgeo_bench.scoring.validate import submission_faults, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import Split
 
-MOST_NAMED: Final = 3  # runs that are left out; the others are counted
+MOST_NAMED: Final = 3  # skipped runs in a message; the others are counted
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told:
-    """One contestant and its answers to the tasks of a board.
+class EntryAnswers:
+    """One entry and its answers to the tasks of a board.
 
-    `asked` are the folders of tasks whose queries it was asked, answered or not, `held` those that it brings along: a
-    file is asked all tasks, and brings those that it holds an answer to; a submission is asked those that it names.
-    `entry` has only the runs that count.
+    `asked` are the folders of tasks whose queries it was asked, answered or not; `held` are those it brings to a board
+    that names no tasks. A file is asked all tasks and brings those it answers; a submission is asked the tasks it
+    names. `entry` holds only the runs that count.
     """
 
     entry: Entry
@@ -39,7 +39,7 @@ class Told:
     asked: frozenset[Path]
 
 
-def read_told(
+def read_entry_answers(
     entries: Sequence[Entry],
     folders: Sequence[Path],
     *,
@@ -47,30 +47,19 @@ def read_told(
     named: Sequence[Path],
     tell: Callable[[str], None],
     failures: Failures,
-) -> list[Told]:
-    """Answers of all contestants; runs of other queries are left out, and refused where they are named themselves.
+) -> list[EntryAnswers]:
+    """Return the answers of all entries; skip runs of other queries, or refuse them where the user named them.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Who.
-    folders : sequence of Path
-        Of tasks; without any, those that runs were made on, and that files hold answers to.
-    root : Path
-        Where tasks/ is.
-    named : sequence of Path
-        Folders and files that the user named.
-    tell : callable
-        Gets a line for what is left out.
-    failures : Failures
-        Takes note of those whose answers cannot be read, who are then left out.
+    Without `folders`, the tasks are those that runs were made on and that files answer; `root` is the parent of tasks/.
+    `named` are the paths that the user named, `tell` receives a line about skipped runs. `failures` records entries
+    whose answers cannot be read.
 
     Raises
     ------
     StoreError
-        If a run that is named by itself answers none of the queries.
+        If a run that the user named answers none of the queries.
     ConfigError
-        If nobody answers any task.
+        If no entry answers any task.
     """
     files: dict[str, dict[str, Prediction]] = {}
     for entry in entries:
@@ -80,24 +69,24 @@ def read_told(
     is_chosen = bool(folders)
     found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
-    told: list[Told] = []
+    answers: list[EntryAnswers] = []
     stale: list[Path] = []
     for entry in (entry for entry in entries if entry.name not in failures.found):
         with failures.of(entry.name):
-            item, others = _told(entry, tasks, files.get(entry.name))
+            item, others = _entry_answers(entry, tasks, files.get(entry.name))
             stale += others
-            told += [item] if item.asked else []
-    if not told and failures.first is not None:
+            answers += [item] if item.asked else []
+    if not answers and failures.first is not None:
         raise failures.first
     refused = next((source for source in stale if source in named), None)
-    if refused is not None or (stale and not told):
+    if refused is not None or (stale and not answers):
         holder = "these tasks do" if is_chosen else "its task does"
         message = (
             f"{refused or stale[0]} holds answers to other queries than {holder} now: "
-            "run again (what is answered already is kept), or make the old queries again"
+            "run again (existing answers are kept), or make the old queries again"
         )
         raise StoreError(message)
-    if not told:
+    if not answers:
         message = (
             f"there is nothing to score: no task in {root / 'tasks'} is answered "
             "(--out names another root, --tasks the tasks themselves)"
@@ -106,19 +95,21 @@ def read_told(
     if stale:
         listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
         tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
-    return told
+    return answers
 
 
-def _told(entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None) -> tuple[Told, list[Path]]:
-    """A contestant with its answers; the folders of those of its runs that answer none of the tasks."""
+def _entry_answers(
+    entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None
+) -> tuple[EntryAnswers, list[Path]]:
+    """Return an entry with its answers, and the folders of its runs that answer none of the tasks."""
     if rows is None:
         return _read_runs(entry, tasks)
     held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-    return Told(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
+    return EntryAnswers(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
 
 
 def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
-    """Folders of the tasks that a file or a submission is asked."""
+    """Return the folders of the tasks that a file or a submission is asked."""
     if entry.submission is None:
         return frozenset(task.folder for task in tasks)
     named = {(item.suite, item.region) for item in entry.submission.tasks}
@@ -129,8 +120,8 @@ def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
     return {item.query_id: item for source in entry.sources for item in prediction_files.read_predictions(source)}
 
 
-def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Path]]:
-    """Answers of a matcher's runs; the folders of those that answer none of the tasks."""
+def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[EntryAnswers, list[Path]]:
+    """Return an entry with the answers of its runs, and the folders of runs that answer none of the tasks."""
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
     rows: dict[str, Prediction] = {}
     runs: list[tuple[Path, Mapping[str, Any]]] = []
@@ -151,58 +142,47 @@ def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[Told, list[Pat
         asked.add(task.folder)
         runs.append((source, _share_of(about, found)))
     mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
-    return Told(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
+    return EntryAnswers(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
 
 
 def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Mapping[str, Any]:
-    """What a run took, of its processor seconds the share of the answers that count."""
+    """Return the run record with CPU time scaled to the fraction of answers that count."""
     if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
         return about
     return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
 
 
 def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
-    """Task folders that runs were made on."""
+    """Return the task folders that runs were made on."""
     names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
     folders = [root / "tasks" / suite / region for suite, region in names]
     return [folder for folder in folders if (folder / task_files.TASK).is_file()]
 
 
-def score_told(
-    told: Sequence[Told],
+def score_entries(
+    answers: Sequence[EntryAnswers],
     tasks: Sequence[ScoredTask],
     *,
     split: Split | None,
     by_region: Collection[str],
     failures: Failures,
 ) -> dict[str, pd.DataFrame]:
-    """Scored rows by contestant, of those whose answers can be scored.
+    """Return scored rows by entry name; `failures` records entries that cannot be scored.
 
-    Parameters
-    ----------
-    told : sequence of Told
-        Contestants with their answers.
-    tasks : sequence of ScoredTask
-        What was asked, with truths.
-    split : Split, optional
-        Says which blocks are one place.
-    by_region : collection of str
-        Suites whose regions are resampled, not their blocks.
-    failures : Failures
-        Takes note of the others.
+    `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block.
 
     Raises
     ------
     StoreError, ConfigError
-        The first fault, if nobody is left.
+        The first fault, if no entry is left.
     """
     folders, found = [task.folder for task in tasks], {}
-    for item in told:
+    for item in answers:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
             scored = _scored(item, tasks, split, by_region)
-            hold_controls({item.entry.name: scored})  # so that whoever it fails with is known
+            hold_controls({item.entry.name: scored})  # so that an error names the entry
             found[item.entry.name] = scored
     if not found and failures.first is not None:
         raise failures.first
@@ -210,12 +190,12 @@ def score_told(
 
 
 def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
-    """Refuse a file or submission that is not what the tasks ask for; queries without a row are misses.
+    """Check a file or submission against the tasks; a query without a row is a miss, not a fault.
 
     Raises
     ------
     ConfigError
-        With the first fault, and how many there are.
+        With the first fault, and the number of faults.
     StoreError
         If it cannot be read.
     """
@@ -231,15 +211,17 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
         raise ConfigError(message)
 
 
-def _scored(told: Told, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]) -> pd.DataFrame:
-    """All tasks that one contestant was asked, one row for each query."""
+def _scored(
+    answers: EntryAnswers, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]
+) -> pd.DataFrame:
+    """Return one row per query of all tasks that an entry was asked."""
     place_of = {} if split is None else split.place_of
     frames = []
     for task in tasks:
-        if task.folder not in told.asked:
+        if task.folder not in answers.asked:
             continue
         names = [head.query_id for head in task.heads]
-        mine = {name: told.predictions[name] for name in names if name in told.predictions}
+        mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)
         frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in by_region else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registered contrasts: two methods on the same queries, tested as was written down before anything was run."""
+"""Registered contrasts: two methods on the same queries, tested as registered before any run."""
 
-import hashlib
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -14,17 +12,16 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact
-from sasgeo_bench.scoring.decisions import Answers
-from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
+from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity import SLOW_DRAWS
 from sasgeo_bench.scoring.integrity_metric import aurc, drawn_areas
 from sasgeo_bench.scoring.intervals import (
     Interval,
+    bootstrap_statistic,
     difference_interval,
     effective_count,
-    mean_difference,
+    mean_interval,
     percentile_interval,
-    statistic_interval,
     wilson,
 )
 from sasgeo_bench.scoring.metrics import primary_of
@@ -32,7 +29,7 @@ from sasgeo_bench.scoring.power import sensitivity
 from sasgeo_bench.scoring.rejection import answers_of
 
 ALPHA: Final = 0.05
-LESS_THAN_MATTERS: Final = ", by less than would matter"  # ends a verdict
+LESS_THAN_MATTERS: Final = ", by less than would matter"  # suffix of a verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,15 +43,15 @@ class Contrast:
     first, second : str
         Matchers; the difference is first less second. For "aurc" each is "matcher x rejector".
     suites : tuple of str
-        Whose queries count, all of them together.
+        Suites whose queries count, pooled.
     kinds : tuple of str
-        Only kinds that begin with one of these, as in "U2"; empty for all stresses.
+        Prefixes of the kinds that count, as in "U2"; empty for all stresses.
     metric : {"primary", "aurc"}
-        Success or recall at 1 on present places; or the area under risk against coverage on all of them.
+        Success or recall at 1 on present places, or the area under the risk-coverage curve on all places.
     track : str
-        Of the queries.
+        Track of the queries.
     min_effect : float
-        Least difference that would matter: of shares, or of "aurc" relative to the second.
+        Least relevant difference: of fractions, or for "aurc" relative to the second method.
     """
 
     name: str
@@ -69,23 +66,24 @@ class Contrast:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What came of a contrast.
+    """Result of a contrast.
 
     Parameters
     ----------
     first_value, second_value, difference, lo, hi : float
-        Figures of both, first less second, and the paired 95 % interval; NaN where nothing could be drawn.
+        Both metrics, first less second, and its paired 95 % interval; NaN without draws.
     n, blocks : int
-        Queries and blocks they are from; fewer than `LEAST_BLOCKS` decide nothing.
+        Numbers of queries and of their blocks; fewer than `LEAST_BLOCKS` decide nothing.
     first_only, second_only : int
         Discordant queries; 0 for "aurc".
     p_exact, p_clustered, p_holm : float
-        McNemar's exact test (queries taken for independent), Obuchowski's for blocks, and that one adjusted by Holm
-        over all registered contrasts; of "aurc" the share of draws on the other side of zero, twice.
+        McNemar's exact test (assumes independent queries), Obuchowski's for blocks, and the latter adjusted by Holm
+        over all registered contrasts. For "aurc" twice the fraction of draws on the other side of zero replaces
+        Obuchowski's.
     detectable : float
-        Least difference these queries would show; NaN for "aurc", and of too few blocks.
+        Least difference that these queries can show; NaN for "aurc" and for too few blocks.
     verdict : str
-        In words.
+        The decision in words.
     """
 
     name: str
@@ -115,39 +113,34 @@ COLUMNS: Final = tuple(field.name for field in fields(Finding))
 def hold_contrasts(
     contrasts: Sequence[Contrast],
     scores: Mapping[str, pd.DataFrame],
-    judged: Mapping[tuple[str, str], pd.DataFrame],
+    rejections: Mapping[tuple[str, str], pd.DataFrame],
     *,
     draws: int = DRAWS,
     failed: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Test every registered contrast.
+    """Test every registered contrast, in order; a contrast without queries, or with a failed side, has p = 1.
 
     Parameters
     ----------
     contrasts : sequence of Contrast
-        All that were registered, and no others: Holm's adjustment is over them.
+        All registered contrasts and no others: Holm's adjustment covers them.
     scores : mapping of str to pandas.DataFrame
         Scored rows by matcher.
-    judged : mapping of (matcher, rejector) to pandas.DataFrame
+    rejections : mapping of (matcher, rejector) to pandas.DataFrame
         From `rejection.judge`.
     draws : int
-        Of the bootstrap.
+        Number of bootstrap draws.
     failed : collection of str
         Matchers, and "matcher x rejector", that failed and so are not on the board.
-
-    Returns
-    -------
-    tuple of Finding
-        In the same order. A contrast without a query has p = 1 and says so; so has one with a side that failed.
 
     Raises
     ------
     ConfigError
         If a contrast names a method that is not on the board, and none failed.
     """
-    there = scores.keys() | {" x ".join(key) for key in judged}
+    there = scores.keys() | {" x ".join(key) for key in rejections}
     found = [
-        _tested(contrast, scores, judged, draws)
+        _tested(contrast, scores, rejections, draws)
         if not failed or {contrast.first, contrast.second} <= there
         else replace(_nothing(contrast), verdict=_undecided(contrast, there, failed))
         for contrast in contrasts
@@ -157,7 +150,7 @@ def hold_contrasts(
 
 
 def _undecided(contrast: Contrast, there: Collection[str], failed: Collection[str]) -> str:
-    """Why a contrast is not decided, one side of which is not on a board where something failed."""
+    """Return the verdict of a contrast with a side that is not on a board where something failed."""
     side = next(name for name in (contrast.first, contrast.second) if name not in there)
     is_known = side in failed or side.split(" x ", maxsplit=1)[0] in failed
     return f"not decided: {side} {'failed' if is_known else 'is not on the board'}"
@@ -166,10 +159,10 @@ def _undecided(contrast: Contrast, there: Collection[str], failed: Collection[st
 def _tested(
     contrast: Contrast,
     scores: Mapping[str, pd.DataFrame],
-    judged: Mapping[tuple[str, str], pd.DataFrame],
+    rejections: Mapping[tuple[str, str], pd.DataFrame],
     draws: int,
 ) -> Finding:
-    first, second = _pair(contrast, scores, judged)
+    first, second = _pair(contrast, scores, rejections)
     if first.empty:
         return _nothing(contrast)
     is_mean = contrast.metric == "primary"
@@ -177,27 +170,20 @@ def _tested(
 
 
 def _pair(
-    contrast: Contrast, scores: Mapping[str, pd.DataFrame], judged: Mapping[tuple[str, str], pd.DataFrame]
+    contrast: Contrast, scores: Mapping[str, pd.DataFrame], rejections: Mapping[tuple[str, str], pd.DataFrame]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows of both sides, the same queries in the same order."""
+    """Return rows of both sides for the same queries in the same order."""
     is_mean = contrast.metric == "primary"
-    known: Mapping[str, pd.DataFrame] = scores if is_mean else {" x ".join(key): item for key, item in judged.items()}
+    known = scores if is_mean else {" x ".join(key): rows for key, rows in rejections.items()}
     return both_on(contrast, known, _stressed if is_mean else _unfalsified)
 
 
 def both_on(
     contrast: Contrast, known: Mapping[str, pd.DataFrame], chosen: Callable[[pd.DataFrame], "pd.Series[bool]"]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows of both sides on the suites, track and kinds of a contrast, the same queries in the same order.
+    """Return rows of both sides on a contrast's suites, track and kinds, for the same queries in the same order.
 
-    Parameters
-    ----------
-    contrast : Contrast
-        Says which sides, and on what.
-    known : mapping of str to pandas.DataFrame
-        Scored rows by the names of sides.
-    chosen : callable
-        Says of rows which of them count, shape (N,).
+    `known` holds scored rows by the names of sides; `chosen` selects the rows that count, shape (N,).
 
     Raises
     ------
@@ -218,7 +204,7 @@ def both_on(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceDifference:
-    """A contrast at one place: first less second with its 95 % interval, and of how much it is."""
+    """Difference of a contrast at one place, first less second, with its 95 % interval and sample sizes."""
 
     place: str
     n: int
@@ -231,30 +217,15 @@ class PlaceDifference:
 def by_place(
     contrast: Contrast,
     scores: Mapping[str, pd.DataFrame],
-    judged: Mapping[tuple[str, str], pd.DataFrame],
+    rejections: Mapping[tuple[str, str], pd.DataFrame],
     *,
     draws: int = SLOW_DRAWS,
 ) -> tuple[PlaceDifference, ...]:
-    """A contrast place by place, to see whether few of them make it; no test, and no part of the registered one.
+    """Return the difference of a contrast at each place, by name; exploratory, not part of the registered test.
 
-    Parameters
-    ----------
-    contrast, scores, judged
-        As of `hold_contrasts`.
-    draws : int
-        Of the bootstrap within each place.
-
-    Returns
-    -------
-    tuple of PlaceDifference
-        By name of the place.
-
-    Raises
-    ------
-    ConfigError
-        As `hold_contrasts` does.
+    Parameters and errors are those of `hold_contrasts`; draws are resampled within each place.
     """
-    first, second = _pair(contrast, scores, judged)
+    first, second = _pair(contrast, scores, rejections)
     places = first["place"].to_numpy(str)
     return tuple(
         _at_place(contrast, first[places == place], second[places == place], str(place), draws)
@@ -263,23 +234,18 @@ def by_place(
 
 
 def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, place: str, draws: int) -> PlaceDifference:
-    blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
-    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=draws)
+    drawn = _drawn(contrast, first, draws)
     if contrast.metric == "primary":
-        ours, theirs = (primary_of(contrast.track).values(frame) for frame in (first, second))
-        apart = ours - theirs
-        sides = (float(np.maximum(apart, 0.0).mean()), float(np.maximum(-apart, 0.0).mean()))
-        found = mean_difference(ours, theirs, drawn)
+        interval = _mean_interval(*_hits(contrast, first, second), drawn)
     else:
         both = [answers_of(frame) for frame in (first, second)]
         sides = (aurc(both[0]), aurc(both[1]))
         areas = [np.concatenate([drawn_areas(some, row).aurc for row in drawn.weights()]) for some in both]
-        found = percentile_interval(sides[0] - sides[1], areas[0] - areas[1])
-    interval = _guarded(found, sides, drawn, effective_count(sites))
+        interval = _guarded(percentile_interval(sides[0] - sides[1], areas[0] - areas[1]), sides, drawn)
     return PlaceDifference(
         place=place,
         n=len(first),
-        blocks=len(set(blocks)),
+        blocks=drawn.blocks_count,
         difference=interval.value,
         lo=interval.lo,
         hi=interval.hi,
@@ -287,14 +253,14 @@ def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, pla
 
 
 def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
-    """The scored rows that a contrast counts: stresses of its suites and kinds on its track."""
+    """Return the scored rows that a contrast counts: its suites, kinds and track."""
     return _rows_of(contrast, frame, _stressed if contrast.metric == "primary" else _unfalsified)
 
 
 def _rows_of(
     contrast: Contrast, frame: pd.DataFrame, chosen: Callable[[pd.DataFrame], "pd.Series[bool]"]
 ) -> pd.DataFrame:
-    """Some rows on the suites, track and kinds of a contrast; what is no stress is about all kinds."""
+    """Return chosen rows on a contrast's suites, track and kinds; rows without stress belong to all kinds."""
     rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
     rows = rows[chosen(rows).to_numpy(bool)]
     is_kind = (rows["role"] != "stress") | rows["kind"].str.startswith(contrast.kinds or "")
@@ -331,25 +297,34 @@ _NUMBERS: Final = (
 )
 
 
-def _seed(contrast: Contrast) -> int:
-    return int.from_bytes(hashlib.sha256(contrast.name.encode()).digest()[:8], "big")
+def _drawn(contrast: Contrast, rows: pd.DataFrame, draws: int) -> ClusterDraws:
+    seed = seed_of_text(contrast.name)
+    return ClusterDraws(blocks=rows["block"].tolist(), sites=rows["pair_id"].tolist(), seed=seed, draws=draws)
+
+
+def _hits(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> tuple[Floats, Floats]:
+    """Return the primary metric of both sides per query, shape (N,) each."""
+    metric = primary_of(contrast.track)
+    return metric.values(first), metric.values(second)
+
+
+def _mean_interval(ours: Floats, theirs: Floats, drawn: ClusterDraws) -> Interval:
+    apart = ours - theirs
+    sides = (float(np.maximum(apart, 0.0).mean()), float(np.maximum(-apart, 0.0).mean()))
+    return _guarded(mean_interval(apart, drawn), sides, drawn)
 
 
 def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
-    """Two sides by success or recall, on the same queries in the same order; without a verdict."""
-    measure = primary_of(contrast.track)
-    ours, theirs = measure.values(first), measure.values(second)
-    blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
-    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=draws)
-    apart = ours - theirs
-    sides = (float(np.maximum(apart, 0.0).mean()), float(np.maximum(-apart, 0.0).mean()))
-    interval = _guarded(mean_difference(ours, theirs, drawn), sides, drawn, effective_count(sites))
-    won = [(values == 1).astype(float) for values in (ours, theirs)]  # a tie that is shared is no win
+    """Return the finding by success or recall on the same queries in the same order, without a verdict."""
+    ours, theirs = _hits(contrast, first, second)
+    blocks, drawn = first["block"].tolist(), _drawn(contrast, first, draws)
+    interval = _mean_interval(ours, theirs, drawn)
+    won = [(values == 1).astype(float) for values in (ours, theirs)]  # a shared tie is no win
     exact, clustered = mcnemar_exact(won[0], won[1]), mcnemar_clustered(won[0], won[1], blocks)
     return replace(
         _nothing(contrast),
         n=len(ours),
-        blocks=len(set(blocks)),
+        blocks=drawn.blocks_count,
         first_value=float(ours.mean()),
         second_value=float(theirs.mean()),
         difference=interval.value,
@@ -359,59 +334,56 @@ def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, 
         second_only=exact.second_only,
         p_exact=exact.p_value,
         p_clustered=clustered.p_value,
-        detectable=sensitivity(ours, theirs, blocks).detectable if len(set(blocks)) >= LEAST_BLOCKS else math.nan,
+        detectable=sensitivity(ours, theirs, blocks) if drawn.blocks_count >= LEAST_BLOCKS else math.nan,
     )
 
 
 def _areas(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
     ours, theirs = (answers_of(frame) for frame in (first, second))
-    blocks, sites = first["block"].tolist(), first["pair_id"].tolist()
-    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=_seed(contrast), draws=SLOW_DRAWS)
-    apart = partial(_apart, ours, theirs)
-    everyone = np.ones(len(first))
-    values = (aurc(ours, everyone), aurc(theirs, everyone))
-    interval = _guarded(statistic_interval(apart, drawn), values, drawn, effective_count(sites))
+    drawn = _drawn(contrast, first, SLOW_DRAWS)
+    values = (aurc(ours), aurc(theirs))
+    draws = (
+        bootstrap_statistic(lambda mass: aurc(ours, mass) - aurc(theirs, mass), drawn)
+        if drawn.blocks_count > 1
+        else np.empty(0)
+    )
+    interval = _guarded(percentile_interval(values[0] - values[1], draws), values, drawn)
     return replace(
         _nothing(contrast),
         n=len(first),
-        blocks=len(set(blocks)),
+        blocks=drawn.blocks_count,
         first_value=values[0],
         second_value=values[1],
         difference=interval.value,
         lo=interval.lo,
         hi=interval.hi,
-        p_clustered=_p_of_draws(apart, drawn),
+        p_clustered=_p_of_draws(draws),
     )
 
 
-def _guarded(found: Interval, sides: tuple[float, float], drawn: ClusterDraws, trials: float) -> Interval:
-    """Where draws say little, of few blocks or where nothing varies, no narrower than by Wilson's over sites.
+def _guarded(found: Interval, sides: tuple[float, float], drawn: ClusterDraws) -> Interval:
+    """Return an interval no narrower than Wilson's over sites where draws say little: few blocks, or nothing varies.
 
-    `sides` are two shares whose difference it is: of queries won and lost, or two areas.
+    `sides` are two fractions whose difference it is: of queries won and lost, or two areas.
     """
     if drawn.blocks_count >= LEAST_BLOCKS and found.lo < found.hi:
         return found
+    trials = effective_count(drawn.blocks if drawn.sites is None else drawn.sites)
     won, lost = (wilson(min(side * trials, trials), trials) for side in sides)
     wide = difference_interval(won, lost)
     return Interval(value=found.value, lo=float(np.fmin(found.lo, wide.lo)), hi=float(np.fmax(found.hi, wide.hi)))
 
 
-def _apart(ours: Answers, theirs: Answers, mass: Floats) -> float:
-    """The difference of both areas under the same weights."""
-    return aurc(ours, mass) - aurc(theirs, mass)
-
-
-def _p_of_draws(apart: Callable[[Floats], float], drawn: ClusterDraws) -> float:
-    """Twice the share of draws on the rarer side of zero, one draw added; NaN for fewer than two blocks."""
-    if drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
+def _p_of_draws(draws: Floats) -> float:
+    """Return twice the share of draws on the rarer side of zero, with one draw added; NaN without draws."""
+    if not len(draws):
         return math.nan
-    values = np.array([apart(row) for some in drawn.weights() for row in some])
-    rarer = min(int((values <= 0).sum()), int((values >= 0).sum()))
-    return min(1.0, 2 * (rarer + 1) / (len(values) + 1))
+    rarer = min(int((draws <= 0).sum()), int((draws >= 0).sum()))
+    return min(1.0, 2 * (rarer + 1) / (len(draws) + 1))
 
 
 def _with_verdict(found: Finding) -> Finding:
-    """Say in words what came of it; a null is a result."""
+    """Return a finding with its verdict; a null is a result."""
     if not found.n:
         return replace(found, verdict=found.verdict or "not tested: no query")
     if found.blocks < LEAST_BLOCKS:
@@ -429,11 +401,5 @@ def _with_verdict(found: Finding) -> Finding:
 
 
 def contrast_frame(findings: Sequence[Finding]) -> pd.DataFrame:
-    """Findings as a table.
-
-    Examples
-    --------
-    >>> contrast_frame([]).columns[0]
-    'name'
-    """
+    """Return findings as a table with a column per field."""
     return pd.DataFrame([{name: getattr(item, name) for name in COLUMNS} for item in findings], columns=list(COLUMNS))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controls of a board: queries whose right score is known beforehand, held against what was scored."""
+"""Controls of a board: compare scores with what is known about them in advance."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,31 +16,23 @@ from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
 ORACLE: Final = "oracle_pose"
-REFERENCE: Final = "fft_vote"  # the plainest search there is: a view without error it must find
-ALPHA: Final = 1e-4  # of each test against chance: a board holds dozens of them
+REFERENCE: Final = "fft_vote"  # the simplest search: it must find a view without error
+ALPHA: Final = 1e-4  # level of each test against chance; a board has dozens
 NEARLY_ALL: Final = 0.9
+_AT_CHANCE: Final = {
+    SHUFFLED: "shuffled map at chance",
+    TURNED: "turned map at chance",
+    TWINS: "identical twins tie",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What came of one control.
+    """Result of one control, as "shuffled map at chance", for one matcher on n queries.
 
-    Parameters
-    ----------
-    control : str
-        As in "shuffled map at chance".
-    matcher : str
-        Whose answers.
-    n : int
-        Queries.
-    found : float
-        Of them right (a tie counts by its chance), or answered where none must be.
-    expected : float
-        What it should be: by chance, at least, or at most, as `control` says.
-    p : float
-        Chance of as many or more, if nothing but chance is at work; NaN where nothing is tested.
-    holds : bool
-        Whether the board can be trusted in this.
+    `found` counts right answers (a tie by its chance), or answers where none is expected. `expected` is their number by
+    chance, at least, or at most, as `control` says. `p` is the chance of as many or more under pure chance; NaN without
+    a test.
     """
 
     control: str
@@ -52,7 +44,7 @@ class Verdict:
     holds: bool
 
     def to_text(self) -> str:
-        """One line.
+        """Return the result in one line.
 
         Examples
         --------
@@ -67,27 +59,14 @@ class Verdict:
 
 
 def is_control(scores: pd.DataFrame) -> Bools:
-    """Which scored rows are of the suite of controls."""
+    """Return a mask of the scored rows in the suite of controls."""
     return (scores["suite"] == CONTROLS).to_numpy(bool)
 
 
 def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
-    """Hold all that was scored against what must come of it.
+    """Check every control of each matcher that answered it.
 
-    Parameters
-    ----------
-    scored : mapping of str to pandas.DataFrame
-        By matcher, from `score.score_task`: every row, those of the suite `controls` among them.
-
-    Returns
-    -------
-    tuple of Verdict
-        Of every control and matcher that answered it; none for a matcher without a row, or that cannot.
-
-    Examples
-    --------
-    >>> hold_controls({})
-    ()
+    `scored` holds all scored rows by matcher, including the suite `controls`.
     """
     verdicts: list[Verdict] = []
     for matcher, frame in scored.items():
@@ -105,13 +84,13 @@ def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
 
 
 def verdict_frame(verdicts: Sequence[Verdict]) -> pd.DataFrame:
-    """Verdicts as a table with the columns of `Verdict`."""
+    """Return verdicts as a table with the columns of `Verdict`."""
     columns = [field.name for field in fields(Verdict)]
     return pd.DataFrame([{name: getattr(item, name) for name in columns} for item in verdicts], columns=columns)
 
 
 def hits(scores: pd.DataFrame) -> Floats:
-    """The primary figure of each row, shape (N,): 1 where it is right, of a tie its chance."""
+    """Return the primary metric of each row, shape (N,): 1 if right, the chance of a tie."""
     parts = [
         pd.Series(primary_of(str(track)).values(part), index=part.index) for track, part in scores.groupby("track")
     ]
@@ -120,7 +99,7 @@ def hits(scores: pd.DataFrame) -> Floats:
 
 
 def chances(scores: pd.DataFrame) -> Floats:
-    """What a blind guess is worth in each row, shape (N,): of candidates, or of a prior's disc."""
+    """Return the chance of a blind guess in each row, shape (N,): among candidates, or within a prior's disc."""
     radii_m = [PriorGroup.parse(name).radius_m or math.inf for name in scores["prior_group"]]
     discs = np.minimum(1.0, (FIX_M / np.array(radii_m, dtype=float)) ** 2)
     pools = scores["pool"].to_numpy(float)
@@ -129,7 +108,7 @@ def chances(scores: pd.DataFrame) -> Floats:
 
 
 def at_least(count: float, each: Floats) -> float:
-    """Chance of at least `count` hits in independent trials, each with its own (Poisson's binomial).
+    """Return the chance of at least `count` hits in independent trials of chance `each` (Poisson binomial).
 
     Examples
     --------
@@ -143,65 +122,46 @@ def at_least(count: float, each: Floats) -> float:
 
 
 def _by_chance(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
-    """Whoever knows more than chance where there is nothing to know has it from somewhere else."""
-    for kind, name in (
-        (SHUFFLED, "shuffled map at chance"),
-        (TURNED, "turned map at chance"),
-        (TWINS, "identical twins tie"),
-    ):
+    """Check that no matcher beats chance where the map holds no information: it would come from elsewhere."""
+    for kind, name in _AT_CHANCE.items():
         mine = controls[controls["kind"] == kind]
-        if not len(mine):
-            continue
-        found = float(hits(mine).sum())
-        each = np.full(len(mine), 0.5) if kind == TWINS else chances(mine)
-        p = at_least(found, each)
-        yield Verdict(
-            control=name,
-            matcher=matcher,
-            n=len(mine),
-            found=found,
-            expected=float(each.sum()),
-            p=p,
-            holds=p >= ALPHA,
-        )
+        if len(mine):
+            found = float(hits(mine).sum())
+            each = np.full(len(mine), 0.5) if kind == TWINS else chances(mine)
+            p = at_least(found, each)
+            yield _verdict(name, matcher, len(mine), found, float(each.sum()), holds=p >= ALPHA, p=p)
 
 
 def _withheld(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
-    """Who sees nothing must say nothing."""
+    """Check that a matcher gives no answer to an empty view."""
     blind = controls[controls["kind"] == BLIND]
     if len(blind):
-        answered = float(blind["is_answered"].sum())
-        yield _exact("blind views withheld", matcher, len(blind), found=answered, expected=0.0)
+        yield _exact("blind views withheld", matcher, len(blind), float(blind["is_answered"].sum()), 0.0)
 
 
 def _nearly_all(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:
-    """A view without error is found, or the search, the map or the truth is at fault."""
+    """Check that views without error are found; otherwise the search, the map or the truth is at fault."""
     clear = controls[controls["kind"] == NOISE_FREE]
     if len(clear):
         found, least = float(hits(clear).sum()), NEARLY_ALL * len(clear)
-        yield Verdict(
-            control="views without error found, at least",
-            matcher=matcher,
-            n=len(clear),
-            found=found,
-            expected=least,
-            p=math.nan,
-            holds=found >= least,
-        )
+        name = "views without error found, at least"
+        yield _verdict(name, matcher, len(clear), found, least, holds=found >= least)
 
 
 def _perfect(matcher: str, asked: pd.DataFrame) -> Iterator[Verdict]:
-    """Who is given the truth is always right, and withholds where there is none; else scorer or truth is at fault."""
+    """Check that the oracle is always right and withholds absent places; otherwise scorer or truth is at fault."""
     present, absent = asked[is_present(asked)], asked[~is_present(asked)]
     if len(present):
-        found = float(hits(present).sum())
-        yield _exact("oracle always right", matcher, len(present), found=found, expected=float(len(present)))
+        yield _exact("oracle always right", matcher, len(present), float(hits(present).sum()), float(len(present)))
     if len(absent):
-        found = float(absent["is_answered"].sum())
-        yield _exact("oracle withholds absent places", matcher, len(absent), found=found, expected=0.0)
+        yield _exact("oracle withholds absent places", matcher, len(absent), float(absent["is_answered"].sum()), 0.0)
 
 
-def _exact(control: str, matcher: str, n: int, *, found: float, expected: float) -> Verdict:
-    return Verdict(
-        control=control, matcher=matcher, n=n, found=found, expected=expected, p=math.nan, holds=found == expected
-    )
+def _exact(control: str, matcher: str, n: int, found: float, expected: float) -> Verdict:
+    return _verdict(control, matcher, n, found, expected, holds=found == expected)
+
+
+def _verdict(
+    control: str, matcher: str, n: int, found: float, expected: float, *, holds: bool, p: float = math.nan
+) -> Verdict:
+    return Verdict(control=control, matcher=matcher, n=n, found=found, expected=expected, p=p, holds=holds)

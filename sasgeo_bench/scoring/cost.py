@@ -18,20 +18,10 @@ BYTES_PER_MB: Final = 1e6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunCost:
-    """Cost of a run on one map; NaN where `run.json` does not say.
+    """Cost of a run on one map; NaN where `run.json` does not state it.
 
-    Parameters
-    ----------
-    prepare_s : float
-        Seconds of `prepare`, without answers.
-    peak_rss_mb : float
-        Peak memory of the matcher's process and all that came from it (1 MB = 10^6 bytes).
-    index_mb : float
-        Files that the matcher wrote for the map.
-    map_mb : float
-        The region's files.
-    cpu_s : float
-        CPU-seconds of all answers together.
+    `prepare_s` excludes answers, `peak_rss_mb` includes child processes (1 MB = 10^6 bytes), `index_mb` are the
+    matcher's files and `map_mb` the region's, `cpu_s` is that of all answers together.
     """
 
     prepare_s: float
@@ -43,18 +33,18 @@ class RunCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Costs:
-    """All that the cost metrics of one matcher are computed from.
+    """Input of the cost metrics of one matcher.
 
     Parameters
     ----------
     scores : pandas.DataFrame
         Its scored rows.
     runs : sequence of mapping
-        What each `run.json` says; none for a file of predictions.
+        Contents of each `run.json`; none for a file of predictions.
     view_bytes : mapping of str to int
-        By query: two bits for each cell and class, one byte for each confidence, WKB for each vector.
+        By query: two bits per cell and class, one byte per confidence, WKB per vector.
     area_km2 : mapping of str to float
-        Mapped area by region, where it is known.
+        Mapped area by region, where known.
     """
 
     scores: pd.DataFrame
@@ -100,7 +90,7 @@ def latency_quantile(costs: Costs, share: float) -> float:
     """Return the least latency in seconds that a share in (0, 1] of the timed queries does not exceed.
 
     A time-out is infinite: it took at least the limit, and leaving it out would make a slow matcher look fast. Other
-    queries without a time (crashes, refusals, submissions without code) are left out. NaN where none was timed.
+    queries without a time (crashes, refusals, submissions without code) are left out. NaN if none is timed.
     """
     latency_s = np.where(costs.scores["status"] == "timeout", np.inf, costs.scores["latency_s"].to_numpy(float))
     timed_s = latency_s[~np.isnan(latency_s)]
@@ -108,13 +98,13 @@ def latency_quantile(costs: Costs, share: float) -> float:
 
 
 def most(costs: Costs, name: str) -> float:
-    """Return the largest value of a field of `RunCost` over all maps; NaN where no run says it."""
+    """Return the largest value of a field of `RunCost` over all maps; NaN if no run states it."""
     values = [getattr(run_cost(about), name) for about in costs.runs]
     return max((value for value in values if not math.isnan(value)), default=math.nan)
 
 
 def map_kb_per_km2(costs: Costs) -> float:
-    """Return kilobytes of maps with what the matcher wrote for them per square kilometre; each map counts once."""
+    """Return kilobytes of maps and the matcher's files for them per square kilometre; each map counts once."""
     stored = {about["region"]: run_cost(about) for about in costs.runs if about["region"] in costs.area_km2}
     size_kb = {name: 1e3 * (cost.map_mb + np.nan_to_num(cost.index_mb)) for name, cost in stored.items()}
     known = [name for name, size in size_kb.items() if not math.isnan(size)]
@@ -123,23 +113,23 @@ def map_kb_per_km2(costs: Costs) -> float:
 
 
 def cpu_s_per_fix(costs: Costs) -> float:
-    """Return CPU-seconds of all queries over those answered; NaN where no run says it."""
+    """Return CPU-seconds of all queries per answered query; NaN if no run states it."""
     if not costs.runs:
         return math.nan
     return per_fix(sum(run_cost(about).cpu_s for about in costs.runs), int(costs.scores["is_answered"].sum()))
 
 
 def sent_kb_per_fix(costs: Costs) -> float:
-    """Return kilobytes of the views of all queries over those answered."""
+    """Return kilobytes of the views of all queries per answered query."""
     asked = costs.scores.loc[costs.scores["status"] != NOT_APPLICABLE, "query_id"]
     sent_kb = sum(costs.view_bytes[name] for name in asked) / BYTES_PER_KB
     return per_fix(sent_kb, int(costs.scores["is_answered"].sum()))
 
 
 def per_fix(total: float, fixes: float) -> float:
-    """Return what one fix costs when all queries are paid for, those without a fix too.
+    """Return the total cost of all queries, answered or not, per fix.
 
-    Infinite where all was in vain; NaN where nothing was paid and nothing came, or the total is not known.
+    Infinite for a cost without fixes; NaN for no cost and no fixes, or an unknown total.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers that may be withheld: who accepts them, what comes of it, and what it costs.
+"""Decisions to accept or withhold fixes, and their cost.
 
-Every query counts. One without an answer (withheld, crash, time-out) can never be accepted. An answer without a
-confidence is trusted less than all answers with one; if no answer has one, all are trusted alike.
+Every query counts. A query without an answer (withheld, crash, time-out) is never accepted. Answers without a
+confidence rank below all answers with one; if no answer has one, all rank the same.
 """
 
 import math
@@ -21,19 +21,19 @@ PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """N queries as the integrity track sees them, present and absent places mixed; each column has shape (N,).
+    """Answers to N queries of the integrity track, present and absent places mixed; each column has shape (N,).
 
     Parameters
     ----------
     confidence : ndarray of float
-        Probability that the fix is right, or any other number that grows with trust; NaN where none is given. It is
-        not looked at where there is no answer.
+        Probability that the fix is right, or any other number that increases with trust; NaN if missing. Ignored where
+        there is no answer.
     is_answered : ndarray of bool
-        Whether there is a fix that could be accepted.
+        There is a fix that could be accepted.
     is_right : ndarray of bool
-        Whether the fix is within tolerance of a place that is present.
+        The fix is within tolerance of a present place.
     is_present : ndarray of bool
-        Whether the place is on the map that is searched.
+        The place is on the searched map.
 
     Raises
     ------
@@ -51,11 +51,11 @@ class Answers:
     is_answered: Bools
     is_right: Bools
     is_present: Bools
-    tie: Ints = field(init=False)  # group of equal confidence, 0 the most confident; the unanswered are the last group
+    tie: Ints = field(init=False)  # group of equal confidence, 0 the highest; queries without an answer are the last
     steps: Floats = field(init=False)  # confidence of each group; -inf for answers without one
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be; group equal confidences, once for all figures and draws."""
+        """Check the columns and group equal confidences, once for all metrics and draws."""
         count = np.size(self.is_answered)
         for name in ("is_answered", "is_right", "is_present"):
             object.__setattr__(self, name, check_column(getattr(self, name), name, count) > 0)
@@ -75,31 +75,17 @@ class Answers:
         object.__setattr__(self, "steps", -values)
 
     def __len__(self) -> int:
-        """Give the number of queries."""
+        """Return the number of queries."""
         return len(self.tie)
 
 
 def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | None = None) -> Floats:
-    """Weights under which places are present in a given share of the queries, as 0.9, 0.7 or 0.5.
-
-    Parameters
-    ----------
-    is_present : array_like of bool, shape (N,)
-        Whether each place is on the map.
-    share : float
-        In [0, 1].
-    weights : array_like, shape (N,), optional
-        What is to be reweighted; 1 each where not given.
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        They sum to what `weights` sum to.
+    """Return weights, shape (N,), under which present places make up a given share of the queries; their sum is kept.
 
     Raises
     ------
     MetricError
-        If a side that is to count has no query.
+        If the share is not in [0, 1], or a side of positive share has no query.
 
     Examples
     --------
@@ -120,39 +106,10 @@ def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | N
     return np.asarray(mass * np.divide(wanted, there, out=np.zeros(len(mass)), where=there > 0))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Outcomes:
-    """What a decision led to, each of shape (N,); every query has exactly one.
-
-    A withheld fix is wrongly withheld if it would have been right. All else that is not accepted is correctly withheld:
-    a false fix, an absent place, and a query without an answer, for there nothing right was withheld (Eq. (13)).
-    """
-
-    false_fix: Bools
-    right_fix: Bools
-    correctly_withheld: Bools
-    wrongly_withheld: Bools
-
-    def shares(self, weights: ArrayLike | None = None) -> dict[str, float]:
-        """Share of all queries with each outcome; NaN for no queries."""
-        names = ("false_fix", "right_fix", "correctly_withheld", "wrongly_withheld")
-        return {name: weighted_mean(getattr(self, name), weights) for name in names}
-
-
 def accept(answers: Answers, threshold: float) -> Bools:
-    """Which fixes are accepted: those with `confidence >= threshold`.
+    """Return which fixes are accepted, shape (N,): those with `confidence >= threshold`.
 
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    threshold : float
-        `-inf` accepts every answer, even one without a confidence; `inf` none.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        Never True without an answer.
+    A threshold of `-inf` accepts every answer, even without a confidence; queries without an answer are never accepted.
 
     Examples
     --------
@@ -164,19 +121,10 @@ def accept(answers: Answers, threshold: float) -> Bools:
 
 
 def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
-    """Which fixes Eq. (14) accepts: those whose chance to be false is below 1 / (1 + cost ratio).
+    """Return which fixes Eq. (14) accepts, shape (N,): chance of a false fix below 1 / (1 + cost ratio).
 
-    Parameters
-    ----------
-    answers : Answers
-        With confidences that are probabilities.
-    cost_ratio : float
-        Cost of a false fix over that of withholding a right one: 5, 20 or 100.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        False without an answer or without a confidence: nothing is known of its risk.
+    The cost ratio is the cost of a false fix over that of withholding a right one: 5, 20 or 100. False without an
+    answer or without a confidence.
 
     Raises
     ------
@@ -205,12 +153,12 @@ def _check_ratio(cost_ratio: float) -> None:
 
 
 def check_probabilities(answers: Answers) -> None:
-    """Refuse confidences outside [0, 1].
+    """Check that all confidences lie in [0, 1].
 
     Raises
     ------
     MetricError
-        With what they reach.
+        With the range found.
     """
     given = answers.confidence[~np.isnan(answers.confidence)]
     if ((given < 0) | (given > 1)).any():
@@ -218,71 +166,28 @@ def check_probabilities(answers: Answers) -> None:
         raise MetricError(message)
 
 
-def outcomes(answers: Answers, accepted: ArrayLike) -> Outcomes:
-    """What a decision leads to.
-
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    accepted : array_like of bool, shape (N,)
-        From `accept` or `accept_by_cost`.
-
-    Returns
-    -------
-    Outcomes
-        One for each query.
-
-    Raises
-    ------
-    MetricError
-        If a query without an answer is accepted.
-
-    Examples
-    --------
-    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[0, 1], is_present=[1, 1])
-    >>> outcomes(some, [True, False]).shares()
-    {'false_fix': 0.5, 'right_fix': 0.0, 'correctly_withheld': 0.0, 'wrongly_withheld': 0.5}
-    """
-    taken = check_column(accepted, "accepted", len(answers)) > 0
-    if (taken & ~answers.is_answered).any():
-        message = "a query without an answer is accepted: decide with accept() or accept_by_cost()"
-        raise MetricError(message)
-    return Outcomes(
-        false_fix=taken & ~answers.is_right,
-        right_fix=taken & answers.is_right,
-        correctly_withheld=~taken & ~answers.is_right,
-        wrongly_withheld=~taken & answers.is_right,
-    )
-
-
 def cost_values(
     answers: Answers, accepted: ArrayLike, cost_ratio: float, *, charged: Literal["right fix", "place"] = "right fix"
 ) -> Floats:
-    """Cost of each query's decision, in units of a wrongly withheld fix.
+    """Return the cost of each query's decision, shape (N,), in units of a wrongly withheld fix: 0, 1 or `cost_ratio`.
 
     Parameters
     ----------
     answers : Answers
-        Of N queries.
+        N queries.
     accepted : array_like of bool, shape (N,)
-        The decision.
+        Accepted fixes.
     cost_ratio : float
         Cost of a false fix.
     charged : {"right fix", "place"}
-        What costs 1 when withheld: a right fix (Eq. (13); it judges the decision, whatever the answers are worth), or
-        every place that is present (it judges the whole method: false answers withheld, and none, are still no fixes).
-        By the first alone a matcher that is never right and withholds all would have cost 0.
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        0, 1 or `cost_ratio`.
+        What costs 1 when withheld. "right fix" (Eq. (13)) evaluates the decision alone: a matcher that is never right
+        and withholds everything costs 0. "place" charges every present place without a fix and evaluates the whole
+        method.
 
     Raises
     ------
     MetricError
-        If the ratio is not positive.
+        If the ratio is not positive, or a query without an answer is accepted.
 
     Examples
     --------
@@ -293,10 +198,12 @@ def cost_values(
     [20.0, 1.0]
     """
     _check_ratio(cost_ratio)
-    found = outcomes(answers, accepted)
-    withheld = found.correctly_withheld | found.wrongly_withheld
-    missed = found.wrongly_withheld if charged == "right fix" else withheld & answers.is_present
-    return np.asarray(cost_ratio * found.false_fix + missed)
+    taken = check_column(accepted, "accepted", len(answers)) > 0
+    if (taken & ~answers.is_answered).any():
+        message = "a query without an answer is accepted: decide with accept() or accept_by_cost()"
+        raise MetricError(message)
+    missed = ~taken & (answers.is_right if charged == "right fix" else answers.is_present)
+    return np.asarray(cost_ratio * (taken & ~answers.is_right) + missed)
 
 
 def decision_cost(
@@ -306,23 +213,7 @@ def decision_cost(
     *,
     charged: Literal["right fix", "place"] = "right fix",
 ) -> float:
-    """Mean cost of a query when fixes are accepted by Eq. (14), in units of a wrongly withheld fix.
-
-    Parameters
-    ----------
-    answers : Answers
-        With confidences that are probabilities.
-    cost_ratio : float
-        Cost of a false fix: 5, 20 or 100.
-    weights : array_like, shape (N,), optional
-        Not negative.
-    charged : {"right fix", "place"}
-        As in `cost_values`.
-
-    Returns
-    -------
-    float
-        Not negative; NaN for no queries.
+    """Return the mean of `cost_values` when fixes are accepted by Eq. (14); NaN for no queries.
 
     Examples
     --------

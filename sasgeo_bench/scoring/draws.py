@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws for the bootstrap: blocks, then sites within them."""
+"""Bootstrap draws: blocks, then sites within them."""
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -13,36 +14,39 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Floats, Ints, block_codes
 
 DRAWS: Final = 10_000
-_CHUNK_CELLS: Final = 2**21  # draws times queries held at once: 16 MB a column of numbers, some ten columns at most
+_CHUNK_CELLS: Final = 2**21  # draws x queries in memory at once: 16 MB per column, about ten columns at most
+
+
+def seed_of_text(text: str) -> int:
+    """Return a seed in [0, 2^64): the first eight bytes of the SHA-256 of a text."""
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterDraws:
-    """Draws with replacement: first blocks, then sites within each block as often as it was drawn, queries and all.
+    """Draws with replacement: first blocks, then sites within each drawn block, with all their queries.
 
     Parameters
     ----------
     blocks : sequence of str or ndarray of int, length N
-        Block of each query. Figures that are to be compared are given for the same queries in the same order.
+        Block of each query. Metrics to compare must have the same queries in the same order.
     sites : sequence of str or ndarray of int, length N, optional
-        Site of each query within its block; without them each query is a site of its own. The queries of a site show
-        one place, so they are drawn together.
+        Site of each query within its block; by default each query is a site. Queries of a site show one place, so they
+        are drawn together.
     seed : int
-        The same seed, blocks and number of draws give the same draws, whatever is computed from them.
+        The same seed, blocks and number of draws give the same draws for every metric.
     draws : int
-        How many.
+        Number of draws.
     draws_within : bool
-        False draws whole blocks, with the queries they hold.
+        False draws whole blocks.
 
     Raises
     ------
     MetricError
-        If the number of draws is not positive, or there are not as many sites as blocks.
+        If the number of draws is not positive, or the numbers of sites and blocks differ.
 
-    Notes
-    -----
-    A block of n sites that is drawn c times gives c n sites, each drawn from its n. Numbers of queries differ between
-    draws if blocks or sites differ in size; means are ratios of sums and take that into account.
+    Notes ----- A block of n sites that is drawn c times gives c n sites, each drawn from its n. Sample sizes differ
+    between draws if blocks or sites differ in size; means are ratios of sums and account for that.
 
     Examples
     --------
@@ -66,11 +70,11 @@ class ClusterDraws:
     count: int = field(init=False)  # of queries
     blocks_count: int = field(init=False)
     _sites_count: int = field(init=False, repr=False)
-    _site: Ints | None = field(init=False, repr=False)  # number of each query's site; None where it is the query's own
+    _site: Ints | None = field(init=False, repr=False)  # site of each query; None if each has its own
     _sizes: tuple[tuple[int, Ints, Ints], ...] = field(init=False, repr=False)  # size, blocks (K,), sites (K, size)
 
     def __post_init__(self) -> None:
-        """Gather blocks of equal size, so that drawing goes by few large steps."""
+        """Group blocks by size, so that drawing takes few vectorized steps."""
         if self.draws < 1:
             message = f"draws must be at least 1, got {self.draws!r}"
             raise MetricError(message)
@@ -90,7 +94,7 @@ class ClusterDraws:
         object.__setattr__(self, "_sizes", tuple(grouped))
 
     def weights(self) -> Iterator[Floats]:
-        """How often each query is drawn, shape (D, N), some draws at a time; all of them hold `draws` rows."""
+        """Yield how often each query is drawn, shape (D, N), in chunks that sum to `draws` rows."""
         for rows, parts in self._chunks():
             drawn = np.empty((rows, self._sites_count))
             for part in parts:
@@ -98,9 +102,9 @@ class ClusterDraws:
             yield drawn if self._site is None else drawn[:, self._site]
 
     def sums(self, table: Floats) -> Iterator[Floats]:
-        """Sums of the columns of a table, shape (N, M), over the queries of each draw, shape (D, M), some at a time.
+        """Yield the sums of a table's columns, shape (N, M), over the queries of each draw, shape (D, M), in chunks.
 
-        The same as `weights() @ table` to the last digits, and some times faster: no weight is ever written down.
+        Equals `weights() @ table` up to rounding, but is several times faster: no weights are stored.
         """
         if self._site is not None:
             order = np.argsort(self._site, kind="stable")
@@ -112,7 +116,7 @@ class ClusterDraws:
             yield total
 
     def _chunks(self) -> Iterator[tuple[int, Iterator["_Picked"]]]:
-        """How many draws at a time, and what each of them takes from the blocks of each size."""
+        """Yield the number of draws of a chunk, and its picks from the blocks of each size."""
         rng = np.random.default_rng(self.seed)
         step = max(1, _CHUNK_CELLS // max(self.count, 1))
         for begin in range(0, self.draws if self.count else 0, step):
@@ -130,28 +134,28 @@ class ClusterDraws:
             if size == 1 or not self.draws_within:
                 yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=None)
                 continue
-            # Of each draw and block so many sites are drawn from `size`.
+            # For each draw and block, as many sites are drawn as the block has, times its copies.
             within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=_small(size))
             yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=within)
 
 
 def _numbered(block: Ints, sites: Sequence[str] | Ints | None) -> tuple[Ints, Ints]:
-    """Number of each query's site, shape (N,), in the order of their first queries, and those queries, shape (S,)."""
+    """Return each query's site by first appearance, shape (N,), and the first query of each site, shape (S,)."""
     if sites is None:
         return np.arange(len(block)), np.arange(len(block))
     _, code = block_codes(sites, len(block))
-    within = block * (1 + int(code.max(initial=0))) + code  # a site that reaches into two blocks is one in each
+    within = block * (1 + int(code.max(initial=0))) + code  # a site in two blocks counts as two
     _, first, inverse = np.unique(within, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse], np.sort(first)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Picked:
-    """What some draws take from K blocks of one size.
+    """Draws from K blocks of one size.
 
-    `sites`, shape (K * size,), are those of the blocks, one block after the other; `copies`, shape (D, K), says how
-    often each block is drawn; `within` which of its sites, draw after draw and block after block: each of them as
-    often as its block where it is None.
+    `sites`, shape (K * size,), are those of the blocks, one block after the other; `copies`, shape (D, K), counts how
+    often each block is drawn. `within` are the drawn positions in the block, by draw and block; None takes each site as
+    often as its block.
     """
 
     size: int
@@ -160,7 +164,7 @@ class _Picked:
     within: NDArray[np.integer] | None
 
     def weights(self, rows: int) -> Floats:
-        """How often each site is taken, shape (D, K * size)."""
+        """Return how often each site is drawn, shape (D, K * size)."""
         if self.within is None:
             return np.repeat(self.copies, self.size, axis=1).astype(np.float64)
         cells = self.copies.ravel() * self.size
@@ -168,7 +172,7 @@ class _Picked:
         return np.bincount(flat, minlength=len(cells) * self.size).reshape(rows, -1).astype(np.float64)
 
     def picks(self, rows: int) -> csr_array | Floats:
-        """The same, as a table with one entry for each site that is taken."""
+        """Return the same as a sparse table with one entry per drawn site."""
         if self.within is None and self.size > 1:
             return self.weights(rows)
         first = np.arange(self.copies.shape[1], dtype=np.int32) * self.size
@@ -180,5 +184,4 @@ class _Picked:
 
 
 def _small(size: int) -> type[np.uint16] | type[np.uint32]:
-    """Give the type that draws numbers below a size fastest."""
     return np.uint16 if size <= np.iinfo(np.uint16).max else np.uint32

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is to be scored: matchers as they were run, and files of predictions."""
+"""Entries of a board: runs of matchers, files of predictions, and submissions."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -28,10 +28,10 @@ _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One contestant: a matcher as it was run, a file of predictions, or a submission.
+    """One entry of a board: the runs of a matcher, a file of predictions, or a submission.
 
-    `runs` are what each `run.json` says; `sources` the folder or file of predictions for each of them. Of a submission
-    `submission` is what its `submission.json` says.
+    `runs` are the contents of each `run.json`; `sources` the folder or file of predictions for each of them.
+    `submission` is the content of `submission.json`.
     """
 
     name: str
@@ -44,31 +44,32 @@ class Entry:
 
     @property
     def card(self) -> dict[str, Any] | None:
-        """What a contestant says of itself; None for a file of predictions."""
+        """Return the card of the matcher or submission; None for a file of predictions."""
         if self.submission is not None:
             return self.submission.card.model_dump(mode="json")
         return dict(self.runs[0]["matcher"]) if self.runs else None
 
     @property
     def declared(self) -> list[str] | None:
-        """Places that it says have taught it, before any runner did; None where it says nothing."""
+        """Return the training places that the entry declares itself; None if it declares nothing."""
         if self.submission is not None:
             return list(self.submission.card.places)
-        said = self.runs[0]["matcher"].get("trained_on") if self.runs else None
-        return [str(place) for place in said] if isinstance(said, list) else None
+        places = self.runs[0]["matcher"].get("trained_on") if self.runs else None
+        return [str(place) for place in places] if isinstance(places, list) else None
 
     @property
     def is_taught(self) -> bool:
-        """Whether the halves of a split were answered after other training."""
+        """Return True if the halves of a split were answered after different training."""
         return bool(self.learned()) or (self.submission is not None and self.submission.card.is_by_half)
 
     def learned(self) -> list[dict[str, Any]]:
-        """What the runner has taught it: each text once, where it comes from, and the tasks asked under it."""
+        """Return each training by the runner once: its source, its training places and the tasks asked under it."""
         found: dict[str, dict[str, Any]] = {}
         for about in self.runs:
-            said = LearnedSaid.of(about)
-            if said is not None:
-                one = found.setdefault(said.key, {**asdict(said), "trained_on": list(said.trained_on), "asked": []})
+            training = LearnedSaid.of(about)
+            if training is not None:
+                fields = asdict(training) | {"trained_on": list(training.trained_on), "asked": []}
+                one = found.setdefault(training.key, fields)
                 one["asked"].append(f"{about['suite']}/{about['region']}")
         return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
@@ -76,34 +77,22 @@ class Entry:
 def find_entries(
     paths: Sequence[Path], submissions: Sequence[Path] = (), *, failures: Failures | None = None
 ) -> tuple[Entry, ...]:
-    """Who is to be scored.
+    """Return the entries found in folders of runs, files of predictions and submissions, by name.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Folders with runs somewhere in them, and files of predictions.
-    submissions : sequence of Path
-        Folders of submissions.
-    failures : Failures, optional
-        Takes note of runs and submissions that cannot be read, which are then left out.
-
-    Returns
-    -------
-    tuple of Entry
-        By name; two versions of one matcher are two entries, with the version in their names, and with the hash where
-        that is the same.
+    Runs may lie at any depth. Two versions of one matcher are two entries, with the version in their names, and the
+    hash if versions agree. `failures` records runs and submissions that cannot be read; without it, the first one
+    raises.
 
     Raises
     ------
     StoreError
-        If a path holds no predictions, a `run.json` does not say whose answers lie beside it, or a submission is not
-        what it says.
+        If a path holds no predictions, a `run.json` does not identify its matcher, or a submission is damaged.
     ConfigError
-        If two contestants have one name, or a file or submission that of a control.
+        If two entries share a name, or a file or submission has that of a control.
     """
     runs: list[Path] = []
     files: list[Entry] = []
-    seen: set[Path] = set()  # a run that lies in two of the folders, or a file that is named twice, counts once
+    seen: set[Path] = set()  # a run or file that is given twice counts once
     for path in paths:
         if path.is_file():
             if _is_new(path, seen):
@@ -119,7 +108,7 @@ def find_entries(
     versions = [(name, number) for name, number, _ in by_run]
 
     def shown(name: str, number: str, digest: str) -> str:
-        """As short as it can be and still be one contestant's alone."""
+        """Return the shortest unique name."""
         if names.count(name) == 1:
             return name
         return f"{name} {number}" if versions.count((name, number)) == 1 else f"{name} {number} ({digest[:6]})"
@@ -138,7 +127,7 @@ def find_entries(
     entries += files
     entries += _all_submitted(submissions, failures)
     listed = [entry.name for entry in entries]
-    # No submission passes for a version of what is there: "mine" beside "mine 1" would be told apart by no reader.
+    # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
     twice = next(
         (
             one.name
@@ -148,23 +137,18 @@ def find_entries(
         None,
     )
     if twice is not None:
-        message = f"two contestants are named {twice!r}: rename the file or the submission of one"
+        message = f"two entries are named {twice!r}: rename the file or the submission of one"
         raise ConfigError(message)
     return tuple(sorted(entries, key=lambda entry: entry.name))
 
 
 def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Entry, ...]:
-    """Leave out what was run on some regions, on each of their maps; who is left without a run is left out.
+    """Return the entries without runs on some regions and their modified maps; drop entries without runs.
 
     Raises
     ------
     ConfigError
-        If no run is on one of them, or all are, or an entry is a file, which does not say where its queries are.
-
-    Examples
-    --------
-    >>> leave_out((), ())
-    ()
+        If no run is on one of the regions, all runs are, or an entry is a file, which does not name regions.
     """
     if not regions:
         return entries
@@ -191,7 +175,7 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
 def _by_run(
     paths: Sequence[Path], failures: Failures | None
 ) -> dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]]:
-    """Runs by name, version and hash; who has one that cannot be read has none, for a part would be ranked as all."""
+    """Return runs by name, version and hash; skip matchers with an unreadable run, which would be ranked on a part."""
     read: dict[Path, dict[str, Any]] = {}
     for path in paths:
         with _noted(failures, str(path.parent)):
@@ -206,7 +190,7 @@ def _by_run(
 
 
 def _root_of(run: Path) -> Path:
-    """Folder of all runs of a matcher with one hash, above suite and region."""
+    """Return the folder of all runs of a matcher with one hash, above suite and region."""
     return list(run.resolve().parents)[:3][-1]
 
 
@@ -238,40 +222,41 @@ def _file_entry(path: Path) -> Entry:
 
 
 def _check_free(name: str, path: Path) -> None:
-    """Refuse the name of a control: its row would stand beside the ranks."""
+    """Refuse the name of a control: its row would not be ranked."""
     if is_unranked(name):
         message = f"{path.name!r}: {name!r} is the name of a control of every board: choose another name"
         raise ConfigError(message)
 
 
 def _submitted(folder: Path) -> Entry:
-    said = read_submission(folder)
-    _check_free(said.card.name, folder)
+    submission = read_submission(folder)
+    _check_free(submission.card.name, folder)
     return Entry(
-        name=said.card.name,
-        version=said.card.version,
+        name=submission.card.name,
+        version=submission.card.version,
         hash="",
         how=AS_SUBMITTED,
-        sources=(folder / predictions_name(said.card.name),),
-        submission=said,
+        sources=(folder / predictions_name(submission.card.name),),
+        submission=submission,
     )
 
 
 def _read_run(path: Path) -> dict[str, Any]:
-    """What a `run.json` says, after a look at whatever a board takes from it: it may be anyone's."""
+    """Read a `run.json` and check every field that a board uses: its author is not trusted."""
     about = prediction_files.read_run(path.parent) or {}
     card = about.get("matcher")
-    said = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
+    stated = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
     if isinstance(card, dict):
-        said |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
-    fault = next((f"{name} is {value!r}" for name, value in said.items() if not value or type(value) is not str), None)
+        stated |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
+    wrong = (f"{name} is {value!r}" for name, value in stated.items() if not value or type(value) is not str)
+    fault = next(wrong, None)
     try:
-        check_identity(str(said["matcher.name"]), str(said["matcher.version"]))
+        check_identity(str(stated["matcher.name"]), str(stated["matcher.version"]))
         run_cost(about)
         LearnedSaid.of(about)
     except (MatchError, MetricError) as error:
         fault = fault or str(error)
-    if said["matcher.name"] == ORACLE != about.get("spec", ORACLE):
+    if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):
         fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
     if fault is not None:
         message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"

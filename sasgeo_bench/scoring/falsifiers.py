@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Falsifiers of registered contrasts: the same two methods where what separates them is taken away."""
+"""Falsifiers of registered contrasts: the same two methods on queries without the stress that separates them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, both_on, mean_finding
 from sasgeo_bench.scoring.draws import DRAWS
 
-EVERY: Final = "all"  # suites, or kinds of one
+EVERY: Final = "all"  # suites, or kinds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Falsifier:
-    """What came of a contrast where its arms should not differ.
+    """Result of a contrast on queries where its methods should not differ.
 
     Parameters
     ----------
     contrast, suite, kind : str
-        "all" suites together, or one; there each kind of falsifier, and "control" for the same places without stress.
+        "all" suites together, or one suite with a kind of falsifier, or "control" for the same places without stress.
     finding : Finding
-        Of the two arms there; of its p none is adjusted, for this is no part of what was registered.
+        Result there; its p-values are not adjusted, since this is not part of the registered test.
     """
 
     contrast: str
@@ -34,7 +34,7 @@ class Falsifier:
 
     @property
     def verdict(self) -> str:
-        """In words: whether the first arm gains where it should not."""
+        """Return in words whether the first method gains where it should not."""
         found = self.finding
         if found.blocks < LEAST_BLOCKS:
             return f"not decided: {counted(found.blocks, 'block')}"
@@ -46,31 +46,14 @@ class Falsifier:
 def hold_falsifiers(
     contrasts: Sequence[Contrast], scores: Mapping[str, pd.DataFrame], *, draws: int = DRAWS
 ) -> tuple[Falsifier, ...]:
-    """Compare the arms of each contrast on controls and falsifiers of its suites.
+    """Compare the methods of each contrast by success or recall on controls and falsifiers of its suites.
 
-    Parameters
-    ----------
-    contrasts : sequence of Contrast
-        Those by success or recall; one by "aurc" has none.
-    scores : mapping of str to pandas.DataFrame
-        Scored rows by matcher.
-    draws : int
-        Of the bootstrap.
-
-    Returns
-    -------
-    tuple of Falsifier
-        By contrast: all suites together, then suite by suite.
+    The order is by contrast: all suites together, then suite by suite.
 
     Raises
     ------
     ConfigError
         If a contrast names a method that is not on the board.
-
-    Examples
-    --------
-    >>> hold_falsifiers((), {})
-    ()
     """
     means = (contrast for contrast in contrasts if contrast.metric == "primary")
     return tuple(item for contrast in means for item in _of(contrast, scores, draws))
@@ -88,7 +71,7 @@ def _of(contrast: Contrast, scores: Mapping[str, pd.DataFrame], draws: int) -> I
 
 
 def _parts(frame: pd.DataFrame) -> Iterator[tuple[str, str, "pd.Series[bool]"]]:
-    """Suite, kind and rows of each part; all of them come first, unless they are one."""
+    """Yield suite, kind and row mask of each part; if there are several, all of them together come first."""
     parts = sorted(set(zip(frame["suite"], frame["kind"], strict=True)))
     if len(parts) > 1:
         yield EVERY, EVERY, frame["suite"].notna()
@@ -97,7 +80,7 @@ def _parts(frame: pd.DataFrame) -> Iterator[tuple[str, str, "pd.Series[bool]"]]:
 
 
 def _unstressed(frame: pd.DataFrame) -> "pd.Series[bool]":
-    """Present places without stress; a view that is all unknown has nothing to be found by."""
+    """Return a mask of present places without stress; a view that is all unknown cannot be found."""
     return frame["is_present"].astype(bool) & (frame["role"] != "stress") & (frame["unknown_share"] < 1)
 
 
@@ -106,13 +89,7 @@ COLUMNS: Final = ("contrast", "suite", "kind", "first", "second", *_TOLD, "verdi
 
 
 def falsifier_frame(found: Sequence[Falsifier]) -> pd.DataFrame:
-    """Falsifiers as a table.
-
-    Examples
-    --------
-    >>> list(falsifier_frame([]).columns)[:3]
-    ['contrast', 'suite', 'kind']
-    """
+    """Return falsifiers as a table with the columns `COLUMNS`."""
     rows = [
         {name: getattr(item.finding, name) for name in ("first", "second", *_TOLD)}
         | {"contrast": item.contrast, "suite": item.suite, "kind": item.kind, "verdict": item.verdict}

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a board for matcher x rejector: how well it is known which answers are false."""
+"""Rows of a board for matcher x rejector: how well confidences separate right from false fixes."""
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -11,36 +10,25 @@ import pandas as pd
 
 from sasgeo_bench.scoring.base import Floats, weighted_mean
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
-from sasgeo_bench.scoring.draws import ClusterDraws
+from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity_metric import drawn_areas
 from sasgeo_bench.scoring.intervals import Interval, effective_count, share_interval
 from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS, RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.rejection import answers_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, side_by_side
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads
 
 AS_DRAWN: Final = "as drawn"
-_CACHED: Final = 2**16  # numbers that a core keeps at hand: larger tables take twice the time
-SLOW_DRAWS: Final = 1000  # for figures that are no means: each draw sorts anew
+_CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
+SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
 _NO_DRAWS: Final = np.empty(0)
 
 
-def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
-    """Every integrity figure of a matcher with a rejector.
+def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
+    """Yield every integrity metric of a matcher with a rejector, from rows of `rejection.judge` or `own_confidence`.
 
-    Parameters
-    ----------
-    matcher, rejector : str
-        Their names.
-    judged : pandas.DataFrame
-        From `rejection.judge` or `rejection.own_word`.
-    is_calibrated : bool
-        Whether it gives probabilities; without, there are no figures that judge them.
-
-    Yields
-    ------
-    Row
-        For each suite, track and prior group, and for all suites of a track and prior group together; there also with
-        present and absent places reweighted to 0.9, 0.7 and 0.5 present.
+    They cover each suite, track and prior group, and all suites of a track and prior group together. The latter also
+    come with present places reweighted to a share of 0.9, 0.7 and 0.5. Without `is_calibrated`, skip metrics that need
+    probabilities.
     """
     parts = [
         (
@@ -55,18 +43,17 @@ def integrity_rows(matcher: str, rejector: str, judged: pd.DataFrame, *, is_cali
             ),
             part,
         )
-        for (track, prior_group), whole in judged.groupby(["track", "prior_group"], sort=True)
+        for (track, prior_group), whole in rows.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
     metrics = [metric for metric in REJECTION if is_calibrated or not metric.needs_chances]
-    yield from side_by_side(lambda item: _rows(*item, metrics), parts)
+    yield from in_threads(lambda item: _rows(*item, metrics), parts)
 
 
 def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -> Iterator[Row]:
     some = answers_of(part)
-    # Of the queries alone, so that two rejectors are drawn alike.
-    text = f"{key.suite}/{key.track}/{key.prior_group}"
-    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    # The seed depends on the queries alone, so that all rejectors share draws.
+    seed = seed_of_text(f"{key.suite}/{key.track}/{key.prior_group}")
     sites = np.unique(part["pair_id"], return_inverse=True)[1]
     drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)
     is_pooled = key.suite == ALL_SUITES
@@ -91,7 +78,7 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
 
 
 def _area_interval(value: float, draws: Floats, trials: float, most: float) -> tuple[Interval, str]:
-    """Interval of an area that can be as large as `most`: it is a mean risk, and told as a share of that."""
+    """Return the interval of an area in [0, `most`]: it is a mean risk, so scale it to [0, 1] and back."""
     found, how = share_interval(value / most, draws / most, trials)
     return Interval(value=value, lo=found.lo * most, hi=found.hi * most), how
 
@@ -99,7 +86,7 @@ def _area_interval(value: float, draws: Floats, trials: float, most: float) -> t
 def _drawn_areas(
     answers: Answers, mixtures: Mapping[str, Floats], drawn: ClusterDraws
 ) -> Mapping[tuple[str, str], Floats]:
-    """The figures that have intervals, by mixture and name, of every draw."""
+    """Return every draw of the areas that have intervals, by mixture and name."""
     found: dict[tuple[str, str], list[Floats]] = {}
     parts = (part for some in drawn.weights() for part in np.array_split(some, 1 + some.size // _CACHED))
     for weights in parts:
@@ -111,7 +98,7 @@ def _drawn_areas(
 
 
 def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
-    """Present and absent places as drawn; pooled also in the declared mixtures, where both are there."""
+    """Yield names and weights: as drawn, and for pooled suites the declared mixtures of present and absent places."""
     yield AS_DRAWN, np.ones(len(some))
     if is_pooled and some.is_present.any() and not some.is_present.all():
         for share in PRESENT_SHARES:
@@ -120,7 +107,7 @@ def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Share:
-    """A share of the queries by mass, as the coverage of a threshold; each column has shape (N,)."""
+    """A weighted share of the queries, as the coverage of a threshold; each column has shape (N,)."""
 
     metric: ThresholdMetric
     counted: Floats
@@ -128,9 +115,9 @@ class _Share:
 
 
 def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
-    """Coverage at the thresholds chosen on calibration places, and the risk that was really reached.
+    """Yield the coverage at thresholds chosen on calibration places, and the risk reached here.
 
-    Nothing where some row has no threshold: the coverage of the others would not be that of these queries.
+    Skip thresholds that some rows lack: the coverage of the others would not be that of these queries.
     """
     is_false = (~part["is_right"].to_numpy(bool)).astype(float)
     for metric in THRESHOLDS:
@@ -142,9 +129,9 @@ def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
 
 
 def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Floats]:
-    """Each share in every draw, all by one pass over the draws; NaN where a draw holds nothing that counts.
+    """Yield each share in every draw, with one pass over the draws; NaN where a draw has no weight.
 
-    No draws for fewer than two blocks: one says nothing of others.
+    For fewer than two blocks the draws are empty.
     """
     if not shares or drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
         yield from (np.empty(0) for _ in shares)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Risk against coverage: areas, operating points, and thresholds that are chosen on calibration blocks.
+"""Risk against coverage: areas, operating points, and thresholds chosen on calibration blocks.
 
-Where a curve has to go on to full coverage, queries without an answer come last and count as false, so that silence is
-never a way to a better area.
+At full coverage, queries without an answer come last and count as false, so that withholding never improves an area.
 """
 
 import math
@@ -19,7 +18,7 @@ from sasgeo_bench.scoring.decisions import Answers
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RiskCoverage:
-    """The operating points a threshold can reach, each of shape (G,), the most confident first."""
+    """Operating points of all thresholds, each of shape (G,), the most confident first."""
 
     threshold: Floats
     coverage: Floats
@@ -27,7 +26,7 @@ class RiskCoverage:
 
 
 def _masses(answers: Answers, weights: ArrayLike | None) -> tuple[Floats, Floats]:
-    """Mass of each group of equal confidence, and its false part, shape (G + 1,); the last group has no answer."""
+    """Return the mass of each group of equal confidence and its false part, shape (G + 1,); no answers come last."""
     mass = check_weights(weights, len(answers))
     count = len(answers.steps) + 1
     return (
@@ -37,20 +36,9 @@ def _masses(answers: Answers, weights: ArrayLike | None) -> tuple[Floats, Floats
 
 
 def risk_coverage(answers: Answers, weights: ArrayLike | None = None) -> RiskCoverage:
-    """Risk (false / accepted) at each coverage (accepted / all) that a threshold can reach.
+    """Return risk (false / accepted) at each coverage (accepted / all) that a threshold can reach.
 
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    RiskCoverage
-        One point for each confidence that occurs; equal confidences are accepted together, since no threshold can part
-        them. It ends at the share of queries that were answered. Empty where nothing was answered.
+    There is one point per distinct confidence; the last coverage is the share of answered queries.
 
     Examples
     --------
@@ -70,27 +58,15 @@ def risk_coverage(answers: Answers, weights: ArrayLike | None = None) -> RiskCov
 
 
 def aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
-    """Area under the risk-coverage curve: mean risk of the 1, 2, ..., N most confident queries.
+    """Return the area under the risk-coverage curve: the mean risk of the 1, 2, ..., N most confident queries.
 
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Counts: weight 2 is a query that is there twice. They need not be whole, but should sum to about N.
+    In [0, 1]; NaN for no queries. `weights`, shape (N,), are counts: they may be fractions, but should sum to about N.
 
-    Returns
-    -------
-    float
-        In [0, 1]; NaN for no queries. 0 where all are right; 1 where none is.
-
-    Notes
-    -----
-    Geifman and El-Yaniv, NeurIPS 2017, and the SASGeo paper, Sec. V. Where confidences tie, it is the expected area
-    under a random order, so that any strictly monotone map of the confidence leaves it as it is: after j of t tied
-    queries of which f are false, j f / t false ones are expected. The sum over j of (F + j f / t) / (A + j), with F
-    false of A accepted before, is f + (F - A f / t) (psi(A + t + 1) - psi(A + 1)), with psi the digamma function; it
-    holds for weights that are not whole, too. Queries without an answer come last and are false.
+    Notes ----- Geifman and El-Yaniv, NeurIPS 2017, and the SASGeo paper, Sec. V. For tied confidences it is the
+    expected area under a random order, so strictly monotone maps of the confidence leave it unchanged. After j of t
+    tied queries with f false ones, j f / t false ones are expected. With F false of A accepted before, the sum over j
+    of (F + j f / t) / (A + j) is f + (F - A f / t) (psi(A + t + 1) - psi(A + 1)), where psi is the digamma function;
+    this also holds for fractional weights.
 
     Examples
     --------
@@ -107,7 +83,7 @@ def aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
 
 
 def _area(group: Floats, false: Floats) -> float:
-    """AURC of groups of equal confidence with positive masses, the most confident first."""
+    """Return the AURC of groups of equal confidence with positive masses, the most confident first."""
     if not len(group):
         return float("nan")
     accepted = np.concatenate(([0.0], np.cumsum(group)))
@@ -127,19 +103,7 @@ class DrawnAreas:
 
 
 def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
-    """Areas of many draws at once: the same as `aurc` and `augrc` with each row of weights, and some times faster.
-
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    weights : ndarray of float, shape (D, N)
-        Of each draw, finite and not negative, as from `ClusterDraws.weights`.
-
-    Returns
-    -------
-    DrawnAreas
-        One of each for each draw.
+    """Return `aurc` and `augrc` for each row of weights, shape (D, N); several times faster than one by one.
 
     Examples
     --------
@@ -167,25 +131,10 @@ def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
 
 
 def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
-    """E-AURC: how much larger the AURC is than that of the best order of the same answers.
+    """Return the E-AURC: the AURC less that of the best order of the same answers, in [0, 1]; NaN for no queries.
 
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Counts, as in `aurc`.
-
-    Returns
-    -------
-    float
-        In [0, 1]; 0 where every right fix is more confident than every false one, and where all are right or all
-        false. NaN for no queries.
-
-    Notes
-    -----
-    Geifman, Uziel and El-Yaniv, ICLR 2019. They subtract r + (1 - r) ln(1 - r), the limit for many queries; we
-    subtract the exact area of the best order of N, so that a perfect order has 0 whatever N is.
+    Notes ----- Geifman, Uziel and El-Yaniv, ICLR 2019. They subtract r + (1 - r) ln(1 - r), the limit for many queries.
+    This function subtracts the exact area of the best order of N, so a perfect order has 0 for every N.
 
     Examples
     --------
@@ -202,24 +151,14 @@ def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
 
 
 def augrc(answers: Answers, weights: ArrayLike | None = None) -> float:
-    """Area under the generalized risk-coverage curve: the chance of an undetected false fix, mean over coverages.
+    """Return the area under the generalized risk-coverage curve, in [0, 1/2]; NaN for no queries.
 
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In [0, 1/2]; NaN for no queries.
+    It is the chance of an undetected false fix, averaged over coverages.
 
     Notes
     -----
-    Traub et al., NeurIPS 2024: false and accepted / all, over accepted / all. With ties averaged the curve is made of
-    straight pieces, and its area is (1 - AUROC) a (1 - a) + (1 - a)^2 / 2, with a the share of right fixes.
+    Traub et al., NeurIPS 2024: false and accepted / all, over accepted / all. With ties averaged the curve is piecewise
+    linear, and its area is (1 - AUROC) a (1 - a) + (1 - a)^2 / 2, with a the share of right fixes.
 
     Examples
     --------
@@ -238,22 +177,10 @@ def augrc(answers: Answers, weights: ArrayLike | None = None) -> float:
 
 
 def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None = None) -> float:
-    """Risk among a given share of the queries, the most confident ones.
+    """Return the risk among the most confident share `coverage` in (0, 1] of the queries; NaN for no queries.
 
-    Parameters
-    ----------
-    answers : Answers
-        Of N queries.
-    coverage : float
-        In (0, 1], as 0.5 or 0.8.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In [0, 1]; NaN for no queries. Where the coverage falls among equal confidences, or within a query, false ones
-        are counted in proportion; queries without an answer come last and count as false.
+    Where the coverage falls among tied confidences or within a query, false ones count in proportion. Queries without
+    an answer come last and count as false.
 
     Raises
     ------
@@ -279,31 +206,15 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
 
 
 def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | None = None) -> float:
-    """Threshold with the largest coverage whose risk on calibration blocks is at most the wanted one.
+    """Return the threshold of largest coverage whose risk on calibration blocks is at most `risk`.
 
-    Parameters
-    ----------
-    calibration : Answers
-        Of queries from calibration blocks; never those that are scored.
-    risk : float
-        In [0, 1].
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        One of the confidences that occur; `-inf` where all answers may be accepted and some have no confidence; `inf`
-        where no coverage keeps the risk, as with no queries or nothing but false fixes.
+    The result is one of the confidences; `-inf` accepts all answers, some without a confidence; `inf` means that no
+    coverage keeps the risk. The risk is empirical, without a margin; boards report the risk reached on test blocks.
 
     Raises
     ------
     MetricError
-        If the risk is out of range.
-
-    Notes
-    -----
-    The risk is the empirical one, without a margin: what is reached on test blocks is told beside it.
+        If the risk is not in [0, 1].
 
     Examples
     --------

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure a figure is: a bootstrap over blocks and sites, never narrower than Wilson's interval of as many sites.
+"""Confidence intervals: a bootstrap over blocks and sites, never narrower than Wilson's interval of as many sites.
 
-Intervals of the bootstrap are percentile intervals: they keep to the range of the figure, they do not change when the
-figure is mapped monotonically, and the same draws serve every figure and every difference. BCa intervals would need an
-acceleration from leaving out blocks, which with a few dozen blocks of unequal size is noise itself; studentised ones
-would need a standard error within each draw. A percentile interval is somewhat narrow for few blocks; drawing sites
-within drawn blocks as well makes it somewhat wide (Davison and Hinkley 1997, Sec. 3.8), the more so the less sites
-of a block are alike: up to the factor sqrt(2) if they are not alike at all. Of few sites the draws say too little, and
-where all answers are right nothing: `share_interval` holds them against Wilson's.
+Bootstrap intervals are percentile intervals: they keep to the range of the metric, commute with monotone maps, and the
+same draws serve every metric and difference. BCa intervals need an acceleration from leaving out blocks, which is
+noise for a few dozen blocks of unequal size; studentised ones need a standard error within each draw. Percentile
+intervals are somewhat narrow for few blocks. Drawing sites within drawn blocks makes them somewhat wide (Davison and
+Hinkley 1997, Sec. 3.8), by up to sqrt(2) if sites of a block are independent. For few sites draws say too little, and
+nothing where all answers are right, so `share_interval` compares them with Wilson's.
 """
 
 import math
@@ -30,7 +29,7 @@ Statistic = Callable[[Floats], float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
-    """A figure and its interval; NaN where nothing can be said."""
+    """A value and its interval; NaN where unknown."""
 
     value: float
     lo: float
@@ -38,29 +37,18 @@ class Interval:
 
 
 def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval:
-    """Wilson's score interval of a proportion.
+    """Return Wilson's score interval of a proportion; [0, 1] without trials.
 
-    Parameters
-    ----------
-    successes, trials : float
-        0 <= successes <= trials; need not be whole, as with hits shared among tied poses or with weights.
-    level : float
-        In (0, 1).
-
-    Returns
-    -------
-    Interval
-        In [0, 1]; all of it where there is no trial.
+    `successes` and `trials` may be fractions, as for hits shared among tied poses or with weights.
 
     Raises
     ------
     MetricError
-        If a number is out of range.
+        If not 0 <= successes <= trials, or the level is not in (0, 1).
 
     Notes
     -----
-    Wilson, JASA 1927, without a correction for continuity. The trials must be independent: across blocks use the
-    bootstrap.
+    Wilson, JASA 1927, without continuity correction. The trials must be independent: across blocks use the bootstrap.
 
     Examples
     --------
@@ -77,7 +65,7 @@ def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval
     if trials == 0:
         return Interval(value=float("nan"), lo=0.0, hi=1.0)
     lo, hi = proportion_confint(successes, trials, alpha=1.0 - level, method="wilson")
-    # Rounding leaves 0 of n and n of n a little inside their exact ends.
+    # Rounding moves the ends of 0 of n and n of n slightly inwards.
     lo, hi = (0.0 if successes == 0 else float(lo)), (1.0 if successes == trials else float(hi))
     return Interval(value=successes / trials, lo=lo, hi=hi)
 
@@ -88,22 +76,11 @@ def _check_level(level: float) -> None:
         raise MetricError(message)
 
 
-def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None, *, level: float = LEVEL) -> Interval:
-    """Wilson's interval of a mean of values in [0, 1], as hits with ties or with weights.
+def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Interval:
+    """Return Wilson's interval of a mean of values in [0, 1], shape (N,), as hits with ties.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-        In [0, 1]. Values between 0 and 1 vary less than successes and failures do, so the interval is not too narrow.
-    weights : array_like, shape (N,), optional
-        Not negative; they count as (sum w)^2 / sum w^2 trials (Kish 1965), N for equal weights.
-    level : float
-        In (0, 1).
-
-    Returns
-    -------
-    Interval
-        In [0, 1].
+    Values between 0 and 1 vary less than successes and failures, so the interval is not too narrow. Weights count as
+    (sum w)^2 / sum w^2 trials (Kish 1965).
 
     Raises
     ------
@@ -123,25 +100,13 @@ def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None, *, level: f
     squared = float((mass**2).sum())
     trials = float(mass.sum()) ** 2 / squared if squared > 0 else 0.0
     share = weighted_mean(column, mass)
-    return wilson(min(share * trials, trials) if trials else 0.0, trials, level=level)
+    return wilson(min(share * trials, trials) if trials else 0.0, trials)
 
 
 def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Floats:
-    """Weighted means of every draw, of one or of several figures.
+    """Return weighted means of every draw, shape (D,) or (D, M); NaN where a draw has no weight.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,) or (N, M)
-        One finite value for each query; M methods or figures side by side share the draws.
-    drawn : ClusterDraws
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative; as of `presence_weights`, or 0 for queries that do not count.
-
-    Returns
-    -------
-    ndarray of float, shape (D,) or (D, M)
-        NaN where a draw holds no query that counts.
+    `values` has shape (N,), or (N, M) for M methods or metrics that share the draws.
 
     Raises
     ------
@@ -168,21 +133,9 @@ def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike |
 
 
 def bootstrap_statistic(statistic: Statistic, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Floats:
-    """Any figure of every draw, through the weights it gives to queries; slower than `bootstrap_means`.
+    """Return a statistic of every draw, shape (D,); slower than `bootstrap_means`.
 
-    Parameters
-    ----------
-    statistic : callable
-        Weights, shape (N,) -> float, as in `lambda weights: aurc(answers, weights)`.
-    drawn : ClusterDraws
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative; the draws are multiplied with them.
-
-    Returns
-    -------
-    ndarray of float, shape (D,)
-        One figure for each draw.
+    `statistic` maps weights, shape (N,), to a number, as `lambda weights: aurc(answers, weights)`.
 
     Examples
     --------
@@ -197,21 +150,7 @@ def bootstrap_statistic(statistic: Statistic, drawn: ClusterDraws, weights: Arra
 
 
 def percentile_interval(value: float, draws: ArrayLike, *, level: float = LEVEL) -> Interval:
-    """Interval between two percentiles of the draws.
-
-    Parameters
-    ----------
-    value : float
-        The figure itself.
-    draws : array_like, shape (D,)
-        The figure of each draw; draws without one (NaN) are left out.
-    level : float
-        In (0, 1).
-
-    Returns
-    -------
-    Interval
-        NaN at both ends where no draw has a figure.
+    """Return the interval between percentiles of the draws, shape (D,), without NaN; NaN where none is left.
 
     Examples
     --------
@@ -229,19 +168,9 @@ def percentile_interval(value: float, draws: ArrayLike, *, level: float = LEVEL)
 
 
 def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = None) -> float:
-    """How many groups of equal mass some queries are worth, as sites.
+    """Return the effective number of groups, as sites: (sum m)^2 / sum m^2 of the groups' masses m (Kish 1965).
 
-    Parameters
-    ----------
-    groups : sequence of str or ndarray of int, length N
-        Group of each query.
-    weights : array_like, shape (N,), optional
-        Not negative; a query of weight 0 does not count.
-
-    Returns
-    -------
-    float
-        (sum m)^2 / sum m^2 of the groups' masses m (Kish 1965): their number where all weigh the same; 0 for nothing.
+    Groups of equal mass count 1 each; 0 for nothing.
 
     Examples
     --------
@@ -254,35 +183,29 @@ def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = No
     return float(mass.sum()) ** 2 / squared if squared > 0 else 0.0
 
 
-def share_interval(value: float, draws: ArrayLike, trials: float, *, level: float = LEVEL) -> tuple[Interval, str]:
-    """Interval of a figure in [0, 1]: between percentiles of its draws, and never narrower than Wilson's.
+def share_interval(value: float, draws: ArrayLike, trials: float) -> tuple[Interval, str]:
+    """Return the 95 % interval of a metric in [0, 1], and how it was found.
+
+    The ends are percentiles of the draws, shape (D,), but never inside Wilson's interval. "blocks" means that draws
+    decide both ends, "wilson" that Wilson's lies farther out at one; "" comes with NaN.
 
     Parameters
     ----------
     value : float
-        The figure itself.
+        The metric; NaN gives NaN.
     draws : array_like, shape (D,)
-        The figure of each draw; none for a single block, which says nothing of others.
+        Its bootstrap draws; empty for a single block.
     trials : float
-        How many trials the queries are worth at least, as the sites by `effective_count`.
-    level : float
-        In (0, 1).
+        Effective number of independent trials, as sites by `effective_count`.
 
-    Returns
-    -------
-    Interval, str
-        And how it was found: "blocks" where the draws decide both ends, "wilson" where Wilson's lies farther out at
-        one. NaN for a figure that is none.
-
-    Notes
-    -----
-    A mean of values in [0, 1] varies at most as much as a share does, so of as many sites Wilson's is wide enough if
-    blocks add nothing. Draws alone are too narrow for a few sites, and a point where all are right. The wider end of
-    both keeps the order: a method that is right wherever another one is has both ends at least as high.
+    Notes ----- A mean of values in [0, 1] varies at most as much as a proportion, so Wilson's interval of as many sites
+    is wide enough if blocks add no correlation. Draws alone are too narrow for few sites, and a point where all answers
+    are right. The wider end keeps the order: a method that is right wherever another one is has both ends at least as
+    high.
 
     Examples
     --------
-    Four sites that were all found, and four that were all found but for one query of ten at one of them:
+    Four sites, all found; and four sites, all found but for one query of ten at one of them:
 
     >>> found, how = share_interval(1.0, np.ones(100), 4)
     >>> round(found.lo, 2), found.hi, how
@@ -292,24 +215,17 @@ def share_interval(value: float, draws: ArrayLike, trials: float, *, level: floa
     """
     if math.isnan(value):
         return Interval(value=value, lo=value, hi=value), ""
-    exact = wilson(min(max(value * trials, 0.0), trials), trials, level=level)
-    drawn = percentile_interval(value, draws, level=level)
+    exact = wilson(min(max(value * trials, 0.0), trials), trials)
+    drawn = percentile_interval(value, draws)
     ends = Interval(value=value, lo=float(np.fmin(drawn.lo, exact.lo)), hi=float(np.fmax(drawn.hi, exact.hi)))
     return ends, "blocks" if (ends.lo, ends.hi) == (drawn.lo, drawn.hi) else "wilson"
 
 
 def difference_interval(first: Interval, second: Interval) -> Interval:
-    """Interval of a difference, first less second, from those of both sides.
+    """Return the interval of first less second from those of both sides.
 
-    Parameters
-    ----------
-    first, second : Interval
-        Of figures that are independent, or vary against each other no more than parts of one whole do.
-
-    Returns
-    -------
-    Interval
-        The distances to the ends, squared and added (Newcombe 1998; Zou and Donner, Statistics in Medicine 2008).
+    The sides are independent, or vary against each other no more than parts of one whole. Distances to the ends are
+    added in quadrature (Newcombe 1998; Zou and Donner, Statistics in Medicine 2008).
 
     Examples
     --------
@@ -327,35 +243,11 @@ def difference_interval(first: Interval, second: Interval) -> Interval:
     )
 
 
-def _told(value: float, draws: Callable[[], Floats], drawn: ClusterDraws, level: float) -> Interval:
-    """Interval of a figure; none for fewer than two blocks, since one says nothing of others."""
-    _check_level(level)
-    if drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
-        return Interval(value=value, lo=float("nan"), hi=float("nan"))
-    return percentile_interval(value, draws(), level=level)
+def mean_interval(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Interval:
+    """Return a weighted mean with its bootstrap interval over blocks; NaN ends for fewer than two blocks.
 
-
-def mean_interval(
-    values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None, *, level: float = LEVEL
-) -> Interval:
-    """Weighted mean with an interval that counts blocks, not queries.
-
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-        One finite value for each query.
-    drawn : ClusterDraws
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative.
-    level : float
-        In (0, 1).
-
-    Returns
-    -------
-    Interval
-        NaN at both ends for fewer than two blocks. It shrinks to a point where all values are equal: 0 of n says
-        nothing of the spread, print `wilson_mean` beside it.
+    `values`, shape (N,), are finite; the difference of two methods per query gives a paired interval. The interval is a
+    point where all values are equal: compare `wilson_mean`.
 
     Examples
     --------
@@ -364,73 +256,5 @@ def mean_interval(
     """
     column = check_column(values, "values", drawn.count)
     value = weighted_mean(column, weights)
-    return _told(value, lambda: bootstrap_means(column, drawn, weights), drawn, level)
-
-
-def mean_difference(
-    first: ArrayLike,
-    second: ArrayLike,
-    drawn: ClusterDraws,
-    weights: ArrayLike | None = None,
-    *,
-    level: float = LEVEL,
-) -> Interval:
-    """Difference of two methods' means, first less second, on the same queries and the same draws.
-
-    Parameters
-    ----------
-    first, second : array_like, shape (N,)
-        Values of two methods for the same queries in the same order.
-    drawn : ClusterDraws
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative.
-    level : float
-        In (0, 1).
-
-    Returns
-    -------
-    Interval
-        As of `mean_interval`.
-
-    Examples
-    --------
-    >>> drawn = ClusterDraws(blocks=["a", "b", "c"], seed=1, draws=500)
-    >>> mean_difference([1.0, 1.0, 0.0], [0.0, 0.0, 0.0], drawn).value.__round__(3)
-    0.667
-    """
-    ours, theirs = (check_column(side, "values", drawn.count) for side in (first, second))
-    return mean_interval(ours - theirs, drawn, weights, level=level)
-
-
-def statistic_interval(
-    statistic: Statistic, drawn: ClusterDraws, weights: ArrayLike | None = None, *, level: float = LEVEL
-) -> Interval:
-    """Any figure with an interval that counts blocks, not queries.
-
-    Parameters
-    ----------
-    statistic : callable
-        Weights, shape (N,) -> float. The difference of two methods is a figure, too:
-        `lambda weights: aurc(ours, weights) - aurc(theirs, weights)`.
-    drawn : ClusterDraws
-        Of N queries.
-    weights : array_like, shape (N,), optional
-        Not negative.
-    level : float
-        In (0, 1).
-
-    Returns
-    -------
-    Interval
-        NaN at both ends for fewer than two blocks.
-
-    Examples
-    --------
-    >>> values = np.array([1.0, 2.0, 4.0])
-    >>> drawn = ClusterDraws(blocks=["a", "b", "c"], seed=1, draws=200)
-    >>> statistic_interval(lambda weights: weighted_mean(values, weights), drawn) == mean_interval(values, drawn)
-    True
-    """
-    value = statistic(check_weights(weights, drawn.count))
-    return _told(value, lambda: bootstrap_statistic(statistic, drawn, weights), drawn, level)
+    draws = bootstrap_means(column, drawn, weights) if drawn.blocks_count > 1 else np.empty(0)
+    return percentile_interval(value, draws)

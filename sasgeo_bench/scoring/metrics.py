@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one table of metrics: boards, Markdown, LaTeX, the site and the reference of the documentation are made from it.
+"""The table of metrics, from which boards, Markdown, LaTeX, the site and the documentation are made.
 
 To add a metric, write its function and add one row to `METRICS`.
 """
@@ -7,7 +7,7 @@ To add a metric, write its function and add one row to `METRICS`.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -39,18 +39,13 @@ class Metric:
     meaning : str
         One or two sentences for a reader of the board.
     source : str
-        Where the definition comes from.
+        Reference of the definition.
     unit : str
-        "1" where there is none.
+        "1" for none.
     better : {"higher", "lower"}
-        Which way is good.
+        Direction of improvement.
     bounds : (float, float)
-        Least and greatest value it can have.
-
-    Examples
-    --------
-    >>> metric_of("aurc").worst, metric_of("success_25m").worst
-    (1.0, 0.0)
+        Least and greatest possible value.
     """
 
     name: str
@@ -77,9 +72,9 @@ class MeanMetric(Metric):
     values : callable
         Scored rows -> one finite value for each.
     counts : callable
-        Scored rows -> which of them are counted: the denominator, the same for every matcher.
+        Scored rows -> mask of the denominator, the same for every matcher.
     is_primary : bool
-        Whether matchers are ranked by it.
+        Matchers are ranked by it.
     """
 
     tracks: tuple[str, ...]
@@ -90,7 +85,7 @@ class MeanMetric(Metric):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QuantileMetric(Metric):
-    """A quantile of the pose errors in a column of scored rows, infinite errors among them."""
+    """A quantile of the pose errors in a column of scored rows, including infinite errors."""
 
     column: str
     share: float
@@ -98,7 +93,7 @@ class QuantileMetric(Metric):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RejectionMetric(Metric):
-    """A figure of matcher x rejector; `needs_chances` where it takes a confidence for a probability.
+    """A metric of matcher x rejector; `needs_chances` if the confidence must be a probability.
 
     `compute(answers, weights=...)` takes `decisions.Answers` of N queries and weights of shape (N,).
     """
@@ -118,32 +113,32 @@ class ThresholdMetric(Metric):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CostMetric(Metric):
-    """What the answers of one matcher take; by track, or of all tracks together."""
+    """Cost of the answers of one matcher, by track or of all tracks together."""
 
     compute: Callable[[cost.Costs], float]
     is_by_track: bool = False
 
 
 def errors_of(scores: pd.DataFrame) -> PoseErrors:
-    """Return errors of scored rows; infinite where there is nothing to be right about, which is never counted."""
+    """Return the errors of scored rows; infinite where there is no right pose, which is never counted."""
     columns = (scores[name].to_numpy(float) for name in ("position_error_m", "yaw_error_deg", "log_scale_error"))
     position_m, yaw_deg, log_scale = (np.where(np.isnan(column), np.inf, column) for column in columns)
     return PoseErrors(position_m=position_m, yaw_deg=yaw_deg, log_scale=log_scale)
 
 
 def ranks_of(scores: pd.DataFrame) -> Ranks:
-    """Return ranks of scored rows."""
+    """Return the ranks of scored rows."""
     above, tied, right = (scores[name].to_numpy(np.int64) for name in ("above", "tied", "right"))
     return Ranks(above=above, tied=tied, right=right)
 
 
 def is_present(scores: pd.DataFrame) -> Bools:
-    """Return which rows have a place to be right about."""
+    """Return a mask of the rows whose place is present."""
     return scores["is_present"].to_numpy(bool)
 
 
 def is_absent(scores: pd.DataFrame) -> Bools:
-    """Return which rows have none: any answer is a false fix."""
+    """Return a mask of the rows whose place is absent: any answer is a false fix."""
     return ~is_present(scores)
 
 
@@ -175,14 +170,14 @@ FALSE_ABSENT: Final = MeanMetric(
     values=_answers,
     counts=is_absent,
 )
-WITHIN: Final = _mean(  # next to the primary metric: what a wrong heading takes away
+WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metric
     name="within_25m",
     meaning="The same as success_25m whatever the heading: what counts as a fix that is not false",
     source="share of queries within metres",
     tracks=TRACKS[:1],
     values=partial(_successes, within_m=SUCCESS_M[0], within_deg=180.0),
 )
-CHANCE: Final = _mean(  # the same for every matcher, so that a board says what guessing reaches
+CHANCE: Final = _mean(  # the same for every matcher
     name="chance_1",
     meaning="What guessing among the candidates reaches",
     source="1 / number of candidates",
@@ -412,21 +407,15 @@ COSTS: Final = (
 )
 METRICS: Final[tuple[Metric, ...]] = (*_MEANS, *QUANTILES, *REJECTION, *THRESHOLDS, *COSTS)
 _BY_NAME: Final = {metric.name: metric for metric in METRICS}
-M = TypeVar("M", bound=Metric)
 
 
 def metric_of(name: str) -> Metric:
     """Return the metric of a name.
 
-    Raises
-    ------
-    KeyError
-        If there is none.
-
     Examples
     --------
-    >>> metric_of("mrr").better
-    'higher'
+    >>> metric_of("aurc").worst, metric_of("success_25m").worst
+    (1.0, 0.0)
     """
     return _BY_NAME[name]
 
@@ -443,11 +432,5 @@ def means_of(track: str) -> tuple[MeanMetric, ...]:
 
 
 def primary_of(track: str) -> MeanMetric:
-    """Return the metric that matchers are ranked by.
-
-    Examples
-    --------
-    >>> primary_of("retrieval").name
-    'recall_1'
-    """
+    """Return the metric that ranks matchers on a track."""
     return next(metric for metric in means_of(track) if metric.is_primary)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the first pose is from the truth: errors, success within metres and degrees, every query counted."""
+"""Errors of the first pose against the truth, and success within metres and degrees; every query counts."""
 
 import math
 from collections.abc import Sequence
@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.base import Bools, Floats, check_column, weighted_quantile
+from sasgeo_bench.scoring.base import Bools, Floats, check_column
 from sasgeo_bench.scoring.ranking import MISS, Rank, rank_of
 from sasgeo_bench.tasks.query import Truth
 
@@ -23,12 +22,12 @@ AUC_M: Final = 50.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseErrors:
-    """Errors of N answers, each of shape (N,) and not negative; infinite where there is no answer.
+    """Errors of N answers, each of shape (N,) and not negative; infinite without an answer.
 
     Parameters
     ----------
     position_m : ndarray of float
-        Distance on the map's plane.
+        Distance on the map plane.
     yaw_deg : ndarray of float
         Unsigned, in [0, 180].
     log_scale : ndarray of float
@@ -40,7 +39,7 @@ class PoseErrors:
     log_scale: Floats
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not belong together."""
+        """Check shapes and signs."""
         count = np.size(self.position_m)
         for name in ("position_m", "yaw_deg", "log_scale"):
             column = check_column(getattr(self, name), name, count)
@@ -51,14 +50,9 @@ class PoseErrors:
 
 
 def first_pose(prediction: Prediction | None) -> Pose | None:
-    """The fix of an answer: its first pose; None for no row, no answer, a crash or a time-out.
+    """Return the fix of an answer, its first pose; None for no row, no answer, a crash or a time-out.
 
-    Of poses with equal scores the one that is listed first counts: it is what would be flown by.
-
-    Examples
-    --------
-    >>> first_pose(Prediction(query_id="a", status="timeout")) is None
-    True
+    Of poses with equal scores the first listed counts, since a vehicle would use it.
     """
     if prediction is None or prediction.status != "ok" or not prediction.candidates:
         return None
@@ -66,19 +60,7 @@ def first_pose(prediction: Prediction | None) -> Pose | None:
 
 
 def pose_errors(answers: Sequence[Pose | None], truths: Sequence[Pose]) -> PoseErrors:
-    """Errors of some fixes.
-
-    Parameters
-    ----------
-    answers : sequence of Pose or None, length N
-        None where there is no answer: its errors are infinite.
-    truths : sequence of Pose, length N
-        Where each view was taken.
-
-    Returns
-    -------
-    PoseErrors
-        Of every query, none left out and none clipped.
+    """Return the errors of N fixes against N truths; infinite for None, never clipped.
 
     Raises
     ------
@@ -113,31 +95,15 @@ def _numbers(pose: Pose) -> tuple[float, float, float, float]:
 
 
 def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_DEG) -> Bools:
-    """Which fixes are right: `position_m <= within_m` and `yaw_deg <= within_deg`.
+    """Return which fixes are right, shape (N,): `position_m <= within_m` and `yaw_deg <= within_deg`.
 
-    Parameters
-    ----------
-    errors : PoseErrors
-        Of N queries.
-    within_m : float
-        Finite, metres.
-    within_deg : float
-        Degrees; 180 where the heading does not count.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        False without an answer.
+    Use 180 degrees to ignore the heading. An error equal to a tolerance is within it, as in all of this package. Metres
+    are those of the region's UTM zone, which differ from metres on the ground by at most 0.1 %.
 
     Raises
     ------
     MetricError
         If a tolerance is negative or `within_m` is not finite.
-
-    Notes
-    -----
-    An error that equals the tolerance is within it, here and everywhere in this room. Metres are those of the region's
-    UTM zone, which differ from metres on the ground by at most 0.1 %.
 
     Examples
     --------
@@ -152,21 +118,7 @@ def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_D
 
 
 def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, within_deg: float = SUCCESS_DEG) -> Rank:
-    """Rank of the best pose within tolerance in an answer to a localization query.
-
-    Parameters
-    ----------
-    prediction : Prediction, optional
-        None where the query has no row at all.
-    truth : Truth
-        Of a place that is present.
-    within_m, within_deg : float
-        Tolerance, as in `successes`.
-
-    Returns
-    -------
-    Rank
-        `MISS` for no answer or none within tolerance.
+    """Return the rank of the best pose within tolerance in an answer to a localization query; `MISS` without one.
 
     Raises
     ------
@@ -186,47 +138,8 @@ def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, w
     return rank_of([score for _, score in prediction.candidates], successes(errors, within_m, within_deg))
 
 
-def error_quantile(errors: ArrayLike, share: float, weights: ArrayLike | None = None) -> float:
-    """Least error that at least a share of all queries does not exceed; infinite where too few were answered.
-
-    Parameters
-    ----------
-    errors : array_like, shape (N,)
-        One column of `PoseErrors`.
-    share : float
-        In (0, 1]: 0.5, 0.9, 0.99.
-    weights : array_like, shape (N,), optional
-        Not negative.
-
-    Returns
-    -------
-    float
-        In the unit of the errors; NaN for no queries.
-
-    Examples
-    --------
-    >>> error_quantile([1.0, 2.0, 3.0, np.inf], 0.5), error_quantile([1.0, 2.0, 3.0, np.inf], 0.9)
-    (2.0, inf)
-    """
-    return weighted_quantile(errors, share, weights)
-
-
 def area_values(errors: PoseErrors, up_to_m: float = AUC_M, within_deg: float = SUCCESS_DEG) -> Floats:
-    """What each query adds to the success AUC: max(0, 1 - error / up_to), 0 where the heading is out of tolerance.
-
-    Parameters
-    ----------
-    errors : PoseErrors
-        Of N queries.
-    up_to_m : float
-        Positive, metres.
-    within_deg : float
-        Degrees; 180 where the heading does not count.
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        In [0, 1].
+    """Return each query's part of the success AUC, shape (N,): max(0, 1 - error / up_to), 0 for a wrong heading.
 
     Raises
     ------

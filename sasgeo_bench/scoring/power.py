@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a suite can tell: how alike queries of a block are, and the least difference that would be found."""
+"""Statistical power of a suite: correlation within blocks, and the least difference it can detect."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Final
 
@@ -16,24 +15,14 @@ from sasgeo_bench.scoring.base import Ints, block_codes, check_column
 
 ALPHA: Final = 0.05
 POWER: Final = 0.8
-_NOTHING: Final = 1e-12  # a spread this small is one of rounding
+_NOTHING: Final = 1e-12  # a smaller spread is a rounding error
 
 
 def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> float:
-    """How much more alike queries of one block are than queries of different blocks.
+    """Return how much more alike values of one block are than values of different blocks, at most 1.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-        Finite; for two methods, the difference of their hits on each query.
-    blocks : sequence of str or ndarray of int, length N
-        Block of each query.
-
-    Returns
-    -------
-    float
-        At most 1; below 0 where queries of a block are less alike than chance. NaN for fewer than two blocks, with no
-        block of two queries, or where nothing varies.
+    Negative where values of a block are less alike than chance. NaN for fewer than two blocks, without a block of two
+    queries, or where nothing varies. For two methods, pass the difference of their hits per query.
 
     Raises
     ------
@@ -68,19 +57,9 @@ def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> f
 
 
 def design_effect(sizes: ArrayLike, correlation: float) -> float:
-    """How many times more queries blocks need than independent ones would.
+    """Return how many times more queries blocks need than independent ones, at least 1.
 
-    Parameters
-    ----------
-    sizes : array_like, shape (K,)
-        Queries in each block.
-    correlation : float
-        Within blocks, as from `intraclass_correlation`; below 0 it counts as 0.
-
-    Returns
-    -------
-    float
-        At least 1.
+    `sizes`, shape (K,), are the queries of each block; a negative correlation counts as 0.
 
     Raises
     ------
@@ -89,8 +68,8 @@ def design_effect(sizes: ArrayLike, correlation: float) -> float:
 
     Notes
     -----
-    Kish 1965: 1 + (m - 1) rho, with m = sum n_k^2 / sum n_k the size of the block of a query picked at random, which
-    for equal blocks is their size.
+    Kish 1965: 1 + (m - 1) rho, with m = sum n_k^2 / sum n_k the size of the block of a random query, which for equal
+    blocks is their size.
 
     Examples
     --------
@@ -105,51 +84,6 @@ def design_effect(sizes: ArrayLike, correlation: float) -> float:
     return 1.0 + (size - 1.0) * max(correlation, 0.0)
 
 
-def pairs_needed(difference: float, discordant_share: float, *, alpha: float = ALPHA, power: float = POWER) -> int:
-    """Independent pairs that McNemar's test needs to find a difference.
-
-    Parameters
-    ----------
-    difference : float
-        Between two shares, in (0, discordant_share].
-    discordant_share : float
-        Share of queries that just one of the two methods gets right, in (0, 1].
-    alpha : float
-        Two-sided level.
-    power : float
-        Chance to find it, in [0.5, 1).
-
-    Returns
-    -------
-    int
-        How many queries.
-
-    Raises
-    ------
-    MetricError
-        If a number is out of range.
-
-    Notes
-    -----
-    Connor, Biometrics 1987: n = (z_a sqrt(p) + z_b sqrt(p - d^2))^2 / d^2.
-
-    Examples
-    --------
-    Three points with 6 % discordant pairs; as 36 blocks of 50 with a correlation of 0.05 they are just enough:
-
-    >>> pairs_needed(0.03, 0.06)
-    521
-    >>> round(pairs_needed(0.03, 0.06) * design_effect([50] * 36, 0.05)) <= 36 * 50
-    True
-    """
-    low, high = _deviates(alpha, power)
-    if not 0 < difference <= discordant_share <= 1:
-        message = f"expected 0 < difference <= discordant_share <= 1, got {difference!r} and {discordant_share!r}"
-        raise MetricError(message)
-    root = low * math.sqrt(discordant_share) + high * math.sqrt(discordant_share - difference**2)
-    return math.ceil((root / difference) ** 2)
-
-
 @cache
 def _deviates(alpha: float, power: float) -> tuple[float, float]:
     if not (0 < alpha < 1 and 0.5 <= power < 1):  # noqa: PLR2004 - below, the quadratic's other root would hold
@@ -161,21 +95,20 @@ def _deviates(alpha: float, power: float) -> tuple[float, float]:
 def detectable_difference(
     pairs: float, discordant_share: float, *, alpha: float = ALPHA, power: float = POWER
 ) -> float:
-    """Least difference of two shares that McNemar's test finds with some independent pairs.
+    """Return the least difference of two shares that McNemar's test finds with some independent pairs.
+
+    Infinite if even a difference of `discordant_share` would be missed.
 
     Parameters
     ----------
     pairs : float
-        Independent ones: queries divided by the design effect.
+        Independent pairs: queries divided by the design effect.
     discordant_share : float
-        In [0, 1].
-    alpha, power : float
-        As in `pairs_needed`.
-
-    Returns
-    -------
-    float
-        In (0, discordant_share]; infinite where even a difference as large as that would be missed.
+        Share of queries that just one of the two methods gets right, in [0, 1].
+    alpha : float
+        Two-sided level.
+    power : float
+        Chance to find the difference, in [0.5, 1).
 
     Raises
     ------
@@ -184,7 +117,7 @@ def detectable_difference(
 
     Notes
     -----
-    Connor's equation solved for the difference d, a quadratic one:
+    Connor, Biometrics 1987: n = (z_a sqrt(p) + z_b sqrt(p - d^2))^2 / d^2, solved for the difference d:
     d = sqrt(p) (z_a sqrt(n) + z_b sqrt(n + z_b^2 - z_a^2)) / (n + z_b^2).
 
     Examples
@@ -204,50 +137,11 @@ def detectable_difference(
     return math.sqrt(discordant_share) * root / (pairs + high**2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sensitivity:
-    """What a suite can tell of two methods.
+def sensitivity(first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints) -> float:
+    """Return the minimum detectable difference of two methods on a suite; infinite if even the largest would be missed.
 
-    Parameters
-    ----------
-    queries, blocks : int
-        How many there are.
-    discordant_share : float
-        Share of queries on which just one method is right.
-    correlation : float
-        Of the methods' differences within blocks.
-    design_effect : float
-        By how much blocks lessen the queries.
-    detectable : float
-        Least difference of shares that would be found; infinite where none would.
-    """
-
-    queries: int
-    blocks: int
-    discordant_share: float
-    correlation: float
-    design_effect: float
-    detectable: float
-
-
-def sensitivity(
-    first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints, *, alpha: float = ALPHA, power: float = POWER
-) -> Sensitivity:
-    """Minimum detectable difference of two methods on a suite.
-
-    Parameters
-    ----------
-    first, second : array_like, shape (N,)
-        Hits of two methods for the same queries, in [0, 1]; shared hits of tied poses count in proportion.
-    blocks : sequence of str or ndarray of int, length N
-        Block of each query.
-    alpha, power : float
-        As in `pairs_needed`.
-
-    Returns
-    -------
-    Sensitivity
-        Where the correlation cannot be estimated it counts as 0, and its field says NaN.
+    `first` and `second` are hits in [0, 1], shape (N,), for the same queries. A correlation that cannot be estimated
+    counts as 0.
 
     Raises
     ------
@@ -257,24 +151,15 @@ def sensitivity(
     Examples
     --------
     >>> blocks = [str(at // 50) for at in range(1800)]
-    >>> found = sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks)
-    >>> round(found.discordant_share, 4), round(found.detectable, 4)
-    (0.0633, 0.0166)
+    >>> round(sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks), 4)
+    0.0166
     """
     ours = check_column(first, "first")
-    apart = ours - check_column(second, "second", len(ours))
+    gaps = ours - check_column(second, "second", len(ours))
     sizes, _ = block_codes(blocks, len(ours))
     if not len(sizes):
         message = "no queries, so no difference can be detected: draw some first"
         raise MetricError(message)
-    correlation = intraclass_correlation(apart, blocks)
+    correlation = intraclass_correlation(gaps, blocks)
     effect = design_effect(sizes, 0.0 if math.isnan(correlation) else correlation)
-    share = float(np.abs(apart).mean())
-    return Sensitivity(
-        queries=len(ours),
-        blocks=len(sizes),
-        discordant_share=share,
-        correlation=correlation,
-        design_effect=effect,
-        detectable=detectable_difference(len(ours) / effect, share, alpha=alpha, power=power),
-    )
+    return detectable_difference(len(ours) / effect, float(np.abs(gaps).mean()))

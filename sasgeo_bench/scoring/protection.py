@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that say whether protection levels hold: a Stanford diagram counted for each method, risk and alert limit."""
+"""Rows of protection levels: Stanford diagrams counted for each method, risk and alert limit."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -33,55 +33,26 @@ COLUMNS: Final = (
 def protection_frame(
     matcher: str, scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
 ) -> pd.DataFrame:
-    """How the protection levels of one matcher fared, all suites of localization together.
+    """Return how the protection levels of one matcher held, pooled over all suites of localization.
 
-    Parameters
-    ----------
-    matcher : str
-        Its name.
-    scores : pandas.DataFrame
-        Its scored rows.
-    predictions : mapping of str to Prediction
-        The same answers by query id, with levels among their diagnostics (`sasgeo.protection.PROTECTION`).
-    split : Split, optional
-        Says which places calibrate conformal levels; without, there are none. Of a hold-out split the test part counts.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for each prior group, method, risk and alert limit, columns those of `COLUMNS`; none where no answer tells
-        a level. Shares are of all queries, an answer without a level is unavailable, one where the place is absent has
-        an infinite error. Intervals are Wilson's of as many trials as there are sites. `supports` says in words what
-        misleading ones among the available support.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.scoring.score import score_task
-    >>> len(protection_frame("mine", score_task([], [], {}), {}))
-    0
+    There is a row for each prior group, method, risk and alert limit; none if no answer has a level in its diagnostics
+    (`sasgeo.protection.PROTECTION`). Shares are of all queries: an answer without a level is unavailable, one at an
+    absent place has an infinite error. Intervals are Wilson's over sites. `supports` states which risk the counts
+    support. `split` assigns the places that calibrate conformal levels; of a hold-out split the test part counts.
     """
     rows = [
         {"matcher": matcher, "prior_group": item.prior_group, **row}
-        for item in told_levels(scores, predictions, split)
+        for item in protection_levels(scores, predictions, split)
         for row in _counted(item)
     ]
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ToldLevels:
-    """Protection levels of one method at one risk, beside the errors; arrays have shape (N,).
+class ProtectionLevels:
+    """Protection levels of one method at one risk, with the errors; arrays have shape (N,).
 
-    Parameters
-    ----------
-    prior_group, method : str
-        Of which queries, and how the levels are found.
-    risk : float
-        The levels are stated for.
-    level_m, error_m : ndarray of float
-        Metres; infinite where there is none, see `protection_frame`.
-    sites : ndarray of str
-        `pair_id` of each query.
+    Levels and errors in metres are infinite if missing; `sites` is the `pair_id` of each query.
     """
 
     prior_group: str
@@ -92,21 +63,12 @@ class ToldLevels:
     sites: Strings
 
 
-def told_levels(
+def protection_levels(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
-) -> Iterator[ToldLevels]:
-    """Protection levels of one matcher, query by query; parameters as of `protection_frame`.
+) -> Iterator[ProtectionLevels]:
+    """Yield the protection levels of one matcher per query, for each prior group, risk and method with a level.
 
-    Yields
-    ------
-    ToldLevels
-        For each prior group, risk and method of which some answer tells a level.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.scoring.score import score_task
-    >>> list(told_levels(score_task([], [], {}), {}))
-    []
+    Parameters are those of `protection_frame`.
     """
     usable = scores[(scores["status"] != NOT_APPLICABLE) & (scores["track"] == "localization")]
     for prior_group, group in usable.groupby("prior_group", sort=True):
@@ -115,15 +77,15 @@ def told_levels(
 
 def _levels_of_group(
     prior_group: str, group: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None
-) -> Iterator[ToldLevels]:
+) -> Iterator[ProtectionLevels]:
     is_holdout = split is not None and split.spec.kind == "holdout"
     is_tested = (group["part"] == "test").to_numpy(bool) if is_holdout else np.ones(len(group), dtype=bool)
     error_m = _errors_m(group)
     sites = group["pair_id"].to_numpy(str)
 
-    def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ToldLevels:
-        """The queries that count."""
-        return ToldLevels(
+    def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ProtectionLevels:
+        """Select the queries that count."""
+        return ProtectionLevels(
             prior_group=prior_group,
             method=method,
             risk=risk,
@@ -133,33 +95,33 @@ def _levels_of_group(
         )
 
     for risk in RISKS:
-        told = {method: _told(group, predictions, level_name(method, risk)) for method in METHODS}
-        for method, level_m in told.items():
+        levels = {method: _diagnostic(group, predictions, level_name(method, risk)) for method in METHODS}
+        for method, level_m in levels.items():
             if np.isfinite(level_m).any():
                 yield of(method, risk, level_m, is_tested)
-        scale_m = _told(group, predictions, SCALE)
+        scale_m = _diagnostic(group, predictions, SCALE)
         if split is not None and np.isfinite(scale_m).any():
             yield of(CONFORMAL, risk, *_conformal(group, split, scale_m, error_m, risk))
 
 
 def _errors_m(group: pd.DataFrame) -> Floats:
-    """Error of each query; infinite without an answer, and for an answer where nothing is right."""
+    """Return the error of each query; infinite without an answer, and for an answer at an absent place."""
     error_m = group["position_error_m"].to_numpy(float)
     return np.where(np.isnan(error_m), np.inf, error_m)
 
 
-def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
-    """A level or scale that each answer tells; infinite where there is none, or what is told cannot be one."""
+def _diagnostic(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
+    """Return the level or scale in each answer's diagnostics; infinite if missing or not positive."""
     answered = zip(group["query_id"], group["is_answered"], strict=True)
-    told = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
-    values = np.array(told, dtype=np.float64)
+    levels = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
+    values = np.array(levels, dtype=np.float64)
     return np.asarray(np.where(values > 0, values, np.inf))
 
 
 def _conformal(
     group: pd.DataFrame, split: Split, scale_m: Floats, error_m: Floats, risk: float
 ) -> tuple[Floats, Bools]:
-    """Levels by a factor that is fitted on other places, and which queries have one that could be fitted."""
+    """Return levels by a factor fitted on other places, and a mask of the queries with a fit."""
     level_m, is_fitted = np.full(len(group), np.inf), np.zeros(len(group), dtype=bool)
     for turn in turns(group, split):
         known = turn.calibration & np.isfinite(scale_m)
@@ -169,16 +131,16 @@ def _conformal(
     return level_m, is_fitted
 
 
-def _counted(told: ToldLevels) -> Iterator[dict[str, Any]]:
-    """A row for each alert limit; none where nothing was tested."""
-    if not len(told.level_m):
+def _counted(levels: ProtectionLevels) -> Iterator[dict[str, Any]]:
+    """Yield a row for each alert limit; none without queries."""
+    if not len(levels.level_m):
         return
-    sites = effective_count(np.unique(told.sites, return_inverse=True)[1])
+    sites = effective_count(np.unique(levels.sites, return_inverse=True)[1])
     for limit_m in ALERT_LIMITS_M:
-        counts = stanford_counts(told.level_m, told.error_m, limit_m, trials=sites)
-        row = {"method": told.method, "risk": told.risk, "alert_limit_m": limit_m}
-        row |= {"n": len(told.level_m), "sites": sites}
-        yield row | _shares(counts) | {"supports": _supports(counts, told.risk)}
+        counts = stanford_counts(levels.level_m, levels.error_m, limit_m, trials=sites)
+        row = {"method": levels.method, "risk": levels.risk, "alert_limit_m": limit_m}
+        row |= {"n": len(levels.level_m), "sites": sites}
+        yield row | _shares(counts) | {"supports": _supports(counts, levels.risk)}
 
 
 def _shares(counts: StanfordCounts) -> dict[str, float]:
@@ -190,6 +152,6 @@ def _shares(counts: StanfordCounts) -> dict[str, float]:
 
 
 def _supports(counts: StanfordCounts, risk: float) -> str:
-    """What the misleading ones among the available support, both counted in sites."""
+    """Return what the misleading ones among the available support, both counted in sites."""
     available = counts.available.value * counts.trials
     return statement(min(counts.misleading.value * counts.trials, available), available, risk=risk)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether protection levels hold, with no more claimed than counts carry; and levels fitted on calibration answers."""
+"""Counts of protection levels that hold, the risk they support, and conformal levels."""
 
 import math
 from dataclasses import dataclass
@@ -7,35 +7,34 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from statsmodels.stats.proportion import proportion_confint
 
 from sasgeo_bench.errors import MetricError
+from sasgeo_bench.sasgeo.conformal import upper_rate
 from sasgeo_bench.scoring.base import Floats, check_column, weighted_mean
 from sasgeo_bench.scoring.calibration import stanford
 from sasgeo_bench.scoring.intervals import LEVEL, Interval, wilson
 
-# More digits than a count can say read as if it said them.
-_DIGITS: Final = 2
+_DIGITS: Final = 2  # more would claim a precision that counts do not have
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StanfordCounts:
-    """How protection levels fared, each a share of all queries with Wilson's interval.
+    """Shares of all queries in the areas of a Stanford diagram, with Wilson's intervals.
 
     Parameters
     ----------
     trials : float
-        What the intervals count: queries, or sites where several queries are of one.
+        Trials of the intervals: queries, or sites where several queries are of one.
     available : Interval
-        The level is within the alert limit: the answer would be flown with.
+        The level is within the alert limit.
     unavailable : Interval
         It is not, or there is no level or no answer.
     misleading : Interval
         Available, and the error exceeds the level.
     hazardous : Interval
-        Of these, the error exceeds the alert limit too: level <= limit < error.
+        Misleading, and the error exceeds the alert limit too: level <= limit < error.
     exceeded : Interval
-        The error exceeds the level, available or not: what is to be no more than the risk the level is stated for.
+        The error exceeds the level, available or not: this share should not exceed the stated risk.
     """
 
     trials: float
@@ -54,30 +53,9 @@ def stanford_counts(
     trials: float | None = None,
     level: float = LEVEL,
 ) -> StanfordCounts:
-    """Count a Stanford diagram.
+    """Count a Stanford diagram; see `calibration.stanford` for parameters and errors.
 
-    Parameters
-    ----------
-    protection_level_m : array_like, shape (N,)
-        Infinite where there is no level or no answer.
-    position_error_m : array_like, shape (N,)
-        Infinite for an answer where the place is absent, and where there is none.
-    alert_limit_m : float
-        Largest error that may be flown with, metres.
-    trials : float, optional
-        Independent trials that the queries are worth; N unless given.
-    level : float
-        Of the intervals, in (0, 1).
-
-    Returns
-    -------
-    StanfordCounts
-        NaN in [0, 1] for no queries.
-
-    Raises
-    ------
-    MetricError
-        As in `calibration.stanford`.
+    `trials` is the effective number of independent trials, N by default; NaN in [0, 1] for no queries.
 
     Examples
     --------
@@ -88,16 +66,15 @@ def stanford_counts(
     [5, 2, 1, 2]
     """
     areas = stanford(protection_level_m, position_error_m, alert_limit_m)
-    worth = float(len(areas.nominal)) if trials is None else trials
+    count = float(len(areas.nominal)) if trials is None else trials
 
     def share(which: ArrayLike) -> Interval:
-        """Share of the queries with its interval."""
         value = weighted_mean(which)
-        return wilson(0.0, 0.0) if math.isnan(value) else wilson(min(value * worth, worth), worth, level=level)
+        return wilson(0.0, 0.0) if math.isnan(value) else wilson(min(value * count, count), count, level=level)
 
     misleading = areas.misleading | areas.hazardous
     return StanfordCounts(
-        trials=worth,
+        trials=count,
         available=share(areas.nominal | misleading),
         unavailable=share(areas.unavailable | areas.unavailable_misleading),
         misleading=share(misleading),
@@ -106,86 +83,18 @@ def stanford_counts(
     )
 
 
-def supported_risk(failures: float, trials: float, *, confidence: float = LEVEL) -> float:
-    """Least risk that counts support: Clopper-Pearson's upper end, one-sided.
-
-    Parameters
-    ----------
-    failures, trials : float
-        0 <= failures <= trials.
-    confidence : float
-        In (0, 1).
-
-    Returns
-    -------
-    float
-        In [0, 1]; 1 without a trial.
-
-    Raises
-    ------
-    MetricError
-        If a number is out of range.
-
-    Examples
-    --------
-    >>> supported_risk(0, 299) < 0.01 < supported_risk(0, 298), supported_risk(0, 0)
-    (True, 1.0)
-    """
-    if not (0 <= failures <= trials < math.inf and 0 < confidence < 1):
-        message = f"0 <= failures <= trials and 0 < confidence < 1, got {failures!r}, {trials!r} and {confidence!r}"
-        raise MetricError(message)
-    if failures == trials:
-        return 1.0
-    return float(proportion_confint(failures, trials, alpha=2.0 * (1.0 - confidence), method="beta")[1])
-
-
-def least_trials(risk: float, *, confidence: float = LEVEL) -> int:
-    """How many trials without a failure it takes to support that failures are rarer than a risk.
-
-    Parameters
-    ----------
-    risk : float
-        In (0, 1).
-    confidence : float
-        In (0, 1).
-
-    Returns
-    -------
-    int
-        Trials.
-
-    Raises
-    ------
-    MetricError
-        If a number is out of range.
-
-    Examples
-    --------
-    >>> least_trials(0.01), least_trials(0.001)
-    (299, 2995)
-    """
-    if not (0 < risk < 1 and 0 < confidence < 1):
-        message = f"risk and confidence must lie in (0, 1), got {risk!r} and {confidence!r}"
-        raise MetricError(message)
-    return math.ceil(math.log(1.0 - confidence) / math.log1p(-risk))
-
-
 def statement(failures: float, trials: float, *, risk: float, confidence: float = LEVEL) -> str:
-    """What counts say of a risk, in a line that claims no more than they carry.
+    """Return which risk some counts support, in a line that claims no more than they support.
 
-    Parameters
-    ----------
-    failures, trials : float
-        0 <= failures <= trials; parts of trials are as good as none.
-    risk : float
-        What is to be shown, in (0, 1).
-    confidence : float
-        In (0, 1).
+    The bound is Clopper-Pearson's upper end, one-sided. Without failures, the line also gives the trials that the risk
+    takes.
 
-    Returns
-    -------
-    str
-        Whether it is supported, what is, and how many trials it would have taken where none failed.
+    Raises
+    ------
+    MetricError
+        If the risk or the confidence is not in (0, 1).
+    ConfigError
+        If not 0 <= failures <= trials.
 
     Examples
     --------
@@ -196,37 +105,30 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     >>> statement(4, 100, risk=0.01)
     '4 of 100 support below 9 % and not below 1 % (95 % confidence)'
     """
-    at_most = supported_risk(failures, trials, confidence=confidence)
-    said = f"{failures:.4g} of {trials:.4g} support below "
+    if not (0 < risk < 1 and 0 < confidence < 1):
+        message = f"risk and confidence must lie in (0, 1), got {risk!r} and {confidence!r}"
+        raise MetricError(message)
+    at_most = upper_rate(failures, trials, confidence=confidence)
+    claim = f"{failures:.4g} of {trials:.4g} support below "
     sure = f" ({100 * confidence:g} % confidence)"
     if at_most < risk:
-        return f"{said}{100 * risk:g} %{sure}"
-    if failures == trials:  # none of none, too
+        return f"{claim}{100 * risk:g} %{sure}"
+    if failures == trials:  # also 0 of 0
         return f"{failures:.4g} of {trials:.4g} support no bound{sure}"
     # Rounded up: below 2.951 % is not below 2.95 %.
     scale = 10.0 ** (_DIGITS - 1 - math.floor(math.log10(100 * at_most)))
     shown = math.ceil(100 * at_most * scale) / scale
-    takes = f", which takes {least_trials(risk, confidence=confidence)} without one" if failures == 0 else ""
-    return f"{said}{shown:g} % and not below {100 * risk:g} %{takes}{sure}"
+    least_trials = math.ceil(math.log(1.0 - confidence) / math.log1p(-risk))
+    takes = f", which takes {least_trials} without one" if failures == 0 else ""
+    return f"{claim}{shown:g} % and not below {100 * risk:g} %{takes}{sure}"
 
 
 def conformal_factor(position_error_m: ArrayLike, scale_m: ArrayLike, risk: float) -> float:
-    """By what a scale is to be multiplied so that the error of a new answer exceeds it as often as the risk at most.
+    """Return the factor on a scale that the error of a new answer exceeds with at most the given risk in (0, 1).
 
-    Parameters
-    ----------
-    position_error_m : array_like, shape (N,)
-        Of calibration answers; infinite where the place is absent.
-    scale_m : array_like, shape (N,)
-        What each answer says of its own uncertainty, positive.
-    risk : float
-        In (0, 1).
-
-    Returns
-    -------
-    float
-        The ceil((N + 1) (1 - risk))-th least ratio of error to scale; infinite where that is more than N, or falls
-        among errors that are infinite.
+    It is the ceil((N + 1) (1 - risk))-th least ratio of error to scale over N calibration answers; infinite where that
+    is more than N, or falls among infinite errors (absent places). The scale is each answer's estimate of its
+    uncertainty.
 
     Raises
     ------
@@ -236,7 +138,7 @@ def conformal_factor(position_error_m: ArrayLike, scale_m: ArrayLike, risk: floa
     Notes
     -----
     Split conformal prediction (Vovk et al. 2005; Lei et al., JASA 2018). It holds on average over calibration sets, for
-    answers that are exchangeable with those of calibration; nothing is said of the answers that are accepted.
+    answers that are exchangeable with those of calibration; it says nothing about accepted answers.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the right answer stands in a list: recall and reciprocal rank, ties decided, every query counted."""
+"""Rank of the right answer in a list: recall and reciprocal rank with ties; every query counts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,26 +18,21 @@ from sasgeo_bench.tasks.query import Truth
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rank:
-    """Where the first right pose of one answer stands.
+    """Rank of the first right pose of one answer.
 
     Parameters
     ----------
     above : int
         Poses with a higher score.
     tied : int
-        Poses with the same score, itself among them.
+        Poses with the same score, including itself.
     right : int
-        How many of the tied ones are right; 0 where no pose of the answer is right or there is no answer.
+        Number of right poses among the tied ones; 0 if no pose of the answer is right or there is no answer.
 
     Raises
     ------
     MetricError
         If more are right than tied, or a number is negative.
-
-    Examples
-    --------
-    >>> Rank(above=2, tied=1, right=1) == rank_of([9.0, 7.0, 4.0], [False, False, True])
-    True
     """
 
     above: int
@@ -45,7 +40,7 @@ class Rank:
     right: int
 
     def __post_init__(self) -> None:
-        """Refuse what no list can give."""
+        """Check the counts."""
         if not (self.above >= 0 and 0 <= self.right <= self.tied):
             message = f"a rank has above >= 0 and 0 <= right <= tied, got {self!r}"
             raise MetricError(message)
@@ -55,19 +50,9 @@ MISS: Final = Rank(above=0, tied=0, right=0)
 
 
 def rank_of(scores: ArrayLike, is_right: ArrayLike) -> Rank:
-    """Rank of the best right pose of one answer.
+    """Return the rank of the best right pose of one answer; `MISS` without one.
 
-    Parameters
-    ----------
-    scores : array_like, shape (K,)
-        Larger is better; in any order.
-    is_right : array_like of bool, shape (K,)
-        Which poses are right.
-
-    Returns
-    -------
-    Rank
-        `MISS` where none is.
+    `scores`, shape (K,), may be in any order; larger is better.
 
     Examples
     --------
@@ -84,21 +69,9 @@ def rank_of(scores: ArrayLike, is_right: ArrayLike) -> Rank:
 
 
 def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
-    """Rank of the right candidate in an answer to a retrieval query.
+    """Return the rank of the right candidate in an answer to a retrieval query; `MISS` if the answer lacks it.
 
-    Parameters
-    ----------
-    prediction : Prediction, optional
-        None where the query has no row at all.
-    truth : Truth
-        With the number of the right candidate.
-    candidates : sequence of Pose
-        Of the query; a pose of the answer is the candidate it lies on.
-
-    Returns
-    -------
-    Rank
-        `MISS` for no answer, a crash, a time-out or an answer that leaves the right candidate out.
+    A pose of the answer is the candidate at its position.
 
     Raises
     ------
@@ -116,7 +89,7 @@ def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequ
     given: set[int] = set()
     right = []
     for pose, _ in prediction.candidates:
-        # As in `matcher.check_match`: of two candidates on one spot, the first not given yet.
+        # As in `matcher.check_match`: of two candidates at one position, the first one not used yet.
         at = next((index for index in candidates_at(pose, candidates) if index not in given), -1)
         given.add(at)
         right.append(at == truth.candidate)
@@ -133,41 +106,23 @@ class Ranks:
 
     @classmethod
     def of(cls, ranks: Sequence[Rank]) -> Self:
-        """Columns of some ranks.
-
-        Examples
-        --------
-        >>> Ranks.of([Rank(above=1, tied=2, right=1), MISS]).tied.tolist()
-        [2, 0]
-        """
+        """Return the columns of some ranks."""
         table = np.array([(rank.above, rank.tied, rank.right) for rank in ranks], dtype=np.int64).reshape(-1, 3)
         return cls(above=table[:, 0], tied=table[:, 1], right=table[:, 2])
 
 
 def hits(ranks: Ranks, k: int) -> Floats:
-    """Chance of each query that a right pose is among the first k, if tied poses are put in random order.
+    """Return the chance that a right pose is among the first k, shape (N,), if tied poses are in random order.
 
-    Parameters
-    ----------
-    ranks : Ranks
-        Of N queries.
-    k : int
-        At least 1.
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        In [0, 1]; 0 or 1 where nothing is tied. Its mean is Recall@k.
+    0 or 1 without ties; the mean is Recall@k.
 
     Raises
     ------
     MetricError
         If k is less than 1.
 
-    Notes
-    -----
-    With m places left for t tied poses of which r are right, all r are left out with chance C(t - r, m) / C(t, m),
-    which is the product of (t - m - j) / (t - j) over j < r. With one right pose the chance to be in is m / t.
+    Notes ----- With m places left for t tied poses of which r are right, all r are left out with chance C(t - r, m) /
+    C(t, m), which is the product of (t - m - j) / (t - j) over j < r. With one right pose the chance to be in is m / t.
 
     Examples
     --------
@@ -175,7 +130,9 @@ def hits(ranks: Ranks, k: int) -> Floats:
     >>> hits(ranks, 1).tolist(), hits(ranks, 5).tolist()
     ([1.0, 0.25, 0.0], [1.0, 1.0, 0.0])
     """
-    _check_k(k)
+    if k < 1:
+        message = f"k must be at least 1, got {k!r}"
+        raise MetricError(message)
     places = np.clip(k - ranks.above, 0, ranks.tied)
     left_out = np.ones(len(places))
     for step in range(int(ranks.right.max(initial=0))):
@@ -184,31 +141,10 @@ def hits(ranks: Ranks, k: int) -> Floats:
     return np.where(ranks.right > 0, 1.0 - left_out, 0.0)
 
 
-def _check_k(k: int) -> None:
-    if k < 1:
-        message = f"k must be at least 1, got {k!r}"
-        raise MetricError(message)
+def reciprocal_ranks(ranks: Ranks) -> Floats:
+    """Return the expected 1 / rank of the first right pose, shape (N,), if tied poses are in random order.
 
-
-def reciprocal_ranks(ranks: Ranks, k: int | None = None) -> Floats:
-    """Expected 1 / rank of the first right pose of each query, if tied poses are put in random order.
-
-    Parameters
-    ----------
-    ranks : Ranks
-        Of N queries.
-    k : int, optional
-        Ranks beyond count 0 (MRR@k).
-
-    Returns
-    -------
-    ndarray of float, shape (N,)
-        In [0, 1]; its mean is the MRR.
-
-    Raises
-    ------
-    MetricError
-        If k is less than 1.
+    The mean is the MRR.
 
     Examples
     --------
@@ -218,9 +154,6 @@ def reciprocal_ranks(ranks: Ranks, k: int | None = None) -> Floats:
     [0.4167]
     """
     last = int((ranks.above + ranks.tied).max(initial=1))
-    if k is not None:
-        _check_k(k)
-        last = min(k, last)
     before = np.zeros(len(ranks.above))
     total = np.zeros(len(ranks.above))
     for place in range(1, last + 1):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matcher x rejector: fitted on calibration places, thresholds chosen there too, and counted on test places alone.
+"""Rejectors on the answers of a matcher: fitted and given thresholds on calibration places, evaluated on test places.
 
-A matcher's own confidence stands beside the rejectors as one that needs no fit.
+A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,18 +22,18 @@ from sasgeo_bench.scoring.integrity_metric import choose_threshold
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
 
-OWN: Final = "own"  # what a board calls a matcher's own confidence; no rejector can have the name
+OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
 RISKS: Final = (0.01, 0.05)
 _NUMBER: Final = r"\d+(?:\.\d+)?"
 _SAID: Final = ("p_right", "remark", "is_calibrated")
-_PARTS: Final = 5  # of the calibration blocks: a threshold is chosen on answers that its rejector was not fitted on
+_PARTS: Final = 5  # folds of the calibration blocks: thresholds need answers that the rejector was not fitted on
 
 Make = Callable[[], Rejector]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """A rejector that is to be fitted: what it says of itself, what makes a new one, and on which places."""
+    """A rejector to fit: its card, a function that makes a new one, and the split that names calibration places."""
 
     card: RejectorCard
     make: Make
@@ -41,24 +41,12 @@ class Rule:
 
 
 def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
-    """Rejectors by name, each tried once before anything is read.
-
-    Parameters
-    ----------
-    specs : sequence of str
-        Names, or module:Class.
-    split : Split, optional
-        Says which places calibrate.
+    """Return rejectors by name from names or module:Class, after making each once.
 
     Raises
     ------
     ConfigError
-        If there is no split, two have one name, or one that of a matcher's own confidence.
-
-    Examples
-    --------
-    >>> rules_of([], None)
-    {}
+        If there is no split, two share a name, or one has that of a matcher's own confidence.
     """
     found: dict[str, Rule] = {}
     named: dict[str, str] = {}
@@ -80,10 +68,10 @@ def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Turn:
-    """One use of a split: which rows are scored, and which calibrate.
+    """One use of a split: masks of the rows to score and of those that calibrate, shape (N,).
 
-    `is_own` is False where none of the fold's own calibration places is on the board, so that all the other places
-    calibrate. Not so for a matcher that learns: its answers on these others come from what the test place taught it.
+    `is_own` is False if none of the fold's own calibration places is on the board, so that all other places calibrate.
+    This fallback is not for matchers with training: their answers on other places were trained on the test place.
     """
 
     test: Bools
@@ -92,21 +80,10 @@ class Turn:
 
 
 def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Iterator[Turn]:
-    """Every use of a split for some scored rows; each row is tested once at most.
+    """Yield every use of a split for scored rows; each row is tested at most once, and no place calibrates itself.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Columns place and part.
-    split : Split
-        Hold-out: one turn, by the part of each query. Cross-fit: one for each place on the board.
-    is_taught : bool
-        Whether the matcher has learnt from other places: then none but the fold's own calibration places calibrate.
-
-    Yields
-    ------
-    Turn
-        Masks of shape (N,). A place never calibrates itself.
+    A hold-out split has one turn, by the part of each query; a cross-fit one for each place on the board. With
+    `is_taught`, for a matcher that was trained on other places, only the fold's own calibration places calibrate.
     """
     place, part = scores["place"].to_numpy(), scores["part"].to_numpy()
     if split.spec.kind == "holdout":
@@ -124,27 +101,17 @@ def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Ite
 def judge(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make, split: Split, *, is_taught: bool = False
 ) -> pd.DataFrame:
-    """What a rejector says of the answers of one matcher, each by a fit on other places.
+    """Return a rejector's output for the answers of one matcher, each from a fit on other places.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Of one matcher; several tracks and prior groups are fitted apart, all suites together.
-    predictions : mapping of str to Prediction
-        The same answers by query id.
-    make : callable
-        Gives a new rejector.
-    split : Split
-        Says which places calibrate.
-    is_taught : bool
-        Whether the matcher has learnt from other places of the split.
+    Each track and prior group has its own fit, over all suites. `make` makes a new rejector; `is_taught` is as in
+    `turns`.
 
     Returns
     -------
     pandas.DataFrame
-        The rows that were tested, with the columns `p_right` (NaN without an answer), `is_calibrated` (else that is an
-        order and no chance), `accepted_<risk>` for each of `RISKS`, `is_own_calibration`, and `remark`, what the
-        rejector said of its fit.
+        The tested rows, with the columns `p_right` (NaN without an answer), `is_calibrated` (False if `p_right` is only
+        an order), `accepted_<risk>` for each of `RISKS`, `is_own_calibration`, and `remark`, the rejector's remark on
+        its fit.
     """
     frames = []
     usable = scores[scores["status"] != NOT_APPLICABLE]
@@ -157,9 +124,7 @@ def judge(
 
 
 def remarks_of(judged: pd.DataFrame) -> list[str]:
-    """What a rejector said of its fits, with how many answers it was said of; remarks that differ in numbers are one.
-
-    A board fits hundreds of times, and what is to be known is where it does not hold, and of how much.
+    """Return a rejector's remarks on its fits with the number of answers; remarks that differ in numbers are one.
 
     Examples
     --------
@@ -179,14 +144,7 @@ def remarks_of(judged: pd.DataFrame) -> list[str]:
 
 
 def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:
-    """Why `judge` has no row for a matcher, in words.
-
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Of one matcher.
-    is_taught : bool
-        Whether it has learnt from other places of the split.
+    """Return why `judge` has no row for a matcher; `is_taught` as there.
 
     Examples
     --------
@@ -202,29 +160,12 @@ def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:
     return "no other place of the board calibrates"
 
 
-def own_word(scores: pd.DataFrame, split: Split | None = None, *, is_taught: bool = False) -> pd.DataFrame:
-    """What a matcher itself says of its answers: its confidence, as a rejector that learns nothing.
+def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taught: bool = False) -> pd.DataFrame:
+    """Return a matcher's own confidences in the form of `judge`, as a rejector without a fit.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Of one matcher. Of a hold-out split only the test part counts, as for any rejector.
-    split : Split, optional
-        Says on which places thresholds for `RISKS` are chosen; all else needs none.
-    is_taught : bool
-        Whether the matcher has learnt from other places of the split.
-
-    Returns
-    -------
-    pandas.DataFrame
-        As of `judge`, with `accepted_<risk>` NaN where no place calibrates, and always a chance. Only tracks and prior
-        groups in which some answer has a confidence; an answer without one is trusted least.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.scoring.score import score_task
-    >>> len(own_word(score_task([], [], {})))
-    0
+    The columns are `p_right`, always a probability, and `accepted_<risk>`, NaN where no place calibrates. Only tracks
+    and prior groups with some confidence count; an answer without one is trusted least. Of a hold-out split only the
+    test part counts. Without a split there are no thresholds.
     """
     usable = scores[scores["status"] != NOT_APPLICABLE]
     frames = []
@@ -236,7 +177,7 @@ def own_word(scores: pd.DataFrame, split: Split | None = None, *, is_taught: boo
 
 
 def _own_of_group(group: pd.DataFrame, split: Split | None, *, is_taught: bool) -> pd.DataFrame:
-    """The rows of one track and prior group that are tested, with what thresholds of other places accept."""
+    """Return the tested rows of one track and prior group, with the fixes that thresholds of other places accept."""
     accepted = {_accepted(risk): np.full(len(group), np.nan) for risk in RISKS}
     for turn in () if split is None else turns(group, split, is_taught=is_taught):
         known = group[turn.calibration]
@@ -266,13 +207,13 @@ def _judged(
 
 
 def _accepted_rows(known: pd.DataFrame, asked: pd.DataFrame) -> dict[str, Bools]:
-    """Which fixes the thresholds accept that are chosen on some rows, by the name of the column."""
+    """Return which fixes the thresholds chosen on some rows accept, by column name."""
     calibration, test = answers_of(known), answers_of(asked)
     return {_accepted(risk): accept(test, choose_threshold(calibration, risk)) for risk in RISKS}
 
 
 def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
-    """Probabilities on calibration blocks, each by a fit on the other ones; of a single block by its own fit."""
+    """Return probabilities on calibration blocks, each from a fit on the others; a single block uses its own fit."""
     names = sorted(set(calibration["block"]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
         return _fit_and_say(make, calibration, calibration, predictions)[0]
@@ -288,7 +229,7 @@ def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, 
 def _fit_and_say(
     make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictions: Mapping[str, Prediction]
 ) -> tuple[Floats, str]:
-    """Fit on the answers of some rows; say of others, NaN where there is no answer. And what it remarks of the fit."""
+    """Fit on the answers of some rows; return P(false) of others, NaN without an answer, and the remark on the fit."""
     rejector = make()
     answered = known[known["is_answered"].to_numpy(bool)]
     found = np.full(len(asked), np.nan)
@@ -299,7 +240,7 @@ def _fit_and_say(
         if some:
             found[is_answered] = check_p_false(rejector.p_false(some), len(some))
         remark = remark_of(rejector)
-    except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
+    except (Exception, SystemExit) as error:  # a plugin must not end the program
         message = f"rejector {rejector.card.name!r} failed ({message_of(error)}): mend it, or leave it out"
         raise MatchError(message) from error
     return found, remark
@@ -310,7 +251,7 @@ def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Seque
 
 
 def answers_of(judged: pd.DataFrame) -> Answers:
-    """Judged rows as the integrity figures take them."""
+    """Return rows of `judge` as `decisions.Answers`."""
     return Answers(
         confidence=judged["p_right"].to_numpy(float),
         is_answered=judged["is_answered"].to_numpy(bool),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What rejectors say of the answers of many contestants, and the figures of it, by several processes."""
+"""Outputs of rejectors for the answers of many entries, with their metrics, in parallel processes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,29 +9,16 @@ import pandas as pd
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.parallel import spread
 from sasgeo_bench.scoring.integrity import integrity_rows
-from sasgeo_bench.scoring.rejection import OWN, Rule, judge, own_word, why_not
+from sasgeo_bench.scoring.rejection import OWN, Rule, judge, own_confidence, why_not
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.tasks.split import Split
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judging:
-    """Answers of one contestant that rejectors are to judge.
+class RejectionTask:
+    """Answers of one entry to evaluate with rejectors, by name; its own confidence is always added.
 
-    Parameters
-    ----------
-    matcher : str
-        Its name on the board.
-    scores : pandas.DataFrame
-        Its scored rows.
-    predictions : mapping of str to Prediction
-        Its answers, by query.
-    rules : mapping of str to Rule
-        Rejectors by name; its own word is always among them.
-    split : Split, optional
-        Says which places calibrate.
-    is_taught : bool
-        Whether it has learnt from other places of the split.
+    `split` assigns calibration places. `is_taught` is True if the entry was trained on other places of the split.
     """
 
     matcher: str
@@ -43,66 +30,54 @@ class Judging:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
-    """What came of it: by rejector what it says (`judge`), rows of the board, why some were not applied, or failed."""
+class RejectionResult:
+    """Result for one entry.
+
+    By rejector: the rows of `judge`, and the errors of those that failed. Then rows of the board, and lines that say
+    why rejectors were not applied.
+    """
 
     matcher: str
-    said: Mapping[str, pd.DataFrame]
+    by_rejector: Mapping[str, pd.DataFrame]
     rows: tuple[pd.DataFrame, ...] = ()
-    lines: tuple[str, ...] = field(default=())
+    skipped: tuple[str, ...] = field(default=())
     failed: Mapping[str, Exception] = field(default_factory=dict)
 
 
-def carry_out(judgings: Sequence[Judging], *, jobs: int = 1) -> Iterator[Judged]:
-    """Have all of them judged, by several processes if there are several jobs; no figure hangs on how many there are.
-
-    Parameters
-    ----------
-    judgings : sequence of Judging
-        One for each contestant.
-    jobs : int
-        Processes.
-
-    Yields
-    ------
-    Judged
-        One for each, in their order.
-
-    Examples
-    --------
-    >>> list(carry_out([], jobs=2))
-    []
-    """
-    yield from spread(judged, judgings, jobs=jobs)
+def apply_rejectors(tasks: Sequence[RejectionTask], *, jobs: int = 1) -> Iterator[RejectionResult]:
+    """Yield the result of each task in order; the number of processes does not affect it."""
+    yield from spread(_evaluated, tasks, jobs=jobs)
 
 
-def judged(judging: Judging) -> Judged:
-    """What the rejectors say of one contestant, its own word among them; no row where one is not applied."""
-    said, rows, lines, failed = {}, [], [], {}
-    for name in (OWN, *judging.rules):
+def _evaluated(task: RejectionTask) -> RejectionResult:
+    """Apply all rejectors to one entry, and its own confidence; a rejector that is not applied has no rows."""
+    by_rejector, rows, skipped, failed = {}, [], [], {}
+    for name in (OWN, *task.rules):
         try:
-            frame = _said(judging, name)
-            rows += [_figures(judging, name, frame)] if len(frame) else []
-        except Exception as error:  # noqa: BLE001 - these answers and this rejector alone do without a figure
+            frame = _rows_of(task, name)
+            rows += [_metrics(task, name, frame)] if len(frame) else []
+        except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
             failed[name] = error
             continue
         if len(frame) or name != OWN:
-            said[name] = frame
+            by_rejector[name] = frame
         if not len(frame) and name != OWN:
-            why = why_not(judging.scores, is_taught=judging.is_taught)
-            lines.append(f"{name} on {judging.matcher}: not applied, {why}")
-    return Judged(matcher=judging.matcher, said=said, rows=tuple(rows), lines=tuple(lines), failed=failed)
+            why = why_not(task.scores, is_taught=task.is_taught)
+            skipped.append(f"{name} on {task.matcher}: not applied, {why}")
+    return RejectionResult(
+        matcher=task.matcher, by_rejector=by_rejector, rows=tuple(rows), skipped=tuple(skipped), failed=failed
+    )
 
 
-def _said(judging: Judging, name: str) -> pd.DataFrame:
-    """What a rejector says of the answers, or a matcher itself."""
+def _rows_of(task: RejectionTask, name: str) -> pd.DataFrame:
+    """Return the rows of a rejector, or of the matcher's own confidence."""
     if name == OWN:
-        return own_word(judging.scores, judging.split, is_taught=judging.is_taught)
-    rule = judging.rules[name]
-    return judge(judging.scores, judging.predictions, rule.make, rule.split, is_taught=judging.is_taught)
+        return own_confidence(task.scores, task.split, is_taught=task.is_taught)
+    rule = task.rules[name]
+    return judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
 
 
-def _figures(judging: Judging, name: str, frame: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the board; its own word is taken for a probability."""
-    is_calibrated = name == OWN or judging.rules[name].card.is_calibrated
-    return to_frame(list(integrity_rows(judging.matcher, name, frame, is_calibrated=is_calibrated)))
+def _metrics(task: RejectionTask, name: str, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of the board; a matcher's own confidence counts as a probability."""
+    is_calibrated = name == OWN or task.rules[name].card.is_calibrated
+    return to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))

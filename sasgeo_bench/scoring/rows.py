@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One figure of one matcher, and of which queries it is: the rows of `leaderboard.parquet`."""
+"""Rows of `leaderboard.parquet`: one metric of one matcher on one set of queries."""
 
 import math
 import os
@@ -15,92 +15,46 @@ from sasgeo_bench.scoring.metrics import Metric
 from sasgeo_bench.scoring.score import MISSING
 
 ALL_SUITES: Final = "all suites"
-AS_SUBMITTED: Final = "as submitted"  # how answers came: their author gave them,
-RUN_HERE: Final = "run here"  # or we ran the code, on queries of a public seed alone,
-REPRODUCED: Final = "reproduced"  # or on a private seed too, where it is not shown to do worse,
-NOT_REPRODUCED: Final = "not reproduced"  # or where it is
-UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: beside the ranks
-YARDSTICK: Final = "oracle_"  # how the names of yardsticks begin, which know what no matcher can: beside the ranks, too
+AS_SUBMITTED: Final = "as submitted"  # source of the answers: their author,
+RUN_HERE: Final = "run here"  # our run of the code, on queries of a public seed only,
+REPRODUCED: Final = "reproduced"  # or of a private seed too, where it is not shown to be worse,
+NOT_REPRODUCED: Final = "not reproduced"  # or is shown to be worse
+UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: not ranked
+YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth: not ranked either
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """One figure of one matcher.
+class RowKey:
+    """Matcher, queries and counts of a row; rows of one matcher on the same queries share them.
 
     Parameters
     ----------
     matcher, rejector : str
-        Whose; the rejector is "" for figures that take every answer.
+        Names; the rejector is "" for metrics that take every answer.
     suite, track, prior_group, stratum : str
-        Of which queries. Figures of two prior groups are never ranked against each other.
+        Set of queries. Values of two prior groups are never ranked against each other.
     n : int
         Queries in the denominator; the same for every matcher.
     answered, missing : int
         Of these: with an answer, and without any row.
     blocks, places : int
-        How many of each the queries come from.
-    metric, unit, better : str
-        Of what.
-    value, lo, hi : float
-        The figure and its 95 % interval; NaN where there is none.
-    interval : str
-        How it was found: "blocks" (bootstrap over blocks, then sites), "wilson" (Wilson's over sites lies farther out
-        at one end or both: of few sites, or where nothing varies, draws say too little), or "".
-    is_applicable : bool
-        False where the matcher's card says it cannot; then there is no figure.
-    rank_best, rank_worst : int
-        Ranks it can have among the matchers that are ranked; None where it is not, and with fewer than `LEAST_BLOCKS`
-        blocks.
-    detectable : float
-        Least difference from the best of the others that these queries would show (alpha 5 %, power 80 %); NaN where
-        there is no rank.
+        Numbers of blocks and places of the queries.
     """
 
     matcher: str
-    rejector: str
-    suite: str
-    track: str
-    prior_group: str
-    stratum: str
-    n: int
-    answered: int
-    missing: int
-    blocks: int
-    places: int
-    metric: str
-    unit: str
-    better: str
-    value: float
-    lo: float = math.nan
-    hi: float = math.nan
-    interval: str = ""
-    is_applicable: bool = True
-    rank_best: int | None = None
-    rank_worst: int | None = None
-    detectable: float = math.nan
-
-
-COLUMNS: Final = tuple(field.name for field in fields(Row))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RowKey:
-    """Fields that all rows about the same queries of one matcher share; see `Row`."""
-
-    matcher: str
-    suite: str
-    track: str
-    prior_group: str
-    stratum: str
-    n: int
-    answered: int
-    missing: int
-    blocks: int
-    places: int
     rejector: str = ""
+    suite: str
+    track: str
+    prior_group: str
+    stratum: str
+    n: int
+    answered: int
+    missing: int
+    blocks: int
+    places: int
 
     @classmethod
     def of(
@@ -129,9 +83,9 @@ class RowKey:
             places=int(scores["place"].nunique()),
         )
 
-    def row(self, metric: Metric, found: Interval, how: str = "", **more: Any) -> Row:  # noqa: ANN401
-        """Return the row of one metric about these queries; `more` are other fields of a `Row`."""
-        key = {name: getattr(self, name) for name in self.__slots__}
+    def row(self, metric: Metric, found: Interval, how: str = "", **more: Any) -> "Row":  # noqa: ANN401
+        """Return the row of one metric on these queries; `more` are other fields of a `Row`."""
+        key = {field.name: getattr(self, field.name) for field in fields(RowKey)}
         return Row(
             **key,
             metric=metric.name,
@@ -145,18 +99,49 @@ class RowKey:
         )
 
 
-def side_by_side(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row(RowKey):
+    """One metric of one matcher.
+
+    Parameters
+    ----------
+    metric, unit, better : str
+        Definition, see `metrics.Metric`.
+    value, lo, hi : float
+        The value and its 95 % interval; NaN if missing.
+    interval : str
+        Method of the interval: "blocks" (bootstrap over blocks, then sites), "wilson" (Wilson's over sites lies farther
+        out at one end or both: few sites, or nothing varies), or "".
+    is_applicable : bool
+        False if the matcher's card excludes the task; then there is no value.
+    rank_best, rank_worst : int
+        Rank interval among the ranked matchers; None for others, and with fewer than `LEAST_BLOCKS` blocks.
+    detectable : float
+        Least difference from the best rival that these queries can show (alpha 5 %, power 80 %); NaN without a rank.
+    """
+
+    metric: str
+    unit: str
+    better: str
+    value: float
+    lo: float = math.nan
+    hi: float = math.nan
+    interval: str = ""
+    is_applicable: bool = True
+    rank_best: int | None = None
+    rank_worst: int | None = None
+    detectable: float = math.nan
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Row))
+
+
+def in_threads(
     make: Callable[[Item], Iterable[Row]], items: Iterable[Item], done: Callable[[], None] = lambda: None
 ) -> list[Row]:
-    """All rows of some items in their order, made by a few threads.
+    """Return the rows of all items in order, made by a few threads; call `done` in this thread after each item.
 
-    Most of the time of a board goes into draws and their sums, which leave the interpreter to other threads meanwhile.
-    `done` is called in this thread after each item.
-
-    Examples
-    --------
-    >>> side_by_side(lambda item: [], [1, 2])
-    []
+    Most of the time goes into draws and their sums, which release the interpreter lock.
     """
     rows: list[Row] = []
     with ThreadPoolExecutor(max_workers=min(_THREADS, os.cpu_count() or 1)) as pool:
@@ -167,7 +152,7 @@ def side_by_side(
 
 
 def name_alone(matcher: str) -> str:
-    """Name of a contestant without the version and hash that it bears beside another of its name.
+    """Return the name of an entry without the version and hash that tell it from another of its name.
 
     Examples
     --------
@@ -178,7 +163,7 @@ def name_alone(matcher: str) -> str:
 
 
 def is_unranked(matcher: str) -> bool:
-    """Whether a contestant is a control, of whatever version.
+    """Return True for a control of any version.
 
     Examples
     --------
@@ -190,27 +175,21 @@ def is_unranked(matcher: str) -> bool:
 
 
 def bare(value: float) -> Interval:
-    """A figure without an interval."""
+    """Return a value without an interval."""
     return Interval(value=value, lo=math.nan, hi=math.nan)
 
 
 def to_frame(rows: list[Row]) -> pd.DataFrame:
-    """Rows as a table with the columns of `Row`.
-
-    Examples
-    --------
-    >>> to_frame([]).columns[0]
-    'matcher'
-    """
+    """Return rows as a table with the columns of `Row`."""
     frame = pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
-    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # whole numbers, and none where none is
+    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # integers or missing
 
 
 @dataclass(frozen=True, slots=True)
-class Contestant:
-    """What all rows of a contestant say: version, hash of code and settings ("" for a file), how its answers came.
+class EntryLabel:
+    """Shared fields of an entry's rows: version, hash of code and settings ("" for a file), source of the answers.
 
-    `set_apart` is why it is in no rank; None where it is.
+    `set_apart` is the reason for excluding it from ranks; None if it is ranked.
     """
 
     version: str
@@ -219,26 +198,10 @@ class Contestant:
     set_apart: str | None = None
 
 
-def with_contestants(board: pd.DataFrame, contestants: Mapping[str, Contestant]) -> pd.DataFrame:
-    """Rows that also say whose code they are of, how the answers came, and whether they are of a control or set apart.
+def with_entry_labels(board: pd.DataFrame, contestants: Mapping[str, EntryLabel]) -> pd.DataFrame:
+    """Return the board with the columns version, hash, how, is_control and set_apart after the matcher.
 
-    Parameters
-    ----------
-    board : pandas.DataFrame
-        Columns as the fields of `Row`.
-    contestants : mapping of str to Contestant
-        By matcher.
-
-    Returns
-    -------
-    pandas.DataFrame
-        With the columns version, hash (missing for a file), how, is_control and set_apart (missing where it is not)
-        behind the matcher.
-
-    Examples
-    --------
-    >>> with_contestants(to_frame([]), {}).columns[:6].tolist()
-    ['matcher', 'version', 'hash', 'how', 'is_control', 'set_apart']
+    The hash is missing for a file, and `set_apart` for ranked entries.
     """
     board = board.copy()
     for at, name in enumerate(("version", "hash", "how")):
@@ -250,7 +213,7 @@ def with_contestants(board: pd.DataFrame, contestants: Mapping[str, Contestant])
 
 
 def is_apart(board: pd.DataFrame) -> "pd.Series[bool]":
-    """Which rows are set apart; none of a table that does not say so.
+    """Return a mask of the rows that are excluded from ranks; all False if the table has no such column.
 
     Examples
     --------

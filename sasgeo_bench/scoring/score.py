@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions held against truths: one scored row for every query, whether it was answered or not."""
+"""Scored rows: one for every query of a task, answered or not."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,8 +16,8 @@ from sasgeo_bench.scoring.pose import first_pose, pose_errors
 from sasgeo_bench.scoring.ranking import MISS, Rank, rank_candidate, rank_of
 from sasgeo_bench.tasks.query import Head, Truth, base_of
 
-SCORER_VERSION: Final = 4  # raised whenever the same predictions get other figures; rows of two never share a board
-FIX_M: Final = 25.0  # the mission tolerance e_max of Eq. 12: a fix farther off is false, on either track
+SCORER_VERSION: Final = 4  # raise it if the same predictions get other scores; a board has one version
+FIX_M: Final = 25.0  # mission tolerance e_max of Eq. 12: a fix beyond it is false, on both tracks
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"
 
@@ -27,36 +27,36 @@ _NO_ERROR: Final[Errors] = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
-    """One query of one matcher, scored.
+    """One scored query of one matcher.
 
     Parameters
     ----------
     query_id, track, suite, suite_version, part, region, prior_group, view_cells, cell_size_m
         Of the query.
     pool : int
-        Candidates to choose from; 0 for localization.
+        Number of candidates; 0 for localization.
     place : str
-        What stays together in the split; the region where no split is given.
+        Unit of the split; the region without a split.
     block, pair_id, role, kind, strength, strength_unit, scene
         Of the truth; so are unknown_share, changed_share, feature_density and alias_index.
     is_present : bool
-        Whether there is something to be right about.
+        The place is on the map.
     status : str
-        Of the prediction, or "missing". "not applicable" only where all queries of the same suite, track and prior
-        group are: else whoever answers could choose what to be asked.
+        Of the prediction, or "missing". "not applicable" must cover all queries of a suite, track and prior group, so
+        that a submission cannot choose its queries.
     is_answered : bool
-        Whether there is a fix that could be accepted.
+        There is a fix that could be accepted.
     above, tied, right : int
         Rank of the right candidate (`ranking.Rank`); 0, 0, 0 for a miss and for localization.
     position_error_m, yaw_error_deg, log_scale_error : float
-        Of the first pose, for localization of a place that is present; infinite without an answer, else NaN.
+        Of the first pose, for localization of a present place; infinite without an answer, else NaN.
     is_right : bool
-        Whether the fix lies within `FIX_M` of where the view was taken (Eq. 12); never for an absent place. In
-        retrieval, too: a pick beside the right candidate is no false fix if it is that near, though no hit.
+        The fix lies within `FIX_M` of the true position (Eq. 12); never for an absent place. In retrieval too: a wrong
+        candidate within that distance is no hit, but no false fix either.
     confidence : float
-        What the matcher says; NaN where it does not.
+        Of the prediction; NaN if missing.
     latency_s : float
-        NaN where it is not known.
+        NaN if unknown.
     """
 
     query_id: str
@@ -96,6 +96,10 @@ class Score:
 
 
 COLUMNS: Final = tuple(field.name for field in fields(Score))
+_HEAD_COLUMNS: Final = tuple(field.name for field in fields(Head) if field.name in COLUMNS)
+_TRUTH_COLUMNS: Final = tuple(
+    field.name for field in fields(Truth) if field.name in COLUMNS and field.name not in _HEAD_COLUMNS
+)
 
 
 def score_task(
@@ -105,33 +109,15 @@ def score_task(
     *,
     place_of: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
-    """Score the predictions of one task.
+    """Score the predictions of one task: a row for each query in order, with the columns of `Score`.
 
-    Parameters
-    ----------
-    heads : iterable of Head
-        Every query of the task.
-    truths : iterable of Truth
-        Of the same queries.
-    predictions : mapping of str to Prediction
-        By query id; a query without one is a miss.
-    place_of : mapping of str to str, optional
-        Block -> place of the split.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for each query, the columns those of `Score`, in the order of the queries.
+    `heads` and `truths` cover the same queries; a query without a prediction is a miss. `place_of` maps blocks to
+    places of the split.
 
     Raises
     ------
     MetricError
         If a query has no truth or a prediction belongs to no query.
-
-    Examples
-    --------
-    >>> score_task([], [], {}).columns[0]
-    'query_id'
     """
     by_id = {truth.query_id: truth for truth in truths}
     asked = list(heads)
@@ -143,20 +129,20 @@ def score_task(
     if foreign is not None:
         message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
         raise MetricError(message)
-    told = [predictions.get(head.query_id) for head in asked]
-    errors = _errors([by_id[head.query_id] for head in asked], told)
+    answers = [predictions.get(head.query_id) for head in asked]
+    errors = _errors([by_id[head.query_id] for head in asked], answers)
     rows = [
         _score(head, by_id[head.query_id], prediction, error, place_of or {})
-        for head, prediction, error in zip(asked, told, errors, strict=True)
+        for head, prediction, error in zip(asked, answers, errors, strict=True)
     ]
     return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
 
 
-def _errors(truths: Sequence[Truth], told: Sequence[Prediction | None]) -> list[Errors]:
-    """Metres, degrees and logarithm of the scale of each first pose; NaN where there is no pose to be right about."""
+def _errors(truths: Sequence[Truth], answers: Sequence[Prediction | None]) -> list[Errors]:
+    """Return metres, degrees and logarithm of the scale of each first pose; NaN without a true pose."""
     found = [_NO_ERROR] * len(truths)
     asked = [(at, truth.pose) for at, truth in enumerate(truths) if truth.is_present and truth.pose is not None]
-    errors = pose_errors([first_pose(told[at]) for at, _ in asked], [pose for _, pose in asked])
+    errors = pose_errors([first_pose(answers[at]) for at, _ in asked], [pose for _, pose in asked])
     columns = (errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist())
     for (at, _), *error in zip(asked, *columns, strict=True):
         found[at] = (error[0], error[1], error[2])
@@ -167,35 +153,16 @@ def _score(
     head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, place_of: Mapping[str, str]
 ) -> Score:
     rank = MISS
-    is_right = errors[0] <= FIX_M  # a candidate's heading is given and its place was moved by chance: no errors of it
+    is_right = errors[0] <= FIX_M  # retrieval candidates have a given heading and a random offset, so no errors below
     if head.track == "retrieval":
         errors = _NO_ERROR
         rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS
     base = base_of(head.region)
     return Score(
-        query_id=head.query_id,
-        track=head.track,
-        suite=head.suite,
-        suite_version=head.suite_version,
-        part=head.part,
-        region=head.region,
+        **{name: getattr(head, name) for name in _HEAD_COLUMNS},
+        **{name: getattr(truth, name) for name in _TRUTH_COLUMNS},
         place=place_of.get(truth.block, base),
-        block=truth.block,
-        prior_group=head.prior_group,
-        view_cells=head.view_cells,
-        cell_size_m=head.cell_size_m,
         pool=len(head.candidates),
-        pair_id=truth.pair_id,
-        role=truth.role,
-        kind=truth.kind,
-        strength=truth.strength,
-        strength_unit=truth.strength_unit,
-        unknown_share=truth.unknown_share,
-        changed_share=truth.changed_share,
-        feature_density=truth.feature_density,
-        alias_index=truth.alias_index,
-        scene=truth.scene,
-        is_present=truth.is_present,
         status=MISSING if prediction is None else prediction.status,
         is_answered=first_pose(prediction) is not None,
         above=rank.above,
@@ -211,7 +178,7 @@ def _score(
 
 
 def _rank(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
-    """Rank of the right candidate; the full comparison only where another candidate lies on the same spot."""
+    """Return the rank of the right candidate; compare all candidates only if another one shares its position."""
     right = candidates[truth.candidate]
     twins = sum(_is_at(other, right, within_m=2 * SAME_PLACE_M) for other in candidates)
     if twins > 1:
@@ -227,20 +194,9 @@ def _is_at(pose: Pose, place: Pose, *, within_m: float = SAME_PLACE_M) -> bool:
 
 
 def settle_not_applicable(scores: pd.DataFrame) -> pd.DataFrame:
-    """Take "not applicable" for a miss where not all queries of the same suite, track and prior group are.
+    """Return the rows with "not applicable" as "missing" unless it covers a whole suite, track and prior group.
 
-    A card names what a matcher needs, and that is the same for all of them; a file that leaves out single queries would
-    choose what it is asked.
-
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Of one matcher, all tasks.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A copy with the status "missing" where it was claimed for a part.
+    A card's requirements are the same for all of these; a file that omits single queries would choose its queries.
     """
     claimed = scores["status"] == NOT_APPLICABLE
     group = [scores["suite"], scores["track"], scores["prior_group"]]

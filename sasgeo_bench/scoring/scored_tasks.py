@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks as a board takes them: what is asked, to find whose answers count; and with their truths, to score these."""
+"""Tasks as a board reads them: hashes of the queries, and queries with truths."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ M2_PER_KM2: Final = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class AskedTask:
-    """A task as runs are held against it: by query, the hash of what is asked."""
+    """A task to compare runs against: the hash of each query."""
 
     folder: Path
     about: Mapping[str, Any]
@@ -30,13 +30,13 @@ class AskedTask:
         Raises
         ------
         StoreError
-            If the folder holds no sound task.
+            If the folder holds no valid task.
         """
         return cls(folder=folder, about=task_files.read_task(folder), asked=task_files.read_asked(folder))
 
 
 def held_tasks(files: Collection[Mapping[str, Prediction]], root: Path) -> Iterator[Path]:
-    """Task folders of which files hold an answer."""
+    """Yield the task folders for which files hold an answer."""
     held = {name for rows in files for name in rows}
     for path in sorted((root / "tasks").glob(f"*/*/{task_files.TASK}")) if held else ():
         if not held.isdisjoint(task_files.read_ids(path.parent)):
@@ -45,7 +45,7 @@ def held_tasks(files: Collection[Mapping[str, Prediction]], root: Path) -> Itera
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTask:
-    """A task as it is scored: read once, for all contestants."""
+    """A task with truths, read once for all entries."""
 
     folder: Path
     about: dict[str, Any]
@@ -56,7 +56,7 @@ class ScoredTask:
 
 
 def read_scored_task(folder: Path, root: Path) -> ScoredTask:
-    """A task and its truths from their own root, after they were held against each other.
+    """Read a task and its truths from their own root, and check that they match.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def read_scored_task(folder: Path, root: Path) -> ScoredTask:
 
 
 def _area_km2(region: Path) -> float | None:
-    """Mapped area of a region; None where it is not beside the tasks, for scores need no map."""
+    """Return the mapped area of a region; None if its map is missing, since scores need no map."""
     try:
         manifest = read_manifest(region)
     except StoreError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A board step by step: the figure that matchers are ranked by along each ladder of strengths."""
+"""Steps of a board: the primary metric along each ladder of strengths."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -13,27 +13,15 @@ GROUP: Final = ("suite", "track", "prior_group")
 
 
 def queries_of(scores: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """What scored rows say of their queries, each query once."""
+    """Return the query columns of scored rows, each query once."""
     return pd.concat(list(scores.values()), ignore_index=True).drop_duplicates("query_id", ignore_index=True)
 
 
 def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
-    """The figure that matchers are ranked by, at each step of each kind that has several.
+    """Return the primary metric of the matchers `shown` at each step of each kind that has several.
 
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        The leaderboard.
-    queries : pandas.DataFrame
-        From `queries_of`.
-    shown : sequence of str
-        Matchers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Rows of the leaderboard with the columns kind, strength, strength_unit and view_cells; controls stand at
-        strength 0 of each kind. A size of view is a part of its own: not every size has every step.
+    The rows are those of the leaderboard `table`, with the columns kind, strength, strength_unit and view_cells.
+    Controls have strength 0 of each kind. View sizes are separate, since not every size has every step.
     """
     places = pd.DataFrame(_ladders(queries))
     if places.empty:
@@ -43,13 +31,13 @@ def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]
 
 
 def primary_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the figure of each track that matchers are ranked by."""
+    """Return the rows of the primary metric of each track."""
     wanted = {track: primary_of(track).name for track in TRACKS}
     return rows[(rows["metric"] == rows["track"].map(wanted)).to_numpy(bool)]
 
 
 def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Names that the leaderboard gives to the steps of each kind, with what they stand for."""
+    """Yield the stratum name of each step of each kind, with its kind, strength and view size."""
     some = queries[queries["is_present"].to_numpy(bool)]
     for key, group in some.groupby(list(GROUP), sort=True):
         sizes = sorted(set(group.loc[group["role"] == CONTROL, "view_cells"]))
@@ -57,11 +45,12 @@ def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
         for kind, mine in stress.groupby("kind", sort=True):
             if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
                 continue
-            said = {**dict(zip(GROUP, key, strict=True)), "kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
+            columns = dict(zip(GROUP, key, strict=True))
+            columns |= {"kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
             steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})
             for strength, size in steps:
                 name = step_name(str(kind), strength, size)
-                yield {**said, "stratum": name, "strength": strength, "view_cells": size}
+                yield {**columns, "stratum": name, "strength": strength, "view_cells": size}
             for size in sorted({size for _, size in steps} & {*sizes}):
                 name = control_name(size) if len(sizes) > 1 else CONTROL
-                yield {**said, "stratum": name, "strength": 0.0, "view_cells": size}
+                yield {**columns, "stratum": name, "strength": 0.0, "view_cells": size}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a suite that are told apart on a board; which part a query is in never depends on an answer."""
+"""Strata of a suite; the stratum of a query never depends on an answer."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -13,23 +13,21 @@ from sasgeo_bench.scoring.base import Bools
 ALL: Final = "all"
 STRESS: Final = "stress"
 CONTROL: Final = "control"
-_MOST_STEPS: Final = 24  # more are no steps: a strength drawn from a range is another one for each query
-_EDGES: Final = {  # fixed, so that boards can be compared
+_MOST_STEPS: Final = 24  # more are no steps: each query has its own random strength
+_EDGES: Final = {  # fixed, to keep boards comparable
     "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
     "changed_share": (0.0, 0.1, 0.2, 0.4, 1.0),
     "feature_density": (0.0, 0.05, 0.1, 0.2, 1.0),
     "alias_index": (0.0, 0.7, 0.8, 0.9, 1.0),
 }
-
-
-_MAPPING: Final = ("real-age",)  # suites whose maps differ mostly by how much was mapped, not by what was built
+_MAPPING: Final = ("real-age",)  # suites whose maps differ mostly in completeness, not in construction
 
 
 def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
-    """Names and masks, shape (N,), of every part of one suite that holds a query.
+    """Yield names and masks, shape (N,), of every stratum of one suite that holds a query.
 
-    Roles, then each step of each kind at each size of view, then bins of what was measured at the truth. A kind that is
-    drawn in one step and size has no rows for them apart.
+    Roles, then each step of each kind at each view size, then bins of measured properties of the truth. A kind with one
+    step and size has no separate rows for them.
 
     Examples
     --------
@@ -61,29 +59,17 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
 
 
 def step_name(kind: str, step: float, view_cells: int) -> str:
-    """Name of one step of a kind at one size of view, of a kind that has several of them.
-
-    Examples
-    --------
-    >>> step_name("G1", 5.0, 96)
-    'G1 5, 96 cells'
-    """
+    """Return the name of one step of a kind at one view size, as "G1 5, 96 cells"."""
     return f"{kind} {step:g}, {view_cells} cells"
 
 
 def control_name(view_cells: int) -> str:
-    """Name of the controls at one size of view, of a suite that has several sizes.
-
-    Examples
-    --------
-    >>> control_name(96)
-    'control, 96 cells'
-    """
+    """Return the name of the controls at one view size, as "control, 96 cells"."""
     return f"{CONTROL}, {view_cells} cells"
 
 
 def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:
-    """Bins of what was measured, without the controls."""
+    """Yield bins of measured properties, without the controls."""
     is_mapping = (
         scores["suite"].isin(_MAPPING).to_numpy(bool) if "suite" in scores else np.zeros(len(scores), dtype=bool)
     )

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A submission on disk: `submission.json` and one file of predictions; it may be anyone's, so nothing in it is trusted.
+"""Submissions on disk: `submission.json` and one file of predictions, by authors who are not trusted.
 
-All that is cheap to look at is looked at before anything is read: names, links, sizes, then hashes, then the shape of
-the table.
+Cheap checks come first: names, links, sizes, then hashes, then the shape of the table.
 """
 
 import os
@@ -25,12 +24,12 @@ from sasgeo_bench.running.prediction_rows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.tasks.task_rows import ASKED
 from sasgeo_bench.texts import json_text
 
-SAID: Final = "submission.json"
+SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"
-README: Final = "README.md"  # beside submissions, and no submission
+README: Final = "README.md"  # may lie among submissions
 MOST_BYTES: Final = 20_000_000  # of the predictions
 _MOST_CARD_BYTES: Final = 100_000
-_MOST_SAID_BYTES: Final = 5_000_000
+_MOST_SUBMISSION_BYTES: Final = 5_000_000
 _TEXTS: Final = ("query_id", "status", "message", ASKED)
 _LEVEL: Final = 19
 
@@ -43,7 +42,7 @@ def read_card(path: Path) -> Card:
     StoreError
         If it cannot be read.
     ConfigError
-        If something in it is wrong; all faults on one line.
+        If a field is wrong; all faults on one line.
     """
     text = _text_of(path, _MOST_CARD_BYTES, "a card (submit --example-card prints one)")
     return parse_toml(text, Card, source=str(path))
@@ -53,7 +52,7 @@ def _text_of(path: Path, most_bytes: int, noun: str) -> str:
     try:
         with path.open("rb") as source:
             read = source.read(most_bytes + 1)
-        text = read.decode("utf-8-sig")  # some editors begin a file with a mark of its byte order
+        text = read.decode("utf-8-sig")  # some editors write a byte order mark
     except (UnicodeDecodeError, OSError) as error:
         fault = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
         message = f"{path} cannot be read ({fault}): name {noun}"
@@ -65,45 +64,26 @@ def _text_of(path: Path, most_bytes: int, noun: str) -> str:
 
 
 def predictions_name(name: str) -> str:
-    """Path of the predictions inside a submission.
-
-    Examples
-    --------
-    >>> predictions_name("mine")
-    'predictions/mine.parquet'
-    """
+    """Return the path of the predictions inside a submission."""
     return f"{PREDICTIONS}/{name}.parquet"
 
 
 def write_submission(
-    folder: Path, said: Submission, predictions: Sequence[Prediction], asked: Mapping[str, str]
+    folder: Path, submission: Submission, predictions: Sequence[Prediction], asked: Mapping[str, str]
 ) -> Submission:
-    """Write a submission, whole or not at all; the same answers give the same bytes.
+    """Write a submission completely or not at all, and return it with its files; the same answers give the same bytes.
 
-    Parameters
-    ----------
-    folder : Path
-        To write, named as the card is; an older submission there is replaced.
-    said : Submission
-        What `submission.json` says, but for the files.
-    predictions : sequence of Prediction
-        The answers.
-    asked : mapping of str to str
-        By query id, the hash of what each answers.
-
-    Returns
-    -------
-    Submission
-        What `submission.json` says.
+    The folder has the name of the card; an older submission there is replaced. `asked` holds the hash of each answered
+    query, by query id.
 
     Raises
     ------
     StoreError
-        If the folder holds something else or has another name, the predictions are too large, or the disk refuses; what
-        was there is as it was.
+        If the folder holds something else or has another name, the predictions are too large, or writing fails; the
+        folder is then unchanged.
     """
-    if folder.name != said.card.name:
-        message = f"{folder} must be named as the card is, {said.card.name!r}: name another folder"
+    if folder.name != submission.card.name:
+        message = f"{folder} must be named as the card is, {submission.card.name!r}: name another folder"
         raise StoreError(message)
     if os.path.lexists(folder) and not is_submission(folder) and (not folder.is_dir() or any(folder.iterdir())):
         message = f"{folder} holds something else than a submission, which would be lost: name another folder"
@@ -112,17 +92,17 @@ def write_submission(
         {**prediction_row(item), ASKED: asked[item.query_id]}
         for item in sorted(predictions, key=lambda item: item.query_id)
     ]
-    name = predictions_name(said.card.name)
+    name = predictions_name(submission.card.name)
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
             (scratch / PREDICTIONS).mkdir()
             table = pa.Table.from_pylist(rows, schema=RUN_SCHEMA)
             write_table(table, scratch / name, compression_level=_LEVEL, write_statistics=False)
             record = file_record(scratch / name)
-            _check_bytes(folder, record.bytes)
-            whole = said.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
+            _check_bytes(folder / name, record.bytes)
+            whole = submission.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
             text = json_text(whole.model_dump(mode="json"))
-            (scratch / SAID).write_text(text, encoding="utf-8")
+            (scratch / SUBMISSION).write_text(text, encoding="utf-8")
     except SasgeoError:
         raise
     except OSError as error:
@@ -131,28 +111,22 @@ def write_submission(
     return whole
 
 
-def _check_bytes(folder: Path, size: int) -> None:
+def _check_bytes(path: Path, size: int) -> None:
     if size > MOST_BYTES:
         message = (
-            f"{folder}: the predictions have {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer "
+            f"{path} has {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer "
             "candidates to each query (run --top-k)"
         )
         raise StoreError(message)
 
 
 def is_submission(folder: Path) -> bool:
-    """Whether a folder says that it is a submission.
-
-    Examples
-    --------
-    >>> is_submission(Path("nowhere"))
-    False
-    """
-    return os.path.lexists(folder / SAID)
+    """Return True if a folder holds a `submission.json`."""
+    return os.path.lexists(folder / SUBMISSION)
 
 
 def list_submissions(folder: Path) -> tuple[Path, ...]:
-    """A submission itself, or all that lie in a folder, by name; what is hidden, and its README, are none.
+    """Return a submission itself, or all in a folder by name, without hidden files and the README.
 
     Raises
     ------
@@ -167,40 +141,39 @@ def list_submissions(folder: Path) -> tuple[Path, ...]:
     found = tuple(path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.name != README)
     other = next((path for path in found if not is_submission(path)), None)
     if other is not None:
-        message = f"{other} is no submission, for it holds no {SAID}: remove it, or make it by 'submit'"
+        message = f"{other} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'"
         raise StoreError(message)
     return found
 
 
 def read_submission(folder: Path) -> Submission:
-    """What a submission says, after its folder was held against it.
+    """Read a submission after checking its folder.
 
     Raises
     ------
     StoreError
-        If a file is missing, unknown, a link, too large or not what its hash says, or holds no predictions.
+        If a file is missing, unknown, a link, too large, differs from its hash, or holds no predictions.
     ConfigError
-        If something that `submission.json` says is wrong; all faults on one line.
+        If a field of `submission.json` is wrong; all faults on one line.
     """
-    _check_names(folder, {SAID, PREDICTIONS})
-    said = _read_said(folder / SAID)
-    name = predictions_name(said.card.name)
-    if folder.resolve().name != said.card.name:
-        message = f"{folder} holds the submission {said.card.name!r}: name the folder so"
+    _check_names(folder, {SUBMISSION, PREDICTIONS})
+    submission = _read_document(folder / SUBMISSION)
+    name = predictions_name(submission.card.name)
+    if folder.resolve().name != submission.card.name:
+        message = f"{folder} holds the submission {submission.card.name!r}: name the folder so"
         raise StoreError(message)
-    if list(said.files) != [name]:
-        message = (
-            f"{folder / SAID} speaks of the files {', '.join(said.files) or 'none'}, expected {name}: submit again"
-        )
+    if list(submission.files) != [name]:
+        listed = ", ".join(submission.files) or "none"
+        message = f"{folder / SUBMISSION} lists the files {listed}, expected {name}: submit again"
         raise StoreError(message)
     _check_names(folder / PREDICTIONS, {Path(name).name})
-    _check_file(folder / name, said.files[name])
+    _check_file(folder / name, submission.files[name])
     _check_table(folder / name)
-    return said
+    return submission
 
 
 def _check_names(folder: Path, expected: set[str]) -> None:
-    """Refuse a folder that holds anything but what it must, and every link: it may lead anywhere."""
+    """Refuse a folder with other names than expected, and every link: it may lead anywhere."""
     if folder.is_symlink() or not folder.is_dir():
         message = f"{folder} is no folder of a submission: make it by 'submit'"
         raise StoreError(message)
@@ -218,13 +191,13 @@ def _check_names(folder: Path, expected: set[str]) -> None:
 
 
 def _is_plain(entry: os.DirEntry[str]) -> bool:
-    """Whether it is a file, or the folder of the predictions; a link, pipe or device is neither."""
+    """Return True for a file or the predictions folder, False for a link, pipe or device."""
     is_folder = entry.name == PREDICTIONS
     return entry.is_dir(follow_symlinks=False) if is_folder else entry.is_file(follow_symlinks=False)
 
 
-def _read_said(path: Path) -> Submission:
-    content = read_json(path, mend="submit again", most_bytes=_MOST_SAID_BYTES)
+def _read_document(path: Path) -> Submission:
+    content = read_json(path, mend="submit again", most_bytes=_MOST_SUBMISSION_BYTES)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         message = f"{path} has schema version {version!r}, this version reads {SCHEMA_VERSION}: submit again"
@@ -232,28 +205,23 @@ def _read_said(path: Path) -> Submission:
     return check_document(content, Submission, source=str(path))
 
 
-def _check_file(path: Path, said: FileSaid) -> None:
-    size = path.stat().st_size
-    if size > MOST_BYTES:
-        message = (
-            f"{path} has {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer candidates to each query"
-        )
-        raise StoreError(message)
+def _check_file(path: Path, expected: FileSaid) -> None:
+    _check_bytes(path, path.stat().st_size)
     found = file_record(path)
-    if (found.sha256, found.bytes) != (said.sha256, said.bytes):
+    if (found.sha256, found.bytes) != (expected.sha256, expected.bytes):
         message = (
-            f"{path} is not what {SAID} says: {found.bytes} bytes, SHA-256 {found.sha256}, "
-            f"expected {said.bytes} bytes, {said.sha256}: submit again"
+            f"{path} is not what {SUBMISSION} says: {found.bytes} bytes, SHA-256 {found.sha256}, "
+            f"expected {expected.bytes} bytes, {expected.sha256}: submit again"
         )
         raise StoreError(message)
 
 
 def _check_table(path: Path) -> None:
-    """Refuse a table of another shape, and one that unpacks to more than anyone has to say."""
+    """Refuse a table of another shape, and one that decompresses to overlong texts."""
     with open_table(path, mend="submit again") as source:
         _check_schema(path, source.schema_arrow)
     with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
-        texts = source.read(columns=list(_TEXTS))  # each text once, however often it stands there
+        texts = source.read(columns=list(_TEXTS))  # each distinct text once
     for name in _TEXTS:
         known = (text for chunk in texts[name].chunks for text in chunk.dictionary if text.is_valid)
         longest = max((len(text.as_buffer()) for text in known), default=0)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scored rows of some matchers -> the leaderboard: figures with intervals, denominators and ranks."""
+"""The leaderboard from scored rows: metrics with intervals, denominators and ranks."""
 
-import hashlib
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,19 +12,18 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Bools, Floats, Ints
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
 from sasgeo_bench.scoring.cost import Costs
-from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
+from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.intervals import Interval, bootstrap_means, effective_count, share_interval
 from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
-from sasgeo_bench.scoring.pose import error_quantile
 from sasgeo_bench.scoring.power import sensitivity
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, is_unranked, side_by_side, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
+from sasgeo_bench.scoring.steps import GROUP
 from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS, strata
 
-GROUP: Final = ("suite", "track", "prior_group")
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -33,26 +31,21 @@ def leaderboard(
     scored: Mapping[str, pd.DataFrame],
     *,
     draws: int = DRAWS,
-    apart: Collection[str] = (),
+    excluded: Collection[str] = (),
     done: Callable[[], None] = lambda: None,
 ) -> pd.DataFrame:
-    """Figures of every matcher on every suite, track, prior group and stratum.
+    """Return the metrics of every matcher on every suite, track, prior group and stratum, with the columns of `Row`.
 
     Parameters
     ----------
     scored : mapping of str to pandas.DataFrame
         By matcher, from `score.score_task`; all hold the same queries.
     draws : int
-        Of the bootstrap.
-    apart : collection of str
-        Matchers that have figures and no rank, and are nobody's rivals; controls are so in any case.
+        Number of bootstrap draws.
+    excluded : collection of str
+        Matchers without a rank, which are nobody's rivals; controls are always so.
     done : callable
         Called after each suite, track and prior group.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns as the fields of `Row`.
 
     Raises
     ------
@@ -60,12 +53,12 @@ def leaderboard(
         If two matchers were scored on different queries.
     """
     groups = _groups(_aligned(scored))
-    beside = frozenset({*apart, *filter(is_unranked, scored)})
-    return to_frame(side_by_side(lambda item: _rows_of_group(*item, draws, beside), groups, done))
+    unranked = frozenset({*excluded, *filter(is_unranked, scored)})
+    return to_frame(in_threads(lambda item: _rows_of_group(*item, draws, unranked), groups, done))
 
 
 def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """The frames with their rows in one order."""
+    """Return the frames with their rows in one order."""
     frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
     first = next(iter(frames.values()), None)
     for name, frame in frames.items():
@@ -76,7 +69,7 @@ def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 
 
 def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str, str], dict[str, pd.DataFrame]]]:
-    """Suite, track and prior group, with the rows of each matcher."""
+    """Yield suite, track and prior group, with the rows of each matcher."""
     if not frames:
         return
     first = next(iter(frames.values()))
@@ -90,14 +83,14 @@ def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str
 class _Group:
     """Queries of one suite, track and prior group as columns: shape (N,), or (N, M) for M matchers.
 
-    What is the same in every part of them is worked out once: values of metrics by name, errors by column, and codes
-    of blocks, places and sites in the order of their names.
+    It caches what all strata share: values of metrics by name, errors by column, and codes of blocks, places and sites
+    in the order of their names.
     """
 
     key: tuple[str, str, str]
     names: tuple[str, ...]
-    rivals: tuple[str, ...]  # those of them that are ranked
-    first: pd.DataFrame  # rows of any matcher: what they say of the queries is the same in all
+    rivals: tuple[str, ...]  # the ranked ones
+    first: pd.DataFrame  # rows of any matcher: query columns are the same for all
     blocks: Ints
     places: Ints
     sites: Ints
@@ -108,13 +101,12 @@ class _Group:
 
     @classmethod
     def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
-        """Columns of the rows of some matchers, of which some stand beside the ranks."""
+        """Return the columns of some matchers' rows; `unranked` matchers are no rivals."""
         first = next(iter(frames.values()))
         columns = dict.fromkeys(quantile.column for quantile in QUANTILES)
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
 
-        def beside(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
-            """A column of each matcher, side by side."""
+        def stacked(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
             return np.column_stack([np.asarray(column(frame)) for frame in frames.values()])
 
         return cls(
@@ -125,10 +117,10 @@ class _Group:
             blocks=codes[0],
             places=codes[1],
             sites=codes[2],
-            is_answered=beside(lambda frame: frame["is_answered"].to_numpy(bool)),
-            is_missing=beside(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
-            measured={metric.name: beside(metric.values) for metric in means_of(key[1])},
-            errors={name: beside(partial(_floats, name=name)) for name in columns},
+            is_answered=stacked(lambda frame: frame["is_answered"].to_numpy(bool)),
+            is_missing=stacked(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
+            measured={metric.name: stacked(metric.values) for metric in means_of(key[1])},
+            errors={name: stacked(partial(_floats, name=name)) for name in columns},
         )
 
 
@@ -138,7 +130,7 @@ def _floats(frame: pd.DataFrame, name: str) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Cell:
-    """Some queries of a group: `chosen` are their numbers in it."""
+    """Queries of a group: `chosen` are their positions in it."""
 
     group: _Group
     stratum: str
@@ -147,12 +139,11 @@ class _Cell:
 
     @property
     def seed(self) -> int:
-        """Of these queries alone, so that all matchers are drawn alike."""
-        text = "/".join((*self.group.key, self.stratum))
-        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+        """Return the seed, a function of the queries alone, so that all matchers share draws."""
+        return seed_of_text("/".join((*self.group.key, self.stratum)))
 
     def keys(self) -> list[RowKey]:
-        """Return what the rows of each matcher share."""
+        """Return the row key of each matcher."""
         suite, track, prior_group = self.group.key
         blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
         return [
@@ -173,7 +164,7 @@ class _Cell:
 
 
 def _rows_of_group(
-    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, beside: Collection[str]
+    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str]
 ) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
     for name, frame in frames.items():
@@ -181,7 +172,7 @@ def _rows_of_group(
             yield _not_applicable(name, key, frame)
     if not able:
         return
-    group = _Group.of(key, able, beside)
+    group = _Group.of(key, able, unranked)
     counted = {metric.name: metric.counts(group.first) for metric in means_of(key[1])}
     for stratum, inside in strata(group.first):
         by_count: dict[bytes, list[MeanMetric]] = {}
@@ -195,7 +186,7 @@ def _rows_of_group(
 
 
 def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -> Row:
-    """The one row of a matcher that cannot."""
+    """Return the only row of a matcher that cannot do the task."""
     suite, track, prior_group = key
     primary = primary_of(track)
     row_key = RowKey.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
@@ -203,7 +194,7 @@ def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -
 
 
 def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
-    """Means that share a denominator, by the same draws."""
+    """Yield rows of means that share a denominator and draws."""
     group, count = cell.group, len(cell.group.names)
     keys, sites = cell.keys(), group.sites[cell.chosen]
     trials = effective_count(sites)
@@ -225,9 +216,9 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Below:
-    """A quantile of the errors of one matcher (its number), and which errors lie below it.
+    """A quantile of the errors of one matcher (its index), and which errors lie below it.
 
-    Errors that equal it count in proportion, so that the mean is the quantile's share even where many are infinite.
+    Errors equal to it count in proportion, so that the mean is the quantile's share even where many are infinite.
     """
 
     matcher: int
@@ -237,30 +228,30 @@ class _Below:
 
 
 def _thresholds(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[_Below]:
-    """Quantiles of errors, whose intervals are those of the share below them, read backwards (Woodruff 1952)."""
+    """Yield quantiles of errors; their intervals invert those of the share below them (Woodruff 1952)."""
     is_pose = cell.group.key[1] == "localization" and any(metric.is_primary for metric in metrics)
     if not is_pose or cell.stratum not in _WHOLE:
         return
     for at in range(len(cell.group.names)):
         for quantile in QUANTILES:
             errors = cell.group.errors[quantile.column][cell.chosen, at]
-            value = error_quantile(errors, quantile.share)
+            value = weighted_quantile(errors, quantile.share)
             is_below, is_equal = errors < value, errors == value
             part = np.clip((quantile.share - is_below.mean()) / is_equal.mean(), 0.0, 1.0)
             yield _Below(matcher=at, quantile=quantile, value=value, is_below=is_below + part * is_equal)
 
 
 def _inverse(errors: Floats, share: float) -> float:
-    """Least error that a share of the queries does not exceed; 0 and infinity beyond the shares there are."""
+    """Return the least error that a share of the queries does not exceed; 0 and infinity beyond the range of shares."""
     if math.isnan(share):
         return math.nan
-    return error_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
+    return weighted_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
 
 
 def _ranked(
     cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, table: Floats, means: Floats, trials: float
 ) -> Iterator[Row]:
-    """Rows of one metric; of the primary one with ranks."""
+    """Yield the rows of one metric, with ranks for the primary one."""
     names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
     found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
     is_decidable = metric.is_primary and keys[0].blocks >= LEAST_BLOCKS
@@ -280,7 +271,7 @@ def _ranked(
 
 
 def _ranks(group: _Group, values: Sequence[float], means: Floats, metric: MeanMetric) -> dict[str, RankInterval]:
-    """Rank intervals of all rivals."""
+    """Return the rank intervals of all rivals."""
     chosen = [group.names.index(name) for name in group.rivals]
     if not chosen:
         return {}
@@ -289,12 +280,12 @@ def _ranks(group: _Group, values: Sequence[float], means: Floats, metric: MeanMe
 
 
 def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
-    """Least difference from the best other rival that would be found."""
+    """Return the detectable difference from the best other rival."""
     others = [group.names.index(other) for other in group.rivals if other != name]
     if not others or name not in group.rivals:
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
-    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks).detectable
+    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks)
 
 
 def cost_rows(matcher: str, costs: Costs) -> Iterator[Row]:

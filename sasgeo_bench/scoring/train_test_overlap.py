@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rows of a board are set apart: those of a method that a place has taught which it is asked about."""
+"""Overlap of training and test places: rows of a method that was trained on the place it is tested on."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -13,47 +13,34 @@ from sasgeo_bench.tasks.split import Split
 
 
 def set_apart(entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None) -> dict[str, str]:
-    """Say why rows are set apart, by contestant; who is not set apart is not in it.
+    """Return by entry why its rows are excluded from ranks; other entries are missing.
 
-    The rule: a row is set apart where answers about a place come from what that place has taught. Controls and
-    yardsticks are beside the ranks anyway.
-
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Who is scored.
-    scores : mapping of str to pandas.DataFrame
-        By contestant, columns suite, region and place of every query it was asked.
-    split : Split, optional
-        Says the half of each place.
-
-    Examples
-    --------
-    >>> set_apart([], {}, None)
-    {}
+    Rows are excluded if the answers about a place come from training on that place. Controls are unranked anyway.
+    `scores` has the columns suite, region and place of every query the entry was asked; `split` assigns the half of
+    each place.
     """
     found = {}
     for entry in entries:
-        places = [] if is_unranked(entry.name) else sorted(set(_taught_and_asked(entry, scores[entry.name], split)))
+        places = [] if is_unranked(entry.name) else sorted(set(_overlaps(entry, scores[entry.name], split)))
         if places:
             what = places[0] if len(places) == 1 else named(places, "place")
             found[entry.name] = f"trained on {what}, which it is tested on"
     return found
 
 
-def _taught_and_asked(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterator[str]:
-    """Places that have taught the very answers about them."""
+def _overlaps(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterator[str]:
+    """Yield places that the answers about them were trained on."""
     for place in dict.fromkeys(scores["place"]):
         if place in _declared(entry, str(place), split):
             yield str(place)
     for about in entry.runs:
-        said = LearnedSaid.of(about)
+        learned = LearnedSaid.of(about)
         is_mine = (scores["suite"] == about["suite"]) & (scores["region"] == about["region"])
-        yield from set() if said is None else set(scores.loc[is_mine, "place"]) & set(said.trained_on)
+        yield from set() if learned is None else set(scores.loc[is_mine, "place"]) & set(learned.trained_on)
 
 
 def _declared(entry: Entry, place: str, split: Split | None) -> Sequence[str]:
-    """Places that are said to have taught the answers about a place."""
+    """Return the declared training places of the answers about a place."""
     if entry.submission is None:
         return entry.declared or ()
     return entry.submission.card.taught(None if split is None else split.half_of.get(place))

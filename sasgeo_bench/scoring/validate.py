@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions held against the tasks they answer: every violation by row and column, found and expected."""
+"""Validation of predictions against the tasks they answer: every violation with row, column, found and expected."""
 
 import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import differing_columns, prediction_of, row_faults
-from sasgeo_bench.scoring.submission_files import SAID, predictions_name
+from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.tasks.task_rows import ASKED
@@ -28,9 +28,9 @@ _ANSWERED: Final = "ok"
 _NO_ROW: Final = "no row for "
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Violation:
-    """One fault: the file, the row's number in it (from 0; -1 for the whole file), the column, found and expected."""
+    """One fault: file, row index (-1 for the whole file), column, found and expected."""
 
     file: str
     row: int
@@ -40,11 +40,11 @@ class Violation:
 
     @property
     def is_missing_row(self) -> bool:
-        """Whether it says that a query has no row."""
+        """Return True if the fault is a query without a row."""
         return self.found.startswith(_NO_ROW)
 
     def to_text(self) -> str:
-        """One line.
+        """Return the fault in one line.
 
         Examples
         --------
@@ -56,20 +56,10 @@ class Violation:
 
 
 def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
-    """Hold predictions against tasks.
+    """Yield the violations of predictions in the order of the rows, queries without a row last.
 
-    Parameters
-    ----------
-    path : Path
-        A predictions file, or a run's folder of parts, newest first; there a query may have been asked again.
-    tasks : sequence of Path
-        Task folders that it should answer, and no others; rows of a run's folder that say they answer something else
-        are passed over (`set_aside` counts them).
-
-    Yields
-    ------
-    Violation
-        In the order of the rows; queries without a row come last, unless a file could not be read by its columns.
+    `path` is a predictions file, or a run's folder of parts, where a newer row replaces an older one. It should answer
+    the tasks and no others. Rows of a run's folder that state other queries are skipped (`set_aside` counts them).
 
     Raises
     ------
@@ -88,13 +78,13 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
         parent: prediction_files.asked_in(parent, asked) for parent in {file.parent for file in files} if path.is_dir()
     }
     unread = 0
-    # In a run's folder a query stands twice where it was asked again: the newer row counts.
+    # In a run's folder a query that was asked again has two rows: the newer one counts.
     for file in reversed(files):
         before = frozenset(seen) if path.is_dir() else frozenset()
         table = prediction_files.read_part(file)
         differing = differing_columns(table)
         for column, found, expected in differing:
-            yield Violation(file=file.name, row=-1, column=column, found=found, expected=f"a column of {expected}")
+            yield Violation(file.name, -1, column, found, f"a column of {expected}")
         unread += bool(differing)
         wrong = {} if differing else _faults_by_row(file.name, table)
         for row, item in enumerate([] if differing else table.to_pylist()):
@@ -106,47 +96,30 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def submission_faults(
-    folder: Path, said: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
+    folder: Path, submission: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
 ) -> Iterator[Violation]:
-    """Hold a submission against the tasks of a board; its folder and hashes are `read_submission`'s business.
+    """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the submission.
-    said : Submission
-        From `read_submission`.
-    tasks : sequence of Path, optional
-        Task folders of the board; those that the submission does not name are passed over. Without any, the rows are
-        held against nothing.
-    board : str
-        Id of the board; empty where nobody says it.
-    places : collection of str
-        Of the board's split; without any, what the card says of training is not looked at.
-
-    Yields
-    ------
-    Violation
-        Faults of what it says, then of its rows; last, as of a file, the queries without a row, which are misses.
+    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `board` is the board's id,
+    empty if unknown. `places` are those of its split; if empty, declared training places are not checked. Files and
+    hashes are checked by `read_submission`.
 
     Raises
     ------
     StoreError
         If a file cannot be read, or a task is of another version.
     """
-    yield from _said_faults(said, board, places)
-    if tasks is None or said.task_version not in TASK_VERSIONS:
+    yield from _card_faults(submission, board, places)
+    if tasks is None or submission.task_version not in TASK_VERSIONS:
         return
-    named = {(item.suite, item.region) for item in said.tasks}
+    named = {(item.suite, item.region) for item in submission.tasks}
     mine = [task for task in tasks if _name_of(task) in named]
     lost = sorted(named - {_name_of(task) for task in mine})
     for suite, region in lost:
-        yield Violation(
-            file=SAID, row=-1, column="tasks", found=f"{suite}/{region}", expected="tasks that the board holds"
-        )
+        yield Violation(SUBMISSION, -1, "tasks", f"{suite}/{region}", "tasks that the board holds")
     queries, asked = _asked_of(mine), _asked(mine)
     seen: dict[str, str] = {}
-    file = folder / predictions_name(said.card.name)
+    file = folder / predictions_name(submission.card.name)
     table = prediction_files.read_part(file)
     wrong = _faults_by_row(file.name, table)
     for row, item in enumerate(table.to_pylist()):
@@ -154,46 +127,38 @@ def submission_faults(
         yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
         if name in asked and item[ASKED] != asked[name]:
             yield Violation(
-                file=file.name,
-                row=row,
-                column=ASKED,
-                found=f"an answer to query {name} as it was drawn otherwise",
-                expected=f"{asked[name]}, for answers belong to queries: run and submit again",
+                file.name,
+                row,
+                ASKED,
+                f"an answer to query {name} as it was drawn otherwise",
+                f"{asked[name]}: run and submit again",
             )
     yield from _missing(file.name, queries, seen)
 
 
-def _said_faults(said: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
-    """What a submission says of itself that does not fit a board."""
-    if said.task_version not in TASK_VERSIONS:
+def _card_faults(submission: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
+    """Yield the fields of a submission that do not fit a board."""
+    if submission.task_version not in TASK_VERSIONS:
         yield Violation(
-            file=SAID,
-            row=-1,
-            column="task_version",
-            found=str(said.task_version),
-            expected=f"{TASK_VERSION}: run and submit again",
+            SUBMISSION, -1, "task_version", str(submission.task_version), f"{TASK_VERSION}: run and submit again"
         )
-    if board and said.board != board:
-        yield Violation(file=SAID, row=-1, column="board", found=repr(said.board), expected=repr(board))
-    for place in said.card.places if places else ():
+    if board and submission.board != board:
+        yield Violation(SUBMISSION, -1, "board", repr(submission.board), repr(board))
+    for place in submission.card.places if places else ():
         if place not in places:
             near = difflib.get_close_matches(place, places, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else ": what else taught it goes into trained_elsewhere"
-            yield Violation(
-                file=SAID, row=-1, column="trained_on", found=repr(place), expected=f"places of the split{hint}"
-            )
+            hint = f", did you mean {near[0]!r}?" if near else ": other training data belongs into trained_elsewhere"
+            yield Violation(SUBMISSION, -1, "trained_on", repr(place), f"places of the split{hint}")
 
 
 def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iterator[Violation]:
     for name in queries:
         if name not in seen:
-            yield Violation(
-                file=file, row=-1, column="query_id", found=f"{_NO_ROW}{name}", expected="one for every query"
-            )
+            yield Violation(file, -1, "query_id", f"{_NO_ROW}{name}", "one for every query")
 
 
 def set_aside(path: Path, tasks: Sequence[Path]) -> int:
-    """How many answers of a run's folder are to queries that the tasks do not hold, or do not hold as they were.
+    """Return how many answers of a run's folder are to queries that the tasks do not hold in this form.
 
     Raises
     ------
@@ -213,7 +178,7 @@ def set_aside(path: Path, tasks: Sequence[Path]) -> int:
 
 
 def _asked(tasks: Sequence[Path]) -> dict[str, str]:
-    return {name: said for task in tasks for name, said in task_files.read_asked(task).items()}
+    return {name: digest for task in tasks for name, digest in task_files.read_asked(task).items()}
 
 
 def _name_of(task: Path) -> tuple[str, str]:
@@ -223,7 +188,7 @@ def _name_of(task: Path) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Asked:
-    """A query, and where its answers may lie; None for retrieval, which says it by candidates, or without a map."""
+    """A query and the bounds of its answers; None for retrieval, which is checked by candidates, or without a map."""
 
     head: Head
     bounds_m: Bounds | None
@@ -234,7 +199,7 @@ def _asked_of(tasks: Sequence[Path]) -> dict[str, _Asked]:
 
 
 def _queries(task: Path) -> Iterator[_Asked]:
-    """Queries of a task that this program can read; what was seen is no matter, and stored results hold none of it."""
+    """Yield the queries of a task; views are not read, since stored results lack them."""
     _, region = _name_of(task)
     bounds_m = _bounds_m(task.resolve().parents[2] / "regions" / region)
     by_group: dict[str, Bounds] = {}
@@ -246,7 +211,7 @@ def _queries(task: Path) -> Iterator[_Asked]:
 
 
 def _bounds_m(region: Path) -> Bounds | None:
-    """Where a region lies; None where its map is not beside the tasks."""
+    """Return the bounds of a region; None if its map is missing."""
     try:
         return read_manifest(region).bounds_m
     except StoreError:
@@ -254,17 +219,17 @@ def _bounds_m(region: Path) -> Bounds | None:
 
 
 def _reach_m(bounds_m: Bounds, group: PriorGroup) -> Bounds:
-    """The region, and what a disc of a prior can hold beyond its rim: at most its diameter."""
+    """Return the bounds of a region, extended by the diameter of the prior's disc."""
     more_m = 2 * (group.radius_m or 0.0)
     west, south, east, north = bounds_m
     return west - more_m, south - more_m, east + more_m, north + more_m
 
 
 def _faults_by_row(file: str, table: pa.Table) -> dict[int, list[Violation]]:
-    """Numbers, names and texts out of their bounds."""
+    """Return numbers, names and texts out of their bounds, by row."""
     found: dict[int, list[Violation]] = {}
     for one in row_faults(table):
-        wrong = Violation(file=file, row=one.row, column=one.column, found=one.found, expected=one.expected)
+        wrong = Violation(file, one.row, one.column, one.found, one.expected)
         found.setdefault(one.row, []).append(wrong)
     return found
 
@@ -279,14 +244,10 @@ def _row_faults(
 ) -> Iterator[Violation]:
     name = item["query_id"]
     if name not in queries:
-        yield Violation(
-            file=file, row=row, column="query_id", found=repr(name), expected="the id of a query of the tasks"
-        )
+        yield Violation(file, row, "query_id", repr(name), "the id of a query of the tasks")
         return
     if name in seen:
-        yield Violation(
-            file=file, row=row, column="query_id", found=f"{name} again ({seen[name]})", expected="each query once"
-        )
+        yield Violation(file, row, "query_id", f"{name} again ({seen[name]})", "each query once")
         return
     seen[name] = f"{file}, row {row}"
     if wrong:
@@ -295,19 +256,13 @@ def _row_faults(
     if item["status"] != _ANSWERED:
         if item["candidates"]:
             count = len(item["candidates"])
-            yield Violation(
-                file=file,
-                row=row,
-                column="candidates",
-                found=counted(count, "pose"),
-                expected=f"none with {item['status']}",
-            )
+            yield Violation(file, row, "candidates", counted(count, "pose"), f"none with {item['status']}")
         return
     yield from _answer_faults(file, row, item, queries[name])
 
 
 def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) -> Iterator[Violation]:
-    """What is wrong with the answer itself."""
+    """Yield the faults of the answer itself."""
     try:
         prediction = prediction_of(item)
         match = Match(
@@ -320,11 +275,11 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) 
         _check_inside(match.poses, query)
     except MatchError as error:
         found, _, expected = str(error).partition(", expected ")
-        yield Violation(file=file, row=row, column="candidates", found=found, expected=expected or "an answer")
+        yield Violation(file, row, "candidates", found, expected or "an answer")
 
 
 def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:
-    """Refuse a place neither in the region nor where a prior's disc may reach: it is of another map or CRS."""
+    """Refuse a position outside the region and the reach of the prior's disc: another map or CRS."""
     if query.bounds_m is None:
         return
     west, south, east, north = query.bounds_m

@@ -28,7 +28,7 @@ from sasgeo_bench.sasgeo.protection import level_name
 from sasgeo_bench.scoring.calibration import calibration_error
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
 from sasgeo_bench.scoring.metrics import primary_of
-from sasgeo_bench.scoring.protection import protection_frame, told_levels
+from sasgeo_bench.scoring.protection import protection_frame, protection_levels
 from sasgeo_bench.scoring.rejection import answers_of
 from sasgeo_bench.scoring.steps import queries_of, steps_frame
 from sasgeo_bench.scoring.tables import leaderboard
@@ -223,7 +223,7 @@ def test_a_curve_ends_where_all_answers_are_accepted_and_mixtures_are_of_all_sui
 
 def test_areas_of_a_stanford_figure_are_those_of_the_board(board):
     answers, table = board.predictions["graph"], board.scores["graph"]
-    (told,) = told_levels(table, answers)
+    (told,) = protection_levels(table, answers)
     areas = stanford_areas(told, 25.0)
     assert sum(areas.values()) == stanford_cells(told)["n"].sum() == COUNT
     frame = protection_frame("graph", table, answers)

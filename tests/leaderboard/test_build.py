@@ -585,7 +585,7 @@ def test_two_files_of_one_name_are_refused(out, tmp_path):
         submission(out, tmp_path / name / "mine.parquet")
     with pytest.raises(ConfigError, match="name the file by letters"):
         find_entries([shutil.copy(tmp_path / "a" / "mine.parquet", tmp_path / "a|b.parquet")])
-    with pytest.raises(ConfigError, match="two contestants are named 'mine'"):
+    with pytest.raises(ConfigError, match="two entries are named 'mine'"):
         find_entries([tmp_path / "a" / "mine.parquet", tmp_path / "b" / "mine.parquet"])
 
 

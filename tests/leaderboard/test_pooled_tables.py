@@ -21,7 +21,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.integrity import integrity_rows
-from sasgeo_bench.scoring.rejection import own_word
+from sasgeo_bench.scoring.rejection import own_confidence
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks.query import Truth
@@ -115,7 +115,7 @@ def test_a_curve_of_errors_passes_through_the_figure_of_the_board_and_ends_below
 def test_a_curve_of_costs_passes_through_the_figures_of_the_board():
     frame = answered(np.where(AT % 3 == 0, 300.0, 4.0)).assign(is_right=AT % 3 > 0)
     frame = frame.assign(confidence=np.where(AT % 3, 0.97, 0.4), is_answered=True)
-    judged = {("one", "own"): own_word(frame)}
+    judged = {("one", "own"): own_confidence(frame)}
     board = to_frame(list(integrity_rows("one", "own", judged["one", "own"])))
     rows = cost_frame(judged, {("one", "own")}, ["one"])
     for ratio in COST_RATIOS:

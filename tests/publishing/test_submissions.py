@@ -573,4 +573,4 @@ def test_one_command_scores_stored_results_and_submissions(copied, stored, progr
 def test_two_contestants_of_one_name_are_refused(copied, stored, tmp_path, rows, mistake):
     path = write_rows(tmp_path / "mine.parquet", rows)
     words = ("score", "--predictions", stored, "--predictions", path, "--submissions", copied)
-    assert "two contestants are named 'mine'" in mistake(*words)
+    assert "two entries are named 'mine'" in mistake(*words)

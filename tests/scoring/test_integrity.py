@@ -11,8 +11,8 @@ from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.integrity import integrity_rows
 from sasgeo_bench.scoring.integrity_metric import aurc
-from sasgeo_bench.scoring.intervals import statistic_interval, wilson
-from sasgeo_bench.scoring.rejection import OWN, answers_of, own_word, turns, why_not
+from sasgeo_bench.scoring.intervals import bootstrap_statistic, percentile_interval, wilson
+from sasgeo_bench.scoring.rejection import OWN, answers_of, own_confidence, turns, why_not
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.tasks.split import SplitFile, make_split
 from tests.scoring.test_tables import scores
@@ -21,7 +21,7 @@ ERRORS = np.where(np.arange(120) % 3 > 0, 1.0, 99.0)  # two of three are right
 
 
 def rows_of(table, split=None):
-    return to_frame(list(integrity_rows("mine", OWN, own_word(table, split))))
+    return to_frame(list(integrity_rows("mine", OWN, own_confidence(table, split))))
 
 
 def pooled(table, split=None):
@@ -57,13 +57,13 @@ def test_the_own_word_of_a_matcher_needs_no_split():
 
 
 def test_its_intervals_are_those_of_any_figure():
-    table = own_word(scores(ERRORS, confidence=np.random.default_rng(1).random(120)))
+    table = own_confidence(scores(ERRORS, confidence=np.random.default_rng(1).random(120)))
     found = pooled(table.drop(columns="p_right"))["aurc"]
     rows = rows_of(table)
     assert (rows[(rows["suite"] == "all suites") & (rows["metric"] == "aurc")]["value"] == found["value"]).all()
     some = answers_of(table)
     drawn = ClusterDraws(blocks=table["block"].tolist(), seed=1, draws=1000)
-    slow = statistic_interval(lambda mass: aurc(some, mass), drawn)
+    slow = percentile_interval(aurc(some), bootstrap_statistic(lambda mass: aurc(some, mass), drawn))
     assert (found["lo"], found["hi"]) == pytest.approx((slow.lo, slow.hi), abs=0.02)
 
 
@@ -76,7 +76,7 @@ def test_equal_confidences_are_worth_as_much_as_chance():
 
 
 def test_a_matcher_that_says_nothing_has_no_own_word():
-    assert own_word(scores(ERRORS)).empty
+    assert own_confidence(scores(ERRORS)).empty
     assert rows_of(scores(ERRORS)).empty
     assert rows_of(scores(ERRORS), split_of("crossfit")).empty
 
@@ -172,7 +172,7 @@ def test_without_an_answer_a_query_is_false_at_full_coverage_and_no_part_of_cali
 
 
 def test_an_order_that_is_no_probability_has_no_figures_that_judge_one():
-    judged = own_word(scores(ERRORS, confidence=np.where(ERRORS < 25, 0.75, 0.25)))
+    judged = own_confidence(scores(ERRORS, confidence=np.where(ERRORS < 25, 0.75, 0.25)))
     told, bare = (
         {row.metric for row in integrity_rows("mine", "margin", judged, is_calibrated=is_calibrated)}
         for is_calibrated in (True, False)

@@ -11,20 +11,16 @@ from scipy.stats import binomtest, bootstrap
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring import draws
-from sasgeo_bench.scoring.decisions import Answers
 from sasgeo_bench.scoring.draws import ClusterDraws
-from sasgeo_bench.scoring.integrity_metric import aurc
 from sasgeo_bench.scoring.intervals import (
     Interval,
     bootstrap_means,
     bootstrap_statistic,
     difference_interval,
     effective_count,
-    mean_difference,
     mean_interval,
     percentile_interval,
     share_interval,
-    statistic_interval,
     wilson,
     wilson_mean,
 )
@@ -179,11 +175,11 @@ def test_two_methods_share_their_draws() -> None:
     np.testing.assert_allclose(bootstrap_means(ours, drawn) - bootstrap_means(theirs, drawn), apart)
     side_by_side = bootstrap_means(np.column_stack((ours, theirs)), drawn)
     np.testing.assert_allclose(side_by_side[:, 0] - side_by_side[:, 1], apart)
-    found = mean_difference(ours, theirs, drawn)
+    found = mean_interval(ours - theirs, drawn)
     assert (found.lo, found.hi) == tuple(np.quantile(apart, [0.025, 0.975], method="inverted_cdf"))
-    assert mean_difference(ours, ours, drawn) == Interval(value=0.0, lo=0.0, hi=0.0)
+    assert mean_interval(ours - ours, drawn) == Interval(value=0.0, lo=0.0, hi=0.0)
     # A difference that holds for every query is seen however much the queries vary.
-    assert mean_difference(ours + 0.01, ours, drawn).lo == pytest.approx(0.01)
+    assert mean_interval(ours + 0.01 - ours, drawn).lo == pytest.approx(0.01)
 
 
 def test_with_a_block_for_each_query_the_interval_is_that_of_scipy() -> None:
@@ -229,29 +225,13 @@ def test_draws_without_a_query_that_counts_are_left_out() -> None:
     assert math.isnan(percentile_interval(1.0, [math.nan]).lo)
 
 
-def test_any_figure_can_have_an_interval() -> None:
-    rng = np.random.default_rng(9)
-    count = 120
-    right, confidence = rng.random(count) < 0.7, rng.random(count)
-    answers = Answers(
-        confidence=confidence, is_answered=np.ones(count), is_right=right, is_present=np.ones(count, dtype=bool)
-    )
-    sure = Answers(confidence=right + 0.0, is_answered=np.ones(count), is_right=right, is_present=np.ones(count))
-    drawn = ClusterDraws(blocks=[f"{at % 10}" for at in range(count)], seed=1, draws=300)
-    found = statistic_interval(lambda weights: aurc(answers, weights), drawn)
-    assert found.value == aurc(answers)
-    assert 0.0 < found.lo < found.value < found.hi < 1.0
-    apart = statistic_interval(lambda weights: aurc(answers, weights) - aurc(sure, weights), drawn)
-    assert 0.0 < apart.lo < apart.value == pytest.approx(aurc(answers) - aurc(sure))
-
-
 def test_what_cannot_be_is_refused() -> None:
     drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=5)
     for values in ([1.0], [1.0, math.inf], [1.0, math.nan], 1.0, [[[1.0]], [[1.0]]]):
         with pytest.raises(MetricError, match="finite"):
             bootstrap_means(values, drawn)
     with pytest.raises(MetricError, match="shape"):
-        mean_difference([1.0, 0.0], [1.0], drawn)
+        mean_interval([1.0], drawn)
     with pytest.raises(MetricError, match="draws"):
         ClusterDraws(blocks=["a"], seed=1, draws=0)
     with pytest.raises(MetricError, match="weights"):

@@ -14,11 +14,10 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.base import weighted_mean
+from sasgeo_bench.scoring.base import weighted_mean, weighted_quantile
 from sasgeo_bench.scoring.pose import (
     PoseErrors,
     area_values,
-    error_quantile,
     first_pose,
     pose_errors,
     rank_pose,
@@ -85,13 +84,13 @@ def test_a_query_without_an_answer_stays_in_every_denominator() -> None:
     errors = only_position([1.0, 2.0, math.inf, math.inf])
     assert success_rate(errors, 5.0) == 0.5
     assert success_auc(errors) == pytest.approx((0.98 + 0.96) / 4)
-    assert error_quantile(errors.position_m, 0.5) == 2.0
-    assert error_quantile(errors.position_m, 0.9) == math.inf
+    assert weighted_quantile(errors.position_m, 0.5) == 2.0
+    assert weighted_quantile(errors.position_m, 0.9) == math.inf
 
 
 def test_large_errors_are_neither_clipped_nor_dropped() -> None:
-    assert error_quantile([1.0, 2.0, 1e6], 0.99) == 1e6
-    assert error_quantile([math.inf] * 3, 0.5) == math.inf
+    assert weighted_quantile([1.0, 2.0, 1e6], 0.99) == 1e6
+    assert weighted_quantile([math.inf] * 3, 0.5) == math.inf
 
 
 @given(errors_m=ERRORS_M)
@@ -112,7 +111,7 @@ def test_success_is_monotone_in_the_tolerance(errors_m) -> None:
     errors = only_position(errors_m)
     rates = [success_rate(errors, within_m) for within_m in (0.0, 5.0, 10.0, 25.0, 200.0)]
     assert rates == sorted(rates)
-    quantiles = [error_quantile(errors_m, share) for share in (0.5, 0.9, 0.99)]
+    quantiles = [weighted_quantile(errors_m, share) for share in (0.5, 0.9, 0.99)]
     assert quantiles == sorted(quantiles)
 
 
@@ -126,7 +125,7 @@ def test_no_queries_have_no_success() -> None:
     nothing = pose_errors([], [])
     assert math.isnan(success_rate(nothing, 5.0))
     assert math.isnan(success_auc(nothing))
-    assert math.isnan(error_quantile(nothing.position_m, 0.5))
+    assert math.isnan(weighted_quantile(nothing.position_m, 0.5))
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import f_oneway
+from scipy.stats import f_oneway, norm
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.compare import mcnemar_exact
@@ -15,27 +15,23 @@ from sasgeo_bench.scoring.power import (
     design_effect,
     detectable_difference,
     intraclass_correlation,
-    pairs_needed,
     sensitivity,
 )
 
 
 def test_the_figures_of_the_design() -> None:
     # Three points with 6 % discordant pairs need 521 pairs; 50 a block with correlation 0.05 multiply by 3.45.
-    assert pairs_needed(0.03, 0.06) == 521
     assert design_effect([50] * 36, 0.05) == pytest.approx(3.45)
     assert 521 * 3.45 < 36 * 50
     assert detectable_difference(36 * 50 / 3.45, 0.06) == pytest.approx(0.03, abs=3e-5)
 
 
 @given(share=st.floats(0.01, 1.0), part=st.floats(0.05, 1.0), power=st.sampled_from([0.5, 0.8, 0.95]))
-def test_the_detectable_difference_is_the_inverse_of_the_pairs_needed(share, part, power) -> None:
+def test_the_detectable_difference_solves_the_equation_of_connor(share, part, power) -> None:
     difference = share * part
-    pairs = pairs_needed(difference, share, power=power)
-    found = detectable_difference(pairs, share, power=power)
-    assert found <= difference * (1 + 1e-9)
-    if pairs > 1 and math.isfinite(fewer := detectable_difference(pairs - 1, share, power=power)):
-        assert fewer >= difference * (1 - 1e-9)
+    root = norm.isf(0.025) * math.sqrt(share) + norm.ppf(power) * math.sqrt(share - difference**2)
+    pairs = (root / difference) ** 2
+    assert detectable_difference(pairs * (1 + 1e-9), share, power=power) == pytest.approx(difference, rel=1e-6)
 
 
 def test_the_power_is_what_a_trial_finds() -> None:
@@ -92,28 +88,24 @@ def test_what_a_suite_can_tell() -> None:
     # 36 blocks of 50; 6 % discordant, two of three for the first, spread evenly: no correlation to speak of.
     lot = np.random.default_rng(4).permutation(1800)
     blocks = [str(at // 50) for at in range(1800)]
-    found = sensitivity(lot < 72, (lot >= 72) & (lot < 108), blocks)
-    assert (found.queries, found.blocks) == (1800, 36)
-    assert found.discordant_share == pytest.approx(0.06)
-    assert abs(found.correlation) < 0.03
-    assert found.detectable == pytest.approx(detectable_difference(1800 / found.design_effect, 0.06))
-    # The same disagreements heaped into a few blocks tell less.
-    heaped = sensitivity(np.arange(1800) < 72, (np.arange(1800) >= 72) & (np.arange(1800) < 108), blocks)
-    assert heaped.correlation > 0.3
-    assert heaped.detectable > 2 * found.detectable
+    first, second = lot < 72, (lot >= 72) & (lot < 108)
+    correlation = intraclass_correlation(first.astype(float) - second, blocks)
+    assert abs(correlation) < 0.03
+    found = sensitivity(first, second, blocks)
+    effect = design_effect([50] * 36, correlation)
+    assert found == pytest.approx(detectable_difference(1800 / effect, 0.06))
+    # The same disagreements in few blocks detect less.
+    at = np.arange(1800)
+    assert sensitivity(at < 72, (at >= 72) & (at < 108), blocks) > 2 * found
 
 
 def test_two_methods_that_never_disagree_cannot_be_told_apart() -> None:
-    found = sensitivity([1, 0, 1, 0], [1, 0, 1, 0], list("aabb"))
-    assert (found.discordant_share, found.design_effect, found.detectable) == (0.0, 1.0, math.inf)
-    assert math.isnan(found.correlation)
+    assert sensitivity([1, 0, 1, 0], [1, 0, 1, 0], list("aabb")) == math.inf
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(MetricError, match="difference"):
-        pairs_needed(0.1, 0.06)
     with pytest.raises(MetricError, match="power"):
-        pairs_needed(0.03, 0.06, power=0.4)
+        detectable_difference(10, 0.5, power=0.4)
     with pytest.raises(MetricError, match="alpha"):
         detectable_difference(10, 0.5, alpha=0.0)
     with pytest.raises(MetricError, match="discordant share"):

@@ -19,8 +19,8 @@ from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.integrity import integrity_rows
 from sasgeo_bench.scoring.intervals import wilson
-from sasgeo_bench.scoring.rejection import own_word
-from sasgeo_bench.scoring.rows import COLUMNS, Contestant, to_frame, with_contestants
+from sasgeo_bench.scoring.rejection import own_confidence
+from sasgeo_bench.scoring.rows import COLUMNS, EntryLabel, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
 from sasgeo_bench.scoring.tables import cost_rows, leaderboard
@@ -209,7 +209,7 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
     chance = np.random.default_rng(3)
     best, good, bad = (np.where(chance.random(600) < share, 1.0, 99.0) for share in (0.95, 0.8, 0.2))
     tables = {name: scores(errors, blocks=60) for name, errors in (("best", best), ("good", good), ("bad", bad))}
-    board = leaderboard(tables, draws=1000, apart={"best"})
+    board = leaderboard(tables, draws=1000, excluded={"best"})
     alone = leaderboard({name: tables[name] for name in ("good", "bad")}, draws=1000)
     row = pick(board, "best", "success_25m")
     assert ranks(row) == (None, None)
@@ -219,8 +219,8 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
         mine, before = (pick(table, name, "success_25m") for table in (board, alone))
         assert ranks(mine) == ranks(before)
         assert mine["detectable"] == before["detectable"]
-    said = {name: Contestant("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
-    first, apart = tables_of(with_contestants(board, said), {})
+    said = {name: EntryLabel("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
+    first, apart = tables_of(with_entry_labels(board, said), {})
     assert set(column_of(first, "matcher")) == {"good (as submitted)", "bad (as submitted)"}
     assert column_of(apart, "matcher") == ["best (as submitted) (set apart)"]
     assert apart.notes == ("best: for a reason.",)
@@ -347,7 +347,7 @@ def test_the_board_says_what_each_of_its_columns_is():
     tables["mine"]["is_right"] &= tables["mine"]["is_present"]
     views = dict.fromkeys(tables["mine"]["query_id"], 1)
     rows = [*cost_rows("mine", Costs(scores=tables["mine"], runs=[], view_bytes=views, area_km2={}))]
-    rows += integrity_rows("mine", "own", own_word(tables["mine"]))
+    rows += integrity_rows("mine", "own", own_confidence(tables["mine"]))
     board = pd.concat([leaderboard(tables, draws=200), to_frame(rows)], ignore_index=True)
     text = board_markdown(board, ABOUT).split("## How to read")[1]
     terms = {line.split("**")[1] for line in text.splitlines() if line}

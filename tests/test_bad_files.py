@@ -248,7 +248,7 @@ def read_states(file: str) -> Callable[[Path], object]:
 
 PACK = [
     *("pack.json", "board.json", "tasks.parquet", "runs.parquet", "queries.parquet", "truths.parquet"),
-    "predictions/mine-0123456789ab.parquet",
+    "predictions.parquet",
 ]
 FORMATS = {
     "region.toml": Format(

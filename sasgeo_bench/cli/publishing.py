@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import say, tell
+from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.publishing import build
 from sasgeo_bench.publishing.archive import board_of
@@ -28,6 +28,7 @@ class PublishOptions(Options):
             "repeated"
         ),
     ] = None
+    jobs: Annotated[int, typer.Option(min=1, help="processes that score stored results")] = 1
     out: Out = Path("out")
 
 
@@ -59,12 +60,17 @@ name another one with --into
     board = options.board
     if options.submissions:
         board = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
-        with_submissions(options.board, options.submissions, board, tell=options.tell)
-    return build.publish(board, options.into, tell=options.tell)
+        with_submissions(
+            options.board, options.submissions, board, tell=options.tell, root=options.out, jobs=options.jobs
+        )
+    return build.publish(
+        board, options.into, tell=options.tell, root=options.out, jobs=options.jobs, progress=options.progress
+    )
 
 
 def publish_command(options: PublishOptions) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
-    written = publish(**vars(options) | {"say": say, "tell": tell})
+    with shown_progress() as progress:
+        written = publish(**vars(options) | {"say": say, "tell": tell, "progress": progress})
     tell(written.to_text())
     say(written.folder / "index.html")

@@ -63,7 +63,7 @@ class PackSaid(_Said):
 
     model_config = ConfigDict(extra="forbid")
 
-    schema_version: Literal[1, 2]
+    schema_version: Literal[1, 2, 3]
     split: Plain | None
     rejectors: list[str]
     contrasts: list[ContrastSaid]

@@ -18,7 +18,6 @@ from sasgeo_bench.files.file_manifest import (
     SITE_FOLDERS,
     check_known,
     check_site,
-    list_files,
 )
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
@@ -209,26 +208,3 @@ def read_scores(folder: Path) -> pd.DataFrame:
     sasgeo_bench.errors.StoreError: nowhere/scores.parquet cannot be read (No such file or directory): score it again
     """
     return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
-
-
-def read_pictures(folder: Path) -> dict[str, bytes]:
-    """Pictures of a board, or of stored results, as they were written: name in `pictures/` -> content.
-
-    Raises
-    ------
-    StoreError
-        If one cannot be read.
-
-    Examples
-    --------
-    >>> read_pictures(Path("nowhere"))
-    {}
-    """
-    place = folder / PICTURES
-    try:
-        return {name: (place / name).read_bytes() for name in list_files(place)}
-    except SasgeoError:
-        raise
-    except OSError as error:
-        message = f"{place} cannot be read ({error.strerror or error}): remove it, or fetch it again"
-        raise StoreError(message) from error

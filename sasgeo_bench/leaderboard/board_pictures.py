@@ -13,8 +13,7 @@ import pandas as pd
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
-from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.leaderboard.board_files import PICTURES, PICTURES_SAID, Extra, read_pictures
+from sasgeo_bench.leaderboard.board_files import PICTURES_SAID, Extra
 from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
 from sasgeo_bench.leaderboard.case_plot import case_pixels
@@ -79,10 +78,9 @@ def pictures_extra(
     tell: Tell,
     root: Path,
     contrasts: Sequence[Contrast] = (),
-    kept: Path | None = None,
     has_cases: bool = True,
 ) -> Extra:
-    """Pictures of a board, and `pictures.json` that lists them.
+    """Draw pictures of a board, and list them in `pictures.json`.
 
     Parameters
     ----------
@@ -91,12 +89,9 @@ def pictures_extra(
     tell : callable
         Gets a line for what cannot be drawn, and how many there are.
     root : Path
-        Where regions/, tasks/ and truth/ are.
+        Where regions/, tasks/ and truth/ are. Tasks that are missing there, or of other queries, have no picture.
     contrasts : sequence of Contrast
         Those that were registered.
-    kept : Path, optional
-        Stored results that the board is made of: they hold no views, so that their pictures are taken as they are, but
-        for cases whose class of failure is another one now.
     has_cases : bool
         Whether queries that went wrong are shown, with their truths.
 
@@ -105,14 +100,15 @@ def pictures_extra(
     Extra
         Without a picture where there is none.
     """
-    if kept is not None:
-        return _kept(kept, tell, _failures(board, contrasts) if has_cases else None)
     found = _Found(failures=board.failures)
-    asked = [about for about in board.tasks if about["suite"] != CONTROLS]
+    tasks = [about for about in board.tasks if about["suite"] != CONTROLS]
+    asked = [about for about in tasks if _is_there(about, root)]
+    if len(asked) < len(tasks):
+        tell(f"pictures of {len(asked)} of {counted(len(tasks), 'task')}: {root / 'tasks'} lacks the views of the rest")
     _add_regions(found, asked, root)
     _add_suites(found, asked, board, root)
     if has_cases:
-        _add_cases(found, board, contrasts, root)
+        _add_cases(found, board, contrasts, asked, root)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
     listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.said.items())
@@ -125,27 +121,13 @@ def _with_list(files: Mapping[str, bytes], said: Mapping[str, Any]) -> dict[str,
     return {**files, PICTURES_SAID: json_text(content).encode()}
 
 
-def _kept(folder: Path, tell: Tell, failures: pd.DataFrame | None) -> Extra:
-    """Pictures of stored results as they are; of cases, where some are wanted, those that are still of their class."""
-    files = read_pictures(folder)
-    if PICTURES_SAID not in files:
-        tell(f"no pictures: {folder} holds none, and no views to draw them of")
-        return Extra()
-    tell(f"pictures are those that {folder} holds: there are no views to draw them anew")
-    named = () if failures is None else zip(*(failures[name] for name in _CLASSED), strict=True)
-    classed = {tuple(map(str, names)) for names in named}
+def _is_there(about: Mapping[str, Any], root: Path) -> bool:
+    """Return whether a folder holds the queries of a task, to the byte: stored results hold no views of their own."""
     try:
-        said = parse_json(files[PICTURES_SAID])
-        cases = list(said["cases"])
-        said["cases"] = [one for one in cases if tuple(str(one[name]) for name in _CLASSED) in classed]
-        lost = {str(one["file"]) for one in cases} - {str(one["file"]) for one in said["cases"]}
-    except (ValueError, TypeError, KeyError) as error:
-        message = f"{folder / PICTURES / PICTURES_SAID} is damaged: remove the folder, or fetch it again"
-        raise StoreError(message) from error
-    if lost and failures is not None:
-        tell(f"left out: {counted(len(lost), 'picture')} of cases whose class of failure is another one now")
-    left = {name: data for name, data in files.items() if name not in lost and name != PICTURES_SAID}
-    return Extra(pictures=_with_list(left, said))
+        there = task_files.read_task(root / "tasks" / str(about["suite"]) / str(about["region"]))
+    except StoreError:
+        return False
+    return bool(there["files"] == about["files"])
 
 
 # --- regions and suites -----------------------------------------------------------------------------------------------
@@ -224,13 +206,16 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
 # --- cases ------------------------------------------------------------------------------------------------------------
 
 
-def _add_cases(found: _Found, board: Board, contrasts: Sequence[Contrast], root: Path) -> None:
+def _add_cases(
+    found: _Found, board: Board, contrasts: Sequence[Contrast], asked: Sequence[Mapping[str, Any]], root: Path
+) -> None:
+    about = {(str(item["suite"]), str(item["region"])): item for item in asked}
     failures = _failures(board, contrasts)
+    failures = failures[[key in about for key in zip(failures["suite"], failures["region"], strict=True)]]
     if not len(failures):
         return
     chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
     words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
-    about = {(str(item["suite"]), str(item["region"])): item for item in board.tasks}
     drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
     for case in _cases(drawn, board, words, root, found):
         row = drawn[case.query.query_id, case.matcher]

@@ -272,12 +272,7 @@ def score_all(
     with laid_out(request) as laid:
         figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
         pictures = partial(
-            pictures_extra,
-            tell=tell,
-            root=laid.root,
-            contrasts=request.contrasts,
-            kept=kept,
-            has_cases=has_cases,
+            pictures_extra, tell=tell, root=request.root, contrasts=request.contrasts, has_cases=has_cases
         )
         said = {} if kept is None else read_board(kept)[0]
         board = make_board(replace(laid, extras=(figures, pictures), kept=said), tell=tell, progress=progress)

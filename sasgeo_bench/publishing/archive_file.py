@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stored results: a board with the answers and truths it was made of, small enough to be kept with the code.
+"""Stored results: a board's tables with the queries, truths and answers they were made of, in few small files.
 
-What was seen is left out, for scores need none of it; so matchers cannot be run on what is stored, and all that was
-answered can be scored again.
+Views are left out, for scores need none of them: matchers cannot be run on stored results, but every answer can be
+scored again. Figures, pictures and tables for other programs are left out, too: `publish` makes them again.
 """
 
-import gzip
 import json
 import re
 import shutil
@@ -16,45 +15,61 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.file_manifest import SITE_FOLDERS, hashes_of, list_files, resolve_link
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.files.parquet import read_table, write_table
+from sasgeo_bench.files.parquet import MOST_VALUES, read_table, write_table
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.board_files import FIGURES, PICTURES
+from sasgeo_bench.leaderboard.board_files import BOARD_FILES
+from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
 from sasgeo_bench.matching.learned_file import LearnedSaid
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive_folder import (
-    CSV,
-    LEARNED,
+    FORMER_LEARNED,
+    FORMER_PREDICTIONS,
     PACK,
     PREDICTIONS,
+    RUNS,
     SCHEMA_VERSION,
     TABLES,
     check_replaced,
     read_settings,
     sound,
 )
-from sasgeo_bench.publishing.archive_rows import RUNS_SCHEMA, TASK, TASK_SCHEMA, check_predictions, check_tables
+from sasgeo_bench.publishing.archive_rows import (
+    LEARNED,
+    MATCHER,
+    RUNS_SCHEMA,
+    TASK,
+    TASK_SCHEMA,
+    check_predictions,
+    check_tables,
+)
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row
+from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row, predictions_of
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under
 from sasgeo_bench.texts import FOLDER, json_text
 
-MOST_BYTES: Final = 20_000_000
+MOST_BYTES: Final = 10_000_000
 _LEVEL: Final = 19
-_PAGE_BYTES: Final = 2**24  # what is alike is told once in a page: few pages, small files
-_TEXTS: Final = ("query_id", "track", "suite", "part", "region", "prior_group", "status", "message")
+_PAGE_BYTES: Final = 2**28  # one page for each column: zstd finds what is alike in the answers of all matchers
+_TEXTS: Final = (  # columns of short texts that come again
+    *("query_id", "track", "suite", "part", "region", "prior_group", "status", "message", MATCHER, "about", LEARNED),
+    *("diagnostics.key_value.key", "measured.key_value.key"),
+)
+# Nearly all bits of these are noise, and only their first bytes are alike: split into bytes they are a tenth smaller.
+_SPLIT: Final = ("candidates.list.element.score", "latency_s")
+_MADE_AGAIN: Final = (".csv", ".tex")  # of a board: the same tables for other programs
 _MEND: Final = "fetch the results again"
 _AND: Final = "; "
-_NO_PICTURES: Final = "pictures of regions, suites and cases"
 _NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
 
 
@@ -113,8 +128,7 @@ def write_pack(
     lacks : str
         What stored results it was made of had left out already.
     most_bytes : int
-        Of all files together. What is larger is written without pictures, then without headings and scales of the poses
-        beside the first, and then with figures as .svg.gz.
+        Of all files together. What is larger is written without heading and scale of the poses beside the first.
 
     Returns
     -------
@@ -131,45 +145,40 @@ def write_pack(
     folder = resolve_link(folder)
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
-            list_files(board, without=SITE_FOLDERS)  # a link would be followed to what it leads to
-            shutil.copytree(board, scratch, dirs_exist_ok=True, ignore=shutil.ignore_patterns(*SITE_FOLDERS))
-            _squeeze(scratch / CSV)
+            _copy_tables(board, scratch)
             _write_tasks(scratch, tasks)
             _write_runs(scratch, runs)
-            said, dropped = {**settings, "contestants": list(runs)}, lacks
-            found = _write_predictions(scratch, runs, is_lean=False)
-            _write_settings(scratch, said, dropped)
-            if _bytes_of(scratch) > most_bytes and (scratch / PICTURES).is_dir():
-                shutil.rmtree(scratch / PICTURES)
-                dropped = _with(dropped, _NO_PICTURES)
-                _write_settings(scratch, said, dropped)
-            if _bytes_of(scratch) > most_bytes:
-                dropped = _with(dropped, _NO_HEADINGS)
-                found = _write_predictions(scratch, runs, is_lean=True)
-                _write_settings(scratch, said, dropped)
-            if _bytes_of(scratch) > most_bytes:  # they are drawn again where results are scored
-                for figure in sorted((scratch / FIGURES).glob("*.svg")):
-                    _squeeze(figure)
-                _write_settings(scratch, said, dropped)
-            total = _bytes_of(scratch)
+            for dropped in dict.fromkeys((lacks, _with(lacks, _NO_HEADINGS))):
+                found = _write_predictions(scratch, runs, is_lean=dropped != lacks)
+                _write_settings(scratch, {**settings, "contestants": list(runs)}, dropped)
+                total = _bytes_of(scratch)
+                if total <= most_bytes:
+                    break
             _check_size(folder, total, found, most_bytes)
     except SasgeoError:
         raise
     except OSError as error:
         message = (
-            f"{folder} cannot be written ({_reason(error)}): check the free space and your rights; results "
-            "that were there are as they were"
+            f"{folder} cannot be written ({one_line(str(error.strerror or error))}): check the free space and your "
+            "rights; results that were there are as they were"
         )
         raise StoreError(message) from error
     count = sum(len(run.predictions) for listed in runs.values() for run in listed)
     return Packed(total_bytes=total, prediction_bytes=found, predictions=count, dropped=dropped)
 
 
-def _reason(error: OSError) -> str:
-    """Return why a file could not be written; for a copied folder the reason of its first file."""
-    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list) and error.args[0]:
-        return one_line(str(error.args[0][0][-1]))
-    return one_line(str(error.strerror or error))
+def _copy_tables(board: Path, folder: Path) -> None:
+    """Copy the tables and texts of a board, tables as small as they get."""
+    for name in list_files(board, without=SITE_FOLDERS):  # refuses links: they would be followed to what they lead to
+        source = board / name
+        if name not in BOARD_FILES or source.suffix in _MADE_AGAIN:
+            continue
+        if source.suffix == ".parquet":
+            table = read_table(source, mend=BOARD_MEND, most_rows=MOST_VALUES)
+            words = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
+            _write_table(table, folder / name, dictionary=words)
+        else:
+            shutil.copyfile(source, folder / name)
 
 
 def _with(dropped: str, more: str) -> str:
@@ -202,22 +211,16 @@ def _bytes_of(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _squeeze(path: Path) -> None:
-    """Put a .gz in place of a file: the same bytes for the same text."""
-    with gzip.GzipFile(f"{path}.gz", "wb", compresslevel=9, mtime=0) as target:
-        target.write(path.read_bytes())
-    path.unlink()
-
-
-def _write_table(table: pa.Table, path: Path) -> None:
-    leaves = [name for name in table.column_names if name in {*_TEXTS, "about"}]
+def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TEXTS, split: Sequence[str] = ()) -> None:
+    """Write a table as small as it gets without loss."""
     write_table(
         table,
         path,
         compression_level=_LEVEL,
         data_page_size=_PAGE_BYTES,
         row_group_size=max(len(table), 1),
-        use_dictionary=[*leaves, "diagnostics.key_value.key", "measured.key_value.key"],
+        use_dictionary=[name for name in dictionary if name.partition(".")[0] in table.column_names],
+        column_encoding=dict.fromkeys(split, "BYTE_STREAM_SPLIT"),
         write_statistics=False,
     )
 
@@ -252,34 +255,35 @@ def _numbered(table: pa.Table, number: int) -> pa.Table:
 
 
 def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
-    """Write the record of each run and its training, each text once."""
-    rows = []
-    for name, listed in runs.items():
-        for run in listed:
-            about = json.dumps(dict(run.about))
-            rows.append({"contestant": name, "rows": len(run.predictions), "about": about})
-            if run.learned is not None and run.learned.is_file():
-                place = folder / LEARNED / _file_of(run.about)
-                place.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(run.learned, place / run.learned.name)
-    _write_table(pa.Table.from_pylist(rows, schema=RUNS_SCHEMA), folder / "runs.parquet")
+    """Write what each run says, with what was learnt for it."""
+    rows = [
+        {
+            "contestant": name,
+            "rows": len(run.predictions),
+            "about": json.dumps(dict(run.about)),
+            LEARNED: None if run.learned is None or not run.learned.is_file() else run.learned.read_text("utf-8"),
+        }
+        for name, listed in runs.items()
+        for run in listed
+    ]
+    _write_table(pa.Table.from_pylist(rows, schema=RUNS_SCHEMA), folder / RUNS)
 
 
 def _file_of(about: Mapping[str, Any]) -> str:
-    """Name of a contestant's file: that of the matcher, and its hash."""
+    """Return the folder of a matcher's runs: its name and its hash."""
     return f"{about['matcher']['name']}-{about['hash']}"
 
 
 def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
-    """Write a file for each entry, its runs one after the other, and return the bytes."""
-    place = folder / PREDICTIONS
-    place.mkdir(exist_ok=True)
-    for listed in runs.values():
-        rows = [item for run in listed for item in run.predictions]
-        kept = [prediction_row(_lean(item) if is_lean else item) for item in rows]
-        table = pa.Table.from_pylist(kept, schema=PREDICTION_SCHEMA)
-        _write_table(table, place / f"{_file_of(listed[0].about)}.parquet")
-    return _bytes_of(place)
+    """Write all answers, one run after the other, and return how many bytes they are."""
+    tables = []
+    for name, listed in runs.items():
+        rows = [prediction_row(_lean(item) if is_lean else item) for run in listed for item in run.predictions]
+        table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA)
+        tables.append(table.append_column(MATCHER, pa.array([name] * len(rows), pa.string())))
+    schema = PREDICTION_SCHEMA.append(pa.field(MATCHER, pa.string()))
+    _write_table(pa.concat_tables([schema.empty_table(), *tables]), folder / PREDICTIONS, split=_SPLIT)
+    return (folder / PREDICTIONS).stat().st_size
 
 
 def _lean(item: Prediction) -> Prediction:
@@ -332,10 +336,29 @@ def unpack(folder: Path, into: Path) -> Unpacked:
     with sound(folder):
         read_settings(folder)
         tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
+        tables["runs"] = _read_runs(folder)
         check_tables(tables)
         tasks = tuple(_lay_tasks(tables, into))
         asked = dict(zip(*(tables["queries"][name].to_pylist() for name in ("query_id", ASKED)), strict=True))
-        return Unpacked(root=into, tasks=tasks, runs=tuple(_lay_runs(folder, tables["runs"], asked, into)))
+        answers = _read_predictions(folder, tables["runs"])
+        return Unpacked(root=into, tasks=tasks, runs=tuple(_lay_runs(tables["runs"], answers, asked, into)))
+
+
+def read_stored_predictions(folder: Path, matcher: str) -> list[Prediction]:
+    """Read the answers of one matcher from stored results.
+
+    Raises
+    ------
+    StoreError
+        If the results are damaged, or hold no answer of it.
+    """
+    with sound(folder):
+        table = _read_predictions(folder, _read_runs(folder))
+        found = predictions_of(table.filter(pc.equal(table[MATCHER], matcher)))
+    if not found:
+        message = f"{folder} holds no answer of {matcher!r}: board.json names its matchers"
+        raise StoreError(message)
+    return found
 
 
 def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
@@ -360,7 +383,7 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
     """
     with sound(folder):
         read_settings(folder)
-        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES if name != "runs"}
+        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
         check_tables(tables)
         return tuple(_lay_tasks(tables, into))
 
@@ -400,27 +423,56 @@ def _folder_name(name: str) -> str:
     return name
 
 
-def _lay_runs(folder: Path, runs: pa.Table, asked: Mapping[str, str], into: Path) -> Iterator[Path]:
-    by_name: dict[str, list[dict[str, Any]]] = {}
+def _read_runs(folder: Path) -> pa.Table:
+    """Read what each run says, with what was learnt for it; results of the former layout keep that in files."""
+    runs = read_table(folder / RUNS, mend=_MEND)
+    if (folder / PREDICTIONS).is_file():
+        return runs
+    learned = [_former_learned(folder, parse_json(text)) for text in runs["about"].to_pylist()]
+    return runs.append_column(LEARNED, pa.array(learned, pa.string()))
+
+
+def _former_learned(folder: Path, about: Mapping[str, Any]) -> str | None:
+    said = LearnedSaid.of(about)
+    path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(said)
+    return path.read_text("utf-8") if path.is_file() else None
+
+
+def _learned_name(said: LearnedSaid | None) -> str:
+    return "" if said is None or said.file is None else _folder_name(Path(said.file).name)
+
+
+def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
+    """Read all answers, in the order of the runs; the former layout has a file for each matcher."""
+    rows = runs.select(["contestant", "rows", "about"]).to_pylist()
+    if (folder / PREDICTIONS).is_file():
+        table = read_table(folder / PREDICTIONS, mend=_MEND)
+    else:
+        files = {row["contestant"]: _folder_name(_file_of(parse_json(row["about"]))) for row in rows}
+        tables = [read_table(folder / FORMER_PREDICTIONS / f"{stem}.parquet", mend=_MEND) for stem in files.values()]
+        matchers = [name for name, part in zip(files, tables, strict=True) for _ in range(len(part))]
+        table = pa.concat_tables(tables).append_column(MATCHER, pa.array(matchers, pa.string()))
+    check_predictions(table)
+    is_whole = sum(row["rows"] for row in rows) == len(table)  # first: anybody may say how many there are
+    if not is_whole or table[MATCHER].to_pylist() != [row["contestant"] for row in rows for _ in range(row["rows"])]:
+        message = f"{RUNS} does not tell the {len(table)} answers of {PREDICTIONS}"
+        raise ValueError(message)
+    return table
+
+
+def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into: Path) -> Iterator[Path]:
+    start, answers = 0, answers.drop_columns([MATCHER])
     for row in runs.to_pylist():
-        by_name.setdefault(row["contestant"], []).append({**row, "about": parse_json(row["about"])})
-    for listed in by_name.values():
-        stem = _folder_name(_file_of(listed[0]["about"]))
-        table, start = read_table(folder / PREDICTIONS / f"{stem}.parquet", mend=_MEND), 0
-        check_predictions(stem, table)
-        if sum(row["rows"] for row in listed) != len(table):
-            message = f"runs.parquet does not tell the {len(table)} answers of {stem}"
-            raise ValueError(message)
-        if (folder / LEARNED / stem).is_dir():
-            shutil.copytree(folder / LEARNED / stem, into / "runs" / stem / learned_file.FOLDER)
-        for row in listed:
-            about, count = row["about"], row["rows"]
-            place = into / "runs" / stem / _folder_name(about["suite"]) / _folder_name(about["region"])
-            prediction_files.write_run(place, about)
-            said = LearnedSaid.of(about)
-            key = None if said is None else said.key
-            part = table.slice(start, count)
-            ties = [asked_under(asked[name], key) for name in part["query_id"].to_pylist()]
-            write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
-            start += count
-            yield place
+        about, count = parse_json(row["about"]), row["rows"]
+        run = into / "runs" / _folder_name(_file_of(about))
+        place = run / _folder_name(about["suite"]) / _folder_name(about["region"])
+        prediction_files.write_run(place, about)
+        said = LearnedSaid.of(about)
+        if row[LEARNED] is not None:
+            (run / learned_file.FOLDER).mkdir(exist_ok=True)
+            (run / learned_file.FOLDER / _learned_name(said)).write_text(row[LEARNED], encoding="utf-8")
+        part = answers.slice(start, count)
+        ties = [asked_under(asked[name], None if said is None else said.key) for name in part["query_id"].to_pylist()]
+        write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
+        start += count
+        yield place

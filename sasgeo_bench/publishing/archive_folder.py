@@ -27,16 +27,17 @@ from sasgeo_bench.leaderboard.archive_record import PackSaid, VersionSaid, parse
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 
 PACK: Final = "pack.json"
-SCHEMA_VERSION: Final = 2
-_READ: Final = (1, SCHEMA_VERSION)  # the first one has no hashes
-PREDICTIONS: Final = "predictions"
-LEARNED: Final = "learned"
-TABLES: Final = ("runs", "tasks", "queries", "truths")
-CSV: Final = f"{LEADERBOARD}.csv"
+SCHEMA_VERSION: Final = 3
+_READ: Final = (1, 2, SCHEMA_VERSION)
+_WITHOUT_HASHES: Final = 1  # the former layouts (1 and 2) hold figures, pictures, and a file for each matcher
+PREDICTIONS: Final = "predictions.parquet"
+RUNS: Final = "runs.parquet"
+TABLES: Final = ("tasks", "queries", "truths")
+FORMER_PREDICTIONS: Final = "predictions"
+FORMER_LEARNED: Final = "learned"
 _OLD_FILES: Final = (  # of results that list none
-    *BOARD_FILES,
-    *(PACK, f"{CSV}.gz", *(f"{name}.parquet" for name in TABLES), f"{PREDICTIONS}/*.parquet", f"{LEARNED}/*"),
-    *(*FIGURE_FILES, *PICTURE_FILES),
+    *(*BOARD_FILES, f"{LEADERBOARD}.csv.gz", *FIGURE_FILES, *PICTURE_FILES),
+    *(PACK, RUNS, *(f"{name}.parquet" for name in TABLES), f"{FORMER_PREDICTIONS}/*.parquet", f"{FORMER_LEARNED}/*"),
 )
 
 
@@ -66,7 +67,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
             message = f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
             raise StoreError(message)
         said = parse_said(data, PackSaid)
-        if said.files is None and found == SCHEMA_VERSION:
+        if said.files is None and found != _WITHOUT_HASHES:
             message = f"{PACK} lists no files"
             raise ValueError(message)
         if said.files is None:

@@ -15,7 +15,11 @@ from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, TRUTH_
 
 TASK: Final = "task"  # column: number of the row in tasks.parquet
 TASK_SCHEMA: Final = pa.schema([(name, pa.string()) for name in ("task_json", "truth_json", "region_json")])
-RUNS_SCHEMA: Final = pa.schema([("contestant", pa.string()), ("rows", pa.int64()), ("about", pa.string())])
+MATCHER: Final = "matcher"  # column: whose answer it is
+LEARNED: Final = "learned"  # column: text that was learnt for a run
+RUNS_SCHEMA: Final = pa.schema(
+    [("contestant", pa.string()), ("rows", pa.int64()), ("about", pa.string()), (LEARNED, pa.string())]
+)
 _HEADS: Final = HEAD_SCHEMA.append(pa.field(ASKED, pa.string())).append(pa.field(VIEW_BYTES, pa.int64()))
 _SCHEMAS: Final = {
     "runs": RUNS_SCHEMA,
@@ -24,7 +28,7 @@ _SCHEMAS: Final = {
     "truths": TRUTH_SCHEMA.append(pa.field(TASK, pa.int32())),
 }
 _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
-_MAY_BE_NULL: Final = {*POSE_FIELDS, "alias_index", "region_json"}
+_MAY_BE_NULL: Final = {*POSE_FIELDS, "alias_index", "region_json", LEARNED}
 _TRACKS: Final = ("retrieval", "localization")
 _ROLES: Final = ("control", "stress", "falsifier")
 _KINDS: Final = (
@@ -119,21 +123,20 @@ def _check_truths(truths: pa.Table, queries: pa.Table) -> None:
     _refuse("truths", "measured", _numbers(_listed(truths["measured"].cast(_PAIRS))["value"].is_null()))
 
 
-def check_predictions(name: str, table: pa.Table) -> None:
+def check_predictions(table: pa.Table) -> None:
     """Refuse answers that no runner has written.
 
     Raises
     ------
     ValueError
-        Naming the file and the column.
+        Naming the column.
     """
-    differing = differing_columns(table)
-    if differing:
-        column, found, expected = differing[0]
-        message = f"{name}.parquet: {column}: found {found}, expected {expected}"
+    for column, found, expected in differing_columns(table):
+        message = f"predictions.parquet: {column}: found {found}, expected {expected}"
         raise ValueError(message)
     for wrong in row_faults(table):
-        message = f"{name}.parquet, row {wrong.row}, {wrong.column}: found {wrong.found}, expected {wrong.expected}"
+        place = f"predictions.parquet, row {wrong.row}, {wrong.column}"
+        message = f"{place}: found {wrong.found}, expected {wrong.expected}"
         raise ValueError(message)
 
 

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board's folder -> its site: the order of the steps."""
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -12,11 +14,13 @@ from sasgeo_bench.ageing.ratebook_file import load_ratebook
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.file_manifest import SITE, resolve_link
-from sasgeo_bench.leaderboard.board_files import LEADERBOARD
+from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOARD, read_board
 from sasgeo_bench.leaderboard.board_schema import check_shape
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.publishing.archive import request_of, score_all
+from sasgeo_bench.publishing.archive_folder import is_pack
 from sasgeo_bench.publishing.site import site_pages
 from sasgeo_bench.publishing.site_files import (
     MOST_BYTES,
@@ -40,8 +44,16 @@ _MAP: Final = "places.svg"
 _RATES: Final = "ageing-rates.svg"
 
 
-def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
-    """Make the site of a board from its folder alone.
+def publish(
+    board: Path,
+    into: Path | None = None,
+    *,
+    tell: Tell,
+    root: Path = Path("out"),
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> Written:
+    """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
 
     Parameters
     ----------
@@ -51,6 +63,12 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
         Folder to write; `site` in the board's own without.
     tell : callable
         Gets a line now and then.
+    root : Path
+        Where regions/, tasks/ and truth/ may be: stored results hold no views, and have the pictures of those here.
+    jobs : int
+        Processes that score stored results.
+    progress : Progress, optional
+        Shows how far scoring is; lines by `tell` unless given.
 
     Returns
     -------
@@ -72,8 +90,8 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
     if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
         message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         raise StoreError(message)
-    with held(board, target, tell=tell):
-        files = read_board_files(board)
+    with held(board, target, tell=tell), _with_figures(board, root, jobs, tell, progress) as folder:
+        files = read_board_files(folder)
         check_public(files.about.get(PRIVATE), str(board))
         with _sound(board):
             for name, table in {LEADERBOARD: files.board, **files.tables}.items():
@@ -90,6 +108,25 @@ def publish(board: Path, into: Path | None = None, *, tell: Tell) -> Written:
     if written.site_bytes > MOST_BYTES:
         tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB, pictures apart: slow to open from afar")
     return written
+
+
+@contextmanager
+def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Progress | None) -> Iterator[Path]:
+    """Yield the folder of a board with figures: stored results are scored into one that goes when the block ends."""
+    if not is_pack(board) or (board / FIGURES).is_dir():  # results of a former layout hold their figures
+        yield board
+        return
+    tell(f"{board}: scoring stored results again, for their figures")
+    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as scratch:
+        folder = Path(scratch) / board.resolve().name
+        request = replace(request_of([board], board=folder, root=root), jobs=jobs)
+        score_all(request, tell=tell, progress=progress)
+        if not read_board(folder)[1].equals(read_board(board)[1]):
+            tell(f"the site shows the tables of this version, which differ from those in {board}: store them anew")
+        for name in BOARD_FILES:  # those of the paper's experiment are made where it is run
+            if (board / name).is_file() and not (folder / name).exists():
+                shutil.copyfile(board / name, folder / name)
+        yield folder
 
 
 @contextmanager

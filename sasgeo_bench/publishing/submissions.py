@@ -314,7 +314,9 @@ def _board_said(folder: Path, board: str) -> str:
         return board
 
 
-def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell) -> Board:
+def with_submissions(
+    stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell, root: Path = Path("out"), jobs: int = 1
+) -> Board:
     """Score stored results again together with submissions, and write the board of both.
 
     Parameters
@@ -327,6 +329,10 @@ def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, 
         Folder to write.
     tell : callable
         Gets a line now and then.
+    root : Path
+        Where regions/, tasks/ and truth/ may be, for pictures.
+    jobs : int
+        Processes that fit rejectors.
 
     Returns
     -------
@@ -342,4 +348,5 @@ def with_submissions(stored: Path, submissions: Sequence[Path], board: Path, *, 
         message = f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written"
         raise StoreError(message)
     found = submissions_for(board_of([stored]), submissions, tell=tell)
-    return score_all(replace(request_of([stored], board=board, root=stored), submissions=found), tell=tell)
+    request = request_of([stored], board=board, root=root)
+    return score_all(replace(request, submissions=found, jobs=jobs), tell=tell)

@@ -44,7 +44,7 @@ _SIGN_STARTS: Final = ("truth-", "part-")  # truths of one part of a task in a r
 _TELLING: Final = frozenset(
     {
         *("pack.json", "truths.parquet", "truth.parquet", "truth.json", "scores.parquet", "submission.json"),
-        *("queries.parquet", "tasks"),
+        *("queries.parquet", "predictions.parquet", "runs.parquet", "tasks"),
         *("truth", "runs", "boards", "predictions", "learned", "pictures", "cases"),
     }
 )

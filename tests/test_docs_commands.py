@@ -31,14 +31,13 @@ from tests.threaded import threaded
 ROOT = Path(__file__).parents[1]
 UsageError = typer.BadParameter.__base__  # of whichever click it is that typer brings along
 # In the order in which a command that stands in several of them is run: in the first that has it.
+GUIDES = ("docs/howto/matcher.md", "docs/howto/region.md", "docs/howto/suite.md")
 DOCUMENTS = (
-    "docs/adding-a-matcher.md",
-    "docs/adding-a-region.md",
-    "docs/adding-a-suite.md",
+    *GUIDES,
     *sorted(
         path.relative_to(ROOT).as_posix()
-        for path in (*ROOT.glob("docs/*.md"), *ROOT.glob("docs/*/README.md"))
-        if path.name not in ("adding-a-matcher.md", "adding-a-region.md", "adding-a-suite.md")
+        for path in ROOT.glob("docs/**/*.md")
+        if path.relative_to(ROOT).as_posix() not in GUIDES
     ),
     *("README.md", "CONTRIBUTING.md", "submissions/README.md"),
     *(f"{folder}/README.md" for folder in ("pipelines", "regions", "splits", "benchmarks")),

@@ -19,6 +19,7 @@ import typer
 from sasgeo_bench import cli
 from sasgeo_bench.cli import program
 from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.matching.scaffold import plugin_files
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
@@ -238,6 +239,13 @@ def write_files(document: str, folder: Path) -> None:
         (folder / name).write_text(content, encoding="utf-8")
 
 
+def write_plugin(folder: Path) -> None:
+    """Make the package that the guide to a matcher ends with; other documents go on from there."""
+    for name, content in plugin_files("my-matcher").items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+
+
 def enter_suites(document: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Suites that a document tells its reader to write."""
     for _, code in blocks(document, "python"):
@@ -261,6 +269,8 @@ def test_the_commands_of_a_document_do_what_they_say(
     document: str, reader: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_files(document, reader)
+    if document != GUIDES[0]:  # which makes the package itself
+        write_plugin(reader / "my-matcher")
     enter_suites(document, monkeypatch)
     for line in commands(document):
         if RUN.get(line.text) is not None and RUN[line.text] == line:

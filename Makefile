@@ -8,10 +8,12 @@ ARGS ?=
 EXTRACTS ?= $(SASGEO_EXTRACTS)
 VENV := .venv
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.docs-installed
+DOCS_RUN ?= 1
 VENV_PYTHON := $(VENV)/bin/python
 PIP := $(VENV_PYTHON) -m pip --disable-pip-version-check
 SASGEO := $(VENV)/bin/sasgeo-bench
-SOURCES := sasgeo_bench baselines benchmarks tests
+SOURCES := sasgeo_bench baselines benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -94,14 +96,21 @@ figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extra
 	$(SASGEO) publish --board docs/results/leaderboard --into $(OUT)/public
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/public/index.html docs/figures/board.webp
 
-docs: $(STAMP) ## run the examples in the docstrings and follow the links between the documents; builds no site
-	$(VENV_PYTHON) -m pytest -q -p no:benchmark sasgeo_bench
-	$(VENV_PYTHON) -m pytest -q -p no:benchmark tests/test_repository.py -k "link or document"
+$(DOCS_STAMP): $(STAMP) requirements-docs.lock
+	$(PIP) install --quiet --require-hashes -r requirements-docs.lock
+	@touch $@
 
-lock: ## resolve requirements.lock anew from pyproject.toml (needs uv: make lock UV=/path/to/uv)
+docs: $(DOCS_STAMP) ## build the documentation site in OUT/docs, strictly; DOCS_RUN=0 leaves out the notebook's run
+	$(VENV_PYTHON) -m pytest -q -p no:benchmark tests/test_docs.py tests/test_repository.py -k "link or document or docs"
+	DOCS_RUN=$(DOCS_RUN) NO_MKDOCS_2_WARNING=1 $(VENV_PYTHON) -m mkdocs build --strict --site-dir $(abspath $(OUT))/docs $(ARGS)
+
+lock: ## resolve requirements.lock and requirements-docs.lock anew from pyproject.toml (needs uv: make lock UV=/path/to/uv)
 	$(UV) pip compile pyproject.toml --extra dev --extra dask --extra publish --universal --python-version 3.11 --generate-hashes --no-config \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 	  --output-file requirements.lock $(ARGS)
+	$(UV) pip compile --group pyproject.toml:docs --constraint requirements.lock --universal --python-version 3.11 --generate-hashes --no-config \
+	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
+	  --output-file requirements-docs.lock $(ARGS)
 
 clean: ## remove .venv and caches; keeps what was built in $(OUT)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist

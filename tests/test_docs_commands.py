@@ -19,6 +19,7 @@ import typer
 from sasgeo_bench import cli
 from sasgeo_bench.cli import program
 from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.matching.scaffold import plugin_files
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
@@ -31,14 +32,13 @@ from tests.threaded import threaded
 ROOT = Path(__file__).parents[1]
 UsageError = typer.BadParameter.__base__  # of whichever click it is that typer brings along
 # In the order in which a command that stands in several of them is run: in the first that has it.
+GUIDES = ("docs/howto/matcher.md", "docs/howto/region.md", "docs/howto/suite.md")
 DOCUMENTS = (
-    "docs/adding-a-matcher.md",
-    "docs/adding-a-region.md",
-    "docs/adding-a-suite.md",
+    *GUIDES,
     *sorted(
         path.relative_to(ROOT).as_posix()
-        for path in (*ROOT.glob("docs/*.md"), *ROOT.glob("docs/*/README.md"))
-        if path.name not in ("adding-a-matcher.md", "adding-a-region.md", "adding-a-suite.md")
+        for path in ROOT.glob("docs/**/*.md")
+        if path.relative_to(ROOT).as_posix() not in GUIDES
     ),
     *("README.md", "CONTRIBUTING.md", "submissions/README.md"),
     *(f"{folder}/README.md" for folder in ("pipelines", "regions", "splits", "benchmarks")),
@@ -239,6 +239,13 @@ def write_files(document: str, folder: Path) -> None:
         (folder / name).write_text(content, encoding="utf-8")
 
 
+def write_plugin(folder: Path) -> None:
+    """Make the package that the guide to a matcher ends with; other documents go on from there."""
+    for name, content in plugin_files("my-matcher").items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+
+
 def enter_suites(document: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Suites that a document tells its reader to write."""
     for _, code in blocks(document, "python"):
@@ -262,6 +269,8 @@ def test_the_commands_of_a_document_do_what_they_say(
     document: str, reader: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_files(document, reader)
+    if document != GUIDES[0]:  # which makes the package itself
+        write_plugin(reader / "my-matcher")
     enter_suites(document, monkeypatch)
     for line in commands(document):
         if RUN.get(line.text) is not None and RUN[line.text] == line:

@@ -14,8 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from docs.site import reference
+
 ROOT = Path(__file__).parents[1]
 CODE = ("sasgeo_bench", "baselines", "benchmarks", "tests")
+LOCKS = ("requirements.lock", "requirements-docs.lock")
 SHIPPED = ("regions", "splits", "pipelines")
 # Made by commands, not by hand (.gitignore names them too).
 GENERATED = {
@@ -75,9 +78,9 @@ def requirement_names(requirements: list[str]) -> set[str]:
     return {re.match(r"[\w.-]+", requirement)[0].lower() for requirement in requirements}
 
 
-def locked_blocks() -> list[str]:
-    """One text for each pinned requirement of the lock file, with its hashes."""
-    body = re.sub(r"^#.*\n", "", read("requirements.lock"), flags=re.MULTILINE)
+def locked_blocks(name: str = "requirements.lock") -> list[str]:
+    """One text for each pinned requirement of a lock file, with its hashes."""
+    body = re.sub(r"^#.*\n", "", read(name), flags=re.MULTILINE)
     return re.sub(r"\\\n\s*", "", body).strip().splitlines()
 
 
@@ -122,17 +125,19 @@ def test_no_file_is_larger_than_half_a_megabyte() -> None:
 # What is installed
 
 
-def test_the_lock_pins_every_requirement_with_hashes() -> None:
-    blocks = locked_blocks()
+@pytest.mark.parametrize("name", LOCKS)
+def test_the_lock_pins_every_requirement_with_hashes(name: str) -> None:
+    blocks = locked_blocks(name)
     assert len(blocks) > 30
     for block in blocks:
         assert re.match(r"[\w.-]+==[\w.+!]+ ", block), block
         assert re.search(r"--hash=sha256:[0-9a-f]{64}", block), block
 
 
-def test_the_lock_names_no_address_and_no_folder() -> None:
+@pytest.mark.parametrize("name", LOCKS)
+def test_the_lock_names_no_address_and_no_folder(name: str) -> None:
     for word in ("://", "--index", "--extra-index", "--find-links", "--trusted-host", " @ ", "file:", "-e "):
-        assert word not in read("requirements.lock"), word
+        assert word not in read(name), word
 
 
 def test_the_lock_holds_every_declared_requirement() -> None:
@@ -140,6 +145,15 @@ def test_the_lock_holds_every_declared_requirement() -> None:
     declared = project()["dependencies"] + extras
     missing = requirement_names(declared) - requirement_names(locked_blocks())
     assert missing == set(), "run `make lock`"
+
+
+def test_the_tools_of_the_documentation_are_locked_to_the_same_versions_and_installed_by_nothing_else() -> None:
+    groups = tomllib.loads(read("pyproject.toml"))["dependency-groups"]
+    assert requirement_names(groups["docs"]) - requirement_names(locked_blocks("requirements-docs.lock")) == set()
+    assert requirement_names(groups["docs"]) & requirement_names(locked_blocks()) == set()
+    pinned, tools = ({re.match(r"[\w.-]+==\S+", one)[0] for one in locked_blocks(name)} for name in LOCKS)
+    shared = requirement_names(list(pinned)) & requirement_names(list(tools))
+    assert {one for one in tools if requirement_names([one]) & shared} <= pinned
 
 
 def test_the_declared_requirements_are_what_the_code_imports() -> None:
@@ -214,18 +228,25 @@ def test_every_make_command_in_a_document_exists() -> None:
 # Documents and data
 
 
+def is_made(target: Path) -> bool:
+    """Whether a page of the site is made from the code (docs/site/reference.py), so that no file holds it."""
+    return os.path.relpath(target, ROOT / "docs") in reference.pages()
+
+
 def test_every_link_between_documents_leads_somewhere() -> None:
     broken = [
         f"{path.relative_to(ROOT)} -> {target}"
         for path, target in markdown_links()
-        if not (path.parent / target).exists()
+        if not (path.parent / target).exists() and not is_made(path.parent / target)
     ]
     assert broken == []
 
 
-def test_every_decision_record_is_listed_in_the_documents() -> None:
+def test_every_decision_record_has_its_number_and_its_three_parts() -> None:
     for path in (ROOT / "docs" / "decisions").glob("*.md"):
-        assert f"decisions/{path.name}" in read("docs/README.md")
+        text = path.read_text(encoding="utf-8")
+        assert text.startswith(f"# {int(path.name[:4])}. "), path
+        assert [part for part in ("Context", "Choice", "Price") if f"\n## {part}\n" not in text] == [], path
 
 
 def test_the_changelog_document_begins_with_the_version_of_the_package() -> None:

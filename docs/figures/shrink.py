@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# ruff: noqa: INP001 - a script, no module
+
 """A picture, or the head of a page as Chromium shows it, small enough for the README."""
 
 import shutil

@@ -26,7 +26,7 @@ def new_matcher_command(
     write_plugin(target, files)
     install = f"{_pip()} install -e {shlex.quote(str(target))}"
     say(f"{target}: {len(files)} files; next: {install} && sasgeo-bench check-matcher {name}")
-    tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/adding-a-matcher.md walks the path)")
+    tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/howto/matcher.md walks the path)")
 
 
 def _pip() -> str:

@@ -153,7 +153,7 @@ def example_card(name: str = "my-matcher") -> str:
 
 
 _EXAMPLE: Final = """\
-# What the board says of your method. One line each; see docs/adding-a-matcher.md.
+# What the board says of your method. One line each; see docs/howto/matcher.md.
 name = "{name}"
 version = "0.1.0"        # raise it whenever answers change
 title = "A matcher of mine"

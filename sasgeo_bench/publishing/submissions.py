@@ -217,7 +217,7 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
     suites = {task.about["suite"] for task, count in counts if count}
     if not suites:
         message = (
-            f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/adding-a-matcher.md)"
+            f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
         )
         raise ConfigError(message)
     return [

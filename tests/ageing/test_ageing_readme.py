@@ -108,7 +108,7 @@ def test_as_many_classes_grow_faster_than_was_set_by_hand_as_the_page_says(table
         for item in classes
         if item.persistence.appear_per_year * 100 < value(tables, "min", item.name, "pooled", "appear_per_year")
     ]
-    assert f"For {len(slow)} of {len(classes)} classes the taxonomy's rate of appearing lies below" in text
+    assert f"For {len(slow)} of {len(classes)} classes the taxonomy's rate of appearance lies below" in text
 
 
 def test_every_place_stands_on_the_page_as_in_the_summary(text):
@@ -119,7 +119,7 @@ def test_every_place_stands_on_the_page_as_in_the_summary(text):
 
 
 def test_every_column_of_the_tables_is_told_of(tables, text):
-    told = set(re.findall(r"`([a-z0-9_*]+)`", text.split("## What the columns mean")[1].split("##")[0]))
+    told = set(re.findall(r"`([a-z0-9_*]+)`", text.split("## Columns")[1].split("##")[0]))
     patterns = [re.compile(name.replace("*", r"\w*")) for name in told]
     numbers = [name for name, kind in tables["monaco"].dtypes.items() if kind.kind in "fi" and name != "years"]
     assert [name for name in numbers if not any(pattern.fullmatch(name) for pattern in patterns)] == []

@@ -204,7 +204,7 @@ def draw_robustness(path: Path, table: pd.DataFrame, *, data: str) -> None:
     note = (
         "Each point is a quarter of the range of the map-change probability, at the mean of its n trials; whiskers are "
         "Wilson's 95 % intervals, trials taken\nfor independent. The probability is that of the most volatile class; "
-        "others change less (docs/paper.md)."
+        "others change less (docs/concepts/paper.md)."
     )
     width, height = 1.2 + 1.78 * across, 1.75 + 1.95 * down
     with _page(path, max(width, 7.6), height, "Recall@1 against the probability of map change", note, data) as figure:

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Execute the notebooks of docs/ and write them as pages."""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+LIMIT_S: Final = 900
+
+
+def pages(folder: Path, scratch: Path) -> dict[str, str | bytes]:
+    """Run each notebook in an empty folder, and return its page and pictures by their paths.
+
+    A cell that fails ends the build with its error. With `DOCS_RUN=0` the notebook is shown without its outputs.
+    """
+    import jupytext  # noqa: PLC0415 - in the group `docs`
+    from jupyter_client.manager import AsyncKernelManager  # noqa: PLC0415 - as above
+    from nbclient import NotebookClient  # noqa: PLC0415 - as above
+    from nbconvert import MarkdownExporter  # noqa: PLC0415 - as above
+
+    made: dict[str, str | bytes] = {}
+    for path in sorted(folder.glob("*.py")):
+        notebook = jupytext.read(path)
+        if os.environ.get("DOCS_RUN") != "0":
+            scratch.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=scratch) as home, tempfile.TemporaryDirectory() as sockets:
+                # Sockets in a private folder, not ports; their paths must be short.
+                kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=f"{sockets}/kernel")
+                program = Path(sys.executable).parent  # where the commands of this environment are
+                own = {"PATH": f"{program}:{os.environ['PATH']}", "TERM": "dumb", "IPYTHONDIR": sockets}
+                place = {"metadata": {"path": home}}
+                client = NotebookClient(notebook, timeout=LIMIT_S, km=kernel, resources=place)
+                client.execute(env=os.environ | own)
+        for cell in (cell for cell in notebook.cells if cell.cell_type == "code"):
+            cell["outputs"] = [item for item in cell.get("outputs", ()) if item.get("name") != "stderr"]
+        text, resources = MarkdownExporter().from_notebook_node(notebook)
+        made[f"notebooks/{path.stem}.md"] = text
+        made |= {f"notebooks/{name}": content for name, content in resources["outputs"].items()}
+    return made

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation: reference pages hold all that the code has, and the written pages keep to their limits."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import typer
+
+from docs.site import reference
+from sasgeo_bench.cli import program
+from sasgeo_bench.running.prediction_rows import PART_SCHEMA
+from sasgeo_bench.scoring.metrics import METRICS
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, TRUTH_SCHEMA
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+# Pages that are written here; results are made by commands, and decisions are kept as they were made.
+WRITTEN = sorted(
+    path
+    for path in DOCS.rglob("*.md")
+    if path.relative_to(DOCS).parts[0] not in ("results", "decisions") and path.name not in ("summary.md", "ageing.md")
+)
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
+PATHS = re.compile(r"\b(?:sasgeo_bench|baselines|benchmarks|tests|docs)/[\w./-]*\w\.(?:py|md|toml|sh)\b")
+MOST_TERMS = 60
+
+
+def read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def pages():
+    return reference.pages()
+
+
+def test_every_public_name_has_its_place_in_the_api(pages):
+    written = "\n".join(text for path, text in pages.items() if path.startswith("reference/api/"))
+    for module, names in reference.public_names().items():
+        for name in names:
+            assert f"::: sasgeo_bench.{module}.{name}\n" in written
+            assert f"[`sgb.{name}`]" in pages["reference/api/index.md"]
+
+
+@pytest.mark.parametrize("name", [name for commands in program.COMMANDS.values() for name in commands])
+def test_every_command_and_option_is_in_the_reference(name, pages):
+    (section,) = re.findall(rf"^### {name}$(.*?)(?=^##|\Z)", pages["reference/cli.md"], re.MULTILINE | re.DOTALL)
+    with typer.Context(typer.main.get_command(program.app)) as parent:
+        command = program.load(name)
+        options = [
+            option
+            for parameter in command.get_params(typer.Context(command, parent=parent))
+            for option in parameter.opts
+            if parameter.name != "help" and not parameter.hidden
+        ]
+    assert [option for option in options if option not in section] == []
+
+
+def test_every_column_of_a_file_is_in_the_reference(pages):
+    for schema in (FILE_SCHEMA, TRUTH_SCHEMA, PART_SCHEMA):
+        assert [name for name in schema.names if f"| `{name}` |" not in pages["reference/files.md"]] == []
+
+
+def test_every_metric_is_in_the_reference_with_what_it_says(pages):
+    lines = pages["reference/metrics.md"].splitlines()
+    for metric in METRICS:
+        (row, *_) = [line for line in lines if re.match(rf"\| \**`{re.escape(metric.name)}`", line)]
+        assert metric.meaning.replace("|", r"\|") in row
+
+
+def test_every_suite_is_in_the_reference(pages):
+    assert [name for name in EVERY_SUITE if f"\n## {name}\n" not in pages["reference/suites.md"]] == []
+
+
+def test_what_a_docstring_says_of_several_parameters_is_said_of_each():
+    class Both:
+        """Return nothing.
+
+        Parameters
+        ----------
+        lo, hi : float
+            Ends of an
+            interval.
+        name : str
+            What it is called.
+
+        Notes
+        -----
+        None.
+        """
+
+    interval = "Ends of an interval."
+    assert reference.meanings([Both]) == {"lo": interval, "hi": interval, "name": "What it is called."}
+
+
+def test_a_bar_or_a_break_in_a_cell_breaks_no_table():
+    assert reference.table(["a"], [["x | y\nz"]])[-2] == r"| x \| y z |"
+
+
+@pytest.mark.parametrize("path", [*WRITTEN, ROOT / "README.md"], ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_no_line_of_a_document_is_too_long_but_rows_of_tables(path):
+    long = [line for line in read(path).splitlines() if len(line) > 120 and not line.lstrip().startswith("|")]
+    assert long == []
+
+
+@pytest.mark.parametrize("path", [*WRITTEN, ROOT / "README.md"], ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_file_that_a_document_names_is_there(path):
+    text = re.sub(r"^```.*?^```$", "", read(path), flags=re.MULTILINE | re.DOTALL)
+    assert [name for name in PATHS.findall(text) if not (ROOT / name).exists()] == []
+
+
+def test_the_readme_is_read_in_four_minutes():
+    text = read(ROOT / "README.md")
+    assert len(text.splitlines()) <= 150
+    assert len(text.split()) <= 4 * 250
+
+
+def test_the_glossary_is_short_and_in_order():
+    head, *items = read(DOCS / "glossary.md").strip().split("\n\n")
+    terms = [item.split("\n:   ")[0] for item in items]
+    assert head == "# Glossary"
+    assert terms == sorted(set(terms), key=str.lower)
+    assert len(terms) <= MOST_TERMS
+    assert [item for item in items if not 2 <= len(item.splitlines()) <= 3] == []
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_a_notebook_needs_public_names_alone(path):
+    nodes = list(ast.walk(ast.parse(read(path))))
+    imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
+    assert "sasgeo_bench" in imported
+    assert imported - {"sasgeo_bench"} <= sys.stdlib_module_names
+    commands = re.findall(r"^# !(\S+)", read(path), flags=re.MULTILINE)
+    assert {"sasgeo-bench"} <= set(commands) <= {"sasgeo-bench", "sed"}
+
+
+@pytest.mark.slow  # half a minute; `make docs` does it, and runs the notebook too
+def test_the_site_is_built_without_a_warning(tmp_path):
+    if find_spec("mkdocs") is None:
+        pytest.skip("mkdocs is not installed (make docs brings it)")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    outside = os.environ | {"DOCS_RUN": "0", "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(command, cwd=ROOT, env=outside, capture_output=True, text=True, check=False)  # noqa: S603 - our own
+    assert built.returncode == 0, built.stderr
+    assert (tmp_path / "site" / "reference" / "api" / "index.html").exists()

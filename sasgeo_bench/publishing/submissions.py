@@ -216,9 +216,7 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
     counts = [(task, sum(name in rows for name in task.asked)) for task in tasks]
     suites = {task.about["suite"] for task, count in counts if count}
     if not suites:
-        message = (
-            f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
-        )
+        message = f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
         raise ConfigError(message)
     return [
         TaskSaid(

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from statsmodels.stats.proportion import proportion_confint
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.sasgeo.conformal import upper_rate
 from sasgeo_bench.scoring.base import Floats, check_column, weighted_mean
 from sasgeo_bench.scoring.calibration import stanford
 from sasgeo_bench.scoring.intervals import LEVEL, Interval, wilson
@@ -83,6 +83,21 @@ def stanford_counts(
     )
 
 
+def supported_risk(failures: float, trials: float, *, confidence: float = LEVEL) -> float:
+    """Return the least risk that counts support, Clopper-Pearson's one-sided upper bound; 1 without a trial.
+
+    Counts need not be whole; 0 <= failures <= trials.
+
+    Examples
+    --------
+    >>> supported_risk(0, 299) < 0.01 < supported_risk(0, 298), supported_risk(0, 0)
+    (True, 1.0)
+    """
+    if failures == trials:
+        return 1.0
+    return float(proportion_confint(failures, trials, alpha=2.0 * (1.0 - confidence), method="beta")[1])
+
+
 def statement(failures: float, trials: float, *, risk: float, confidence: float = LEVEL) -> str:
     """Return which risk some counts support, in a line that claims no more than they support.
 
@@ -108,7 +123,7 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     if not (0 < risk < 1 and 0 < confidence < 1):
         message = f"risk and confidence must lie in (0, 1), got {risk!r} and {confidence!r}"
         raise MetricError(message)
-    at_most = upper_rate(failures, trials, confidence=confidence)
+    at_most = supported_risk(failures, trials, confidence=confidence)
     claim = f"{failures:.4g} of {trials:.4g} support below "
     sure = f" ({100 * confidence:g} % confidence)"
     if at_most < risk:

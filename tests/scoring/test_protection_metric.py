@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sasgeo_bench.sasgeo.conformal import upper_rate
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.intervals import wilson
@@ -15,6 +14,7 @@ from sasgeo_bench.scoring.protection_metric import (
     conformal_factor,
     stanford_counts,
     statement,
+    supported_risk,
 )
 
 LEVELS = st.lists(st.tuples(st.floats(0, 60), st.floats(0, 60)), min_size=1, max_size=30)
@@ -70,8 +70,8 @@ def test_a_statement_claims_no_more_than_the_counts_carry():
 def test_a_statement_is_never_below_what_is_supported(failures, more):
     trials = failures + more
     stated = float(statement(failures, trials, risk=1e-6).split("below ")[1].split(" %")[0])
-    assert stated / 100 >= upper_rate(failures, trials) - 1e-12
-    assert stated / 100 <= 1.1 * upper_rate(failures, trials)
+    assert stated / 100 >= supported_risk(failures, trials) - 1e-12
+    assert stated / 100 <= 1.1 * supported_risk(failures, trials)
 
 
 def test_a_conformal_factor_is_a_rank_of_calibration_and_infinite_where_that_is_too_small():

@@ -37,7 +37,7 @@ from sasgeo_bench.leaderboard.board_schema import check_shape
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.learned_file import read_learned
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import Card, Submission, TaskSaid, example_card
+from sasgeo_bench.matching.submission import Card, Submission, TaskManifest, example_card
 from sasgeo_bench.osm.history import DatedExtract, read_history
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -163,7 +163,7 @@ def make_predictions(folder: Path, tiny: TinyPlace) -> None:
 def make_submission(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
     card = parse_toml(example_card("mine"), Card, source="card")
-    asked = TaskSaid(suite="clean", region="here", queries_sha256="0" * 64, queries=1, answered=1)
+    asked = TaskManifest(suite="clean", region="here", queries_sha256="0" * 64, queries=1, answered=1)
     said = Submission(
         schema_version=1,
         card=card,

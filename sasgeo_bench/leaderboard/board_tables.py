@@ -191,7 +191,7 @@ def _section(book: Book, key: Key) -> Section:
 def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
     table = suite_table(book, key, names)
     reasons = tuple(f"{name}: {book.entries[name]['set_apart']}." for name in names)
-    title = "Set apart: not to be compared with those above"
+    title = f"Set apart, not to be compared with those above: {key[0]}, {key[1]}"
     return replace(table, name=f"{table.name}-apart", title=title, notes=reasons)
 
 

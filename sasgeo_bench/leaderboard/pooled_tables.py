@@ -20,7 +20,7 @@ from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_co
 from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.integrity import SLOW_DRAWS
 from sasgeo_bench.scoring.intervals import bootstrap_means, effective_count, share_interval
-from sasgeo_bench.scoring.metrics import RECALL_AT, primary_of, ranks_of
+from sasgeo_bench.scoring.metrics import primary_of, ranks_of
 from sasgeo_bench.scoring.pose import rank_pose
 from sasgeo_bench.scoring.ranking import Ranks, hits
 from sasgeo_bench.scoring.rejection import answers_of
@@ -31,7 +31,7 @@ from sasgeo_bench.tasks.query import Truth
 
 Scores = Mapping[str, pd.DataFrame]
 
-RANKS: Final = (1, 2, 3, *RECALL_AT[1:])
+RANKS: Final = (1, 2, 3, 5, 10, 20, 50, 100, 200)
 WITHIN_M: Final = "within_25m"  # the figure of the board that a curve of errors passes through
 LEAST_ERROR_M: Final = 0.1
 MOST_ERROR_M: Final = 2000.0

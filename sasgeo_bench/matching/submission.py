@@ -113,7 +113,7 @@ class FileSaid(Document):
     bytes: Count
 
 
-class TaskSaid(Document):
+class TaskManifest(Document):
     """A task that was answered: its queries, by the hash of their file, and how many of them have a row."""
 
     suite: Folder
@@ -134,7 +134,7 @@ class Submission(Document):
     data_version: int
     scorer_version: int
     made_by: Short
-    tasks: Annotated[list[TaskSaid], Field(min_length=1, max_length=100_000)]
+    tasks: Annotated[list[TaskManifest], Field(min_length=1, max_length=100_000)]
     files: Annotated[dict[str, FileSaid], Field(max_length=100)]
     licence: Short
     attribution: Line

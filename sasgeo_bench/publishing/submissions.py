@@ -13,7 +13,7 @@ from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.matching.plugins import shipped_names
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskSaid
+from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_settings
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
@@ -211,7 +211,7 @@ def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Predict
     return {item.query_id: item for item in prediction_files.read_predictions(predictions)}
 
 
-def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predictions: Path) -> list[TaskSaid]:
+def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predictions: Path) -> list[TaskManifest]:
     """All tasks of every suite that is answered at all: whoever answers chooses suites, and nothing within them."""
     counts = [(task, sum(name in rows for name in task.asked)) for task in tasks]
     suites = {task.about["suite"] for task, count in counts if count}
@@ -219,7 +219,7 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
         message = f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
         raise ConfigError(message)
     return [
-        TaskSaid(
+        TaskManifest(
             suite=task.about["suite"],
             region=task.about["region"],
             queries_sha256=task.about["files"][task_files.QUERIES]["sha256"],

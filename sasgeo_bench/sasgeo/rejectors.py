@@ -8,12 +8,13 @@ from typing import Final, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 from sklearn.ensemble import GradientBoostingClassifier  # type: ignore[import-untyped, unused-ignore]
 from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
 
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.sasgeo.conformal import upper_rate
 from sasgeo_bench.sasgeo.frame import Frame, Rows, features, is_none, lead
 
 _DECIMALS: Final = 12  # of a probability: the last digits of a fit depend on memory alignment
@@ -139,19 +140,6 @@ class _FittedModel:
         """Return the probability of a false fix, shape (N,)."""
         chance = special.expit(self.model.log_odds(self.frame.filled(features(answers))))
         return np.asarray((self.answers * chance + 1.0) / (self.answers + 2.0))
-
-
-def upper_rate(failures: float, trials: float, *, confidence: float = 0.95) -> float:
-    """Return Clopper-Pearson's one-sided upper bound on a rate, in [0, 1]; 1 without a trial.
-
-    Counts need not be whole; 0 <= failures <= trials.
-
-    Examples
-    --------
-    >>> round(upper_rate(0, 299), 4), upper_rate(0, 0)
-    (0.01, 1.0)
-    """
-    return 1.0 if failures == trials else float(stats.beta.ppf(confidence, failures + 1.0, trials - failures))
 
 
 @dataclass(frozen=True, kw_only=True)

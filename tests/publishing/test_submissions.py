@@ -512,7 +512,7 @@ def test_submissions_stand_beside_what_was_run_and_say_so(copied, stored, tmp_pa
     again = table[table["matcher"] == "prior_centre"].drop(columns="detectable").reset_index(drop=True)
     pd.testing.assert_frame_equal(again, before.drop(columns="detectable"))
     text = (tmp_path / "both" / "leaderboard.md").read_text(encoding="utf-8")
-    assert "| mine | as submitted |" in text
+    assert "| mine (as submitted) |" in text
     assert "<script>" not in text
 
 
@@ -534,7 +534,7 @@ def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, t
     assert entry["set_apart"] == why
     assert set(entry["trained_on"]) <= {"munich", "town-riverside"}
     text = (tmp_path / "both" / "leaderboard.md").read_text(encoding="utf-8")
-    assert ("## Set apart: clean, localization" in text) == (why is not None)
+    assert ("## Set apart, not to be compared with those above: clean, localization" in text) == (why is not None)
     assert (f"- mine is set apart: {why}." in text) == (why is not None)
     assert (f"mine: set apart, {why}" in lines) == (why is not None)
 

@@ -44,15 +44,17 @@ from sasgeo_bench.scoring.rows import Row
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import Place, SplitFile
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.task_files import TaskSaid
+from sasgeo_bench.tasks.task_files import TaskManifest
 from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, TRUTH_SCHEMA
 
 # Headings of the API pages, by the folder that a public name comes from.
 STAGES: Final = {
+    "cli": "Stages as functions",
     "bounds": "Bounds of an answer",
     "geometry": "Poses and grids",
     "osm": "OpenStreetMap features",
     "regions": "Regions and evidence",
+    "search": "Dense pose search",
     "tasks": "Queries and truths",
     "matching": "Matchers and rejectors",
     "running": "Predictions and conformance",
@@ -73,7 +75,7 @@ _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
     "Submission card": ("`card.toml`", {"": Card}),
     "Submission": ("`submission.json`", {"": Submission}),
     "Region manifest": ("`region.json`", {"": Manifest}),
-    "Task manifest": ("`task.json`", {"": TaskSaid}),
+    "Task manifest": ("`task.json`", {"": TaskManifest}),
 }
 _TABLES: Final[dict[str, tuple[str, pa.Schema, tuple[type, ...]]]] = {
     "Queries": ("`out/tasks/<suite>/<region>/queries.parquet`", FILE_SCHEMA, (Query, Evidence, Prior)),

@@ -6,12 +6,15 @@ import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
+import sasgeo_bench as sgb
 from docs.site import reference
 from sasgeo_bench.cli import program
 from sasgeo_bench.running.prediction_rows import PART_SCHEMA
@@ -30,6 +33,7 @@ WRITTEN = sorted(
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
 PATHS = re.compile(r"\b(?:sasgeo_bench|baselines|benchmarks|tests|docs)/[\w./-]*\w\.(?:py|md|toml|sh)\b")
 MOST_TERMS = 60
+ENTRY_POINTS = ("sasgeo_bench.matchers", "sasgeo_bench.rejectors")
 
 
 def read(path: Path) -> str:
@@ -116,6 +120,30 @@ def test_every_file_that_a_document_names_is_there(path):
     assert [name for name in PATHS.findall(text) if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_name_of_the_code_in_a_document_is_there(path):
+    for name in set(re.findall(r"\bsasgeo_bench(?:\.\w+)+|\bsgb\.\w+", read(path))):
+        parts = name.replace("sgb.", "sasgeo_bench.").split(".")
+        if name not in ENTRY_POINTS and parts[-1] not in ("toml", "py"):
+            assert resolves(parts), name
+
+
+def resolves(parts):
+    """Whether a dotted name is a module, or something in one."""
+    module = ".".join(parts[:-1])
+    return hasattr(import_module(module), parts[-1]) or find_spec(".".join(parts)) is not None
+
+
+def test_the_perturbation_of_the_guide_keeps_to_its_rules():
+    (code,) = re.findall(r"^```python\n(.*?)^```$", read(DOCS / "howto" / "perturbation.md"), re.MULTILINE | re.DOTALL)
+    made: dict[str, object] = {}
+    exec(code, made)  # noqa: S102 - of our own documents
+    view = sgb.Evidence(classes=("water",), cells=np.zeros((1, 8, 4), dtype=np.uint8), cell_size_m=1.0)
+    seen = made["Stripes"](share=0.5)(view, np.random.default_rng(0))  # type: ignore[operator]
+    assert seen.unknown_share == 0.5
+    assert made["Stripes"](share=0.0)(view, np.random.default_rng(0)) is view  # type: ignore[operator]
+
+
 def test_the_readme_is_read_in_four_minutes():
     text = read(ROOT / "README.md")
     assert len(text.splitlines()) <= 150
@@ -138,8 +166,9 @@ def test_a_notebook_needs_public_names_alone(path):
     imported |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
     assert "sasgeo_bench" in imported
     assert imported - {"sasgeo_bench"} <= sys.stdlib_module_names
-    commands = re.findall(r"^# !(\S+)", read(path), flags=re.MULTILINE)
-    assert {"sasgeo-bench"} <= set(commands) <= {"sasgeo-bench", "sed"}
+    cells = re.findall(r'^# %% magic_args="-e" language="bash"\n((?:# .*\n)+)', read(path), flags=re.MULTILINE)
+    assert {line.split()[1] for cell in cells for line in cell.splitlines()} == {"sasgeo-bench"}
+    assert not re.search(r"^# !", read(path), flags=re.MULTILINE)  # its failure would go unseen
 
 
 @pytest.mark.slow  # half a minute; `make docs` does it, and runs the notebook too

@@ -138,8 +138,8 @@ class RareClass:
 # everything is unknown. `module:Class` names a matcher that is not installed; a package of your own begins with
 # `sasgeo-bench new-matcher`.
 
-# %%
-# !sasgeo-bench check-matcher rare_class:RareClass
+# %% magic_args="-e" language="bash"
+# sasgeo-bench check-matcher rare_class:RareClass
 
 # %% [markdown]
 # ## Ask it questions
@@ -147,27 +147,27 @@ class RareClass:
 # Build a synthetic town, draw the suite `clean` on it at two sites, and answer the queries. `random` and
 # `prior_centre` are the baselines to beat: one guesses, the other answers with the centre of the prior.
 
-# %%
-# !sasgeo-bench build-region town-riverside
-# !sasgeo-bench make-queries --suite clean --regions town-riverside --n 2
+# %% magic_args="-e" language="bash"
+# sasgeo-bench build-region town-riverside
+# sasgeo-bench make-queries --suite clean --regions town-riverside --n 2
 
-# %%
-# !sasgeo-bench run --matcher rare_class:RareClass --tasks out/tasks/clean/town-riverside --jobs 2
-# !sasgeo-bench run --matcher prior_centre --tasks out/tasks/clean/town-riverside
-# !sasgeo-bench run --matcher random --tasks out/tasks/clean/town-riverside
+# %% magic_args="-e" language="bash"
+# sasgeo-bench run --matcher rare_class:RareClass --tasks out/tasks/clean/town-riverside --jobs 2
+# sasgeo-bench run --matcher prior_centre --tasks out/tasks/clean/town-riverside
+# sasgeo-bench run --matcher random --tasks out/tasks/clean/town-riverside
 
 # %% [markdown]
 # ## Read the row
 #
 # `score` holds the answers against the truths and writes a board: tables, figures and pictures of failures.
 
-# %%
-# !sasgeo-bench score --predictions out/runs --tasks out/tasks/clean/town-riverside --name first
-
-# %%
-# !sed -n '/^## clean/,/^## Costs/p' out/boards/first/leaderboard.md | grep -v Costs
+# %% magic_args="-e" language="bash"
+# sasgeo-bench score --predictions out/runs --tasks out/tasks/clean/town-riverside --name first
 
 # %% [markdown]
+# The row is there, with its interval. `out/boards/first/leaderboard.md` holds the whole board, with costs, strata and
+# the meaning of each column.
+#
 # Two sites in one place are one block, or few. Intervals are wide, and with fewer than six blocks nobody is ranked:
 # the board says so instead of showing an order that the next draw would change. For a row that can be ranked, ask more
 # sites in more places: `sasgeo-bench leaderboard demo --matcher rare_class:RareClass`.

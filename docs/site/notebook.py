@@ -2,10 +2,12 @@
 """Execute the notebooks of docs/ and write them as pages."""
 
 import os
+import re
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 LIMIT_S: Final = 900
 
@@ -29,13 +31,24 @@ def pages(folder: Path, scratch: Path) -> dict[str, str | bytes]:
                 # Sockets in a private folder, not ports; their paths must be short.
                 kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=f"{sockets}/kernel")
                 program = Path(sys.executable).parent  # where the commands of this environment are
-                own = {"PATH": f"{program}:{os.environ['PATH']}", "TERM": "dumb", "IPYTHONDIR": sockets}
+                own = {"PATH": f"{program}:{os.environ['PATH']}", "IPYTHONDIR": sockets}
                 place = {"metadata": {"path": home}}
                 client = NotebookClient(notebook, timeout=LIMIT_S, km=kernel, resources=place)
                 client.execute(env=os.environ | own)
         for cell in (cell for cell in notebook.cells if cell.cell_type == "code"):
-            cell["outputs"] = [item for item in cell.get("outputs", ()) if item.get("name") != "stderr"]
+            cell["outputs"] = _joined(item for item in cell.get("outputs", ()) if item.get("name") != "stderr")
         text, resources = MarkdownExporter().from_notebook_node(notebook)
-        made[f"notebooks/{path.stem}.md"] = text
+        made[f"notebooks/{path.stem}.md"] = re.sub(r"^```\w+\n%%bash -e\n", "```bash\n", text, flags=re.MULTILINE)
         made |= {f"notebooks/{name}": content for name, content in resources["outputs"].items()}
     return made
+
+
+def _joined(outputs: Iterable[Any]) -> list[Any]:
+    """Return outputs with the pieces of what was printed put together."""
+    joined: list[Any] = []
+    for item in outputs:
+        if joined and item.output_type == joined[-1].output_type == "stream":
+            joined[-1].text += item.text
+        else:
+            joined.append(item)
+    return joined

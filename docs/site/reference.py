@@ -49,10 +49,12 @@ from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, TRUTH_SCHEMA
 
 # Headings of the API pages, by the folder that a public name comes from.
 STAGES: Final = {
+    "cli": "Stages as functions",
     "bounds": "Bounds of an answer",
     "geometry": "Poses and grids",
     "osm": "OpenStreetMap features",
     "regions": "Regions and evidence",
+    "search": "Dense pose search",
     "tasks": "Queries and truths",
     "matching": "Matchers and rejectors",
     "running": "Predictions and conformance",

@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rectangles that hide a share of the view: smoke, signs, masts, a lost tile of the image."""
 
+from functools import lru_cache
 from typing import Final
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.geometry.angles import rotation
+from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, Occlusion
+from sasgeo_bench.tasks.perturbations.fields import Field, centres, dilated, highest, smooth_noise, top_share
 
 _DRAWS: Final = 256  # rectangles drawn at a time
 _SIDES: Final = (0.08, 0.35)  # smallest and largest side of a rectangle, as fractions of the view's side
@@ -56,3 +61,149 @@ def _cover(window: Mask, most_cells: int) -> int:
     last = np.flatnonzero(~window[rows])[: most_cells - spent]
     window[rows, last] = True
     return most_cells
+
+
+MASKS: Final = 32
+_KINDS: Final = 4
+
+
+class AdversarialMask(Occlusion):
+    """Cover the view with that of 32 fixed masks which hides most present cells.
+
+    The masks (spots, bars, clouds, far corners; eight of each) depend on neither the view nor the generator. So no mask
+    is fitted to the truth cell by cell, and every method meets the same masks.
+    """
+
+    def mask(self, evidence: Evidence, _rng: np.random.Generator) -> Mask:
+        """Return the mask that hides most present cells; the first of them if several do."""
+        present = np.add.reduce(evidence.cells == PRESENT, axis=0, dtype=np.float32)
+        covered = np.einsum("mp,p->m", _halved(evidence.shape, self.share), _half(present).ravel())
+        return np.asarray(library(evidence.shape, self.share)[int(np.argmax(covered))])
+
+
+@lru_cache(maxsize=4)
+def library(shape: tuple[int, int], share: float) -> Mask:
+    """Return the masks that each cover a share of a view, shape (32, rows, cols)."""
+    masks = np.stack([top_share(_score(shape, index), share) for index in range(MASKS)])
+    masks.flags.writeable = False
+    return masks
+
+
+@lru_cache(maxsize=4)
+def _halved(shape: tuple[int, int], share: float) -> Field:
+    return np.stack([_half(mask.astype(np.float32)).ravel() for mask in library(shape, share)])
+
+
+def _half(values: Field) -> Field:
+    rows, cols = (max(1, count // 2) for count in values.shape)
+    return np.asarray(cv2.resize(values, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _score(shape: tuple[int, int], index: int) -> NDArray[np.float32]:
+    """Return how early a mask covers each cell, shape (rows, cols); lengths are in halves of the view's side."""
+    rng = np.random.default_rng((20251, index))
+    at = centres(shape, 2 / max(shape))
+    kind = index % _KINDS
+    along, across = at.along_and_across(float(rng.uniform(0, 360)))
+    if kind == 0:
+        spots = rng.uniform(-0.8, 0.8, size=(int(rng.integers(1, 5)), 2))
+        score = np.max([-np.hypot(at.right_m - x, at.up_m - y) for x, y in spots], axis=0)
+    elif kind == 1:
+        offsets = rng.uniform(-0.7, 0.7, size=int(rng.integers(1, 4)))
+        score = np.max([-np.abs(across - offset) for offset in offsets], axis=0)
+    elif kind == 2:  # noqa: PLR2004 - the third kind
+        score = smooth_noise(shape, max(shape) / float(rng.uniform(3, 6)), rng).astype(np.float64)
+    else:
+        score = along + rng.uniform(0, 0.8) * np.abs(across)
+    return np.asarray(score, dtype=np.float32)
+
+
+HIDDEN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "field_boundary")
+_OVERHANG_M: Final = 4.0  # of crowns over the edge of green
+_SHADOW_M: Final = 8.0  # length of a building's shadow
+_PATCH_M: Final = 8.0  # width of a crown, or of a gap between crowns
+
+
+class CanopyAndShadow(Occlusion):
+    """Make lines unknown under trees and in shadows; `share` is that of the shaded cells.
+
+    The sun stands anywhere. A hidden cell is unknown for every line class, whether a line runs there or not: unknown
+    cells must not show where roads are.
+    """
+
+    def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
+        """Return the part of the shade where the noise is strongest, for the line classes."""
+        shade = shaded(evidence, rng.uniform(0, 360))
+        noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
+        hidden = shade & (noise >= highest(noise[shade], self.share * np.count_nonzero(shade)))
+        return np.asarray(hidden & np.isin(evidence.classes, HIDDEN)[:, None, None])
+
+
+def shaded(evidence: Evidence, sun_deg: float) -> Mask:
+    """Return where crowns and shadows can fall, shape (rows, cols); `sun_deg` is clockwise from the view's up."""
+    shade = np.zeros(evidence.shape, dtype=bool)
+    if "green" in evidence.classes:
+        shade |= dilated(evidence.layer("green") == PRESENT, _OVERHANG_M / evidence.cell_size_m)
+    if "building" in evidence.classes and evidence.cell_size_m <= _SHADOW_M:
+        building = evidence.layer("building") == PRESENT
+        shade |= shadow(building, sun_deg, _SHADOW_M / evidence.cell_size_m)
+        shade &= ~building
+    return shade
+
+
+def shadow(building: Mask, sun_deg: float, length_cells: float) -> Mask:
+    """Extend buildings away from the sun."""
+    reach = int(np.ceil(length_cells))
+    right, up = rotation(sun_deg)[:, 1]
+    # A cell is in shadow if a building stands between it and the sun, so the element points towards the sun.
+    element = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+    end = (reach + round(length_cells * right), reach - round(length_cells * up))
+    cv2.line(element, (reach, reach), end, color=1, thickness=1)
+    return np.asarray(cv2.dilate(building.view(np.uint8), element), dtype=np.uint8).view(np.bool_)
+
+
+_RADIUS_M: Final = 20.0
+_WATER_BONUS: Final = 1.5  # added to the strength of glare where all is water; the strength has a deviation of 0.575
+_RIM: Final = 0.3  # relative difference from the mean size of the largest and smallest blobs, those of two classes
+
+
+class Glare(Occlusion):
+    """Hide soft blobs; `share` is that of the cells over all classes.
+
+    A soft edge in three states: a blob reaches less far for some classes than for others, at random in each view. If
+    the share exceeds 1 / 1.3, the sizes of blobs differ less, so that the mean stays.
+    """
+
+    def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
+        """Return the blobs, shape (C, rows, cols)."""
+        radius_cells = _RADIUS_M / evidence.cell_size_m
+        strength = smooth_noise(evidence.shape, 2 * radius_cells, rng)
+        if "water" in evidence.classes:
+            water = (evidence.layer("water") == PRESENT).astype(np.float32)
+            reach = max(1, round(radius_cells / 2))
+            strength += np.float32(_WATER_BONUS) * cv2.blur(water, (reach, reach))
+        rim = min(_RIM, (1 - self.share) / self.share)
+        reaches = self.share * (1 + rim * np.linspace(-1, 1, len(evidence.classes)))
+        if len(evidence.classes) == 1:
+            reaches[:] = self.share
+        ordered = np.sort(strength, axis=None)[::-1]
+        counts = (rng.permutation(reaches) * ordered.size).round().astype(int)
+        limits = ordered[np.clip(counts - 1, 0, None)]
+        return np.asarray(strength >= limits[:, None, None])
+
+
+_SPREAD: Final = 0.4  # weight of the sides against the far end: 0 cuts straight across, 1 cuts a corner of 90 degrees
+
+
+class TiltWedge(Occlusion):
+    """Hide the far end of the view in a random direction of lean."""
+
+    def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
+        """Return the cells that lie farthest in the direction of the lean."""
+        return far_side(evidence, self.share, rng.uniform(0, 360))
+
+
+def far_side(evidence: Evidence, share: float, direction_deg: float) -> Mask:
+    """Return the cells that lie farthest in a direction, clockwise from the view's up."""
+    along, across = centres(evidence.shape, evidence.cell_size_m).along_and_across(direction_deg)
+    return top_share((along + _SPREAD * np.abs(across)).astype(np.float32), share)

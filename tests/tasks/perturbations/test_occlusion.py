@@ -7,15 +7,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.adversarial import MASKS, AdversarialMask, library
 from sasgeo_bench.tasks.perturbations.base import share_hidden
 from sasgeo_bench.tasks.perturbations.border import Border
-from sasgeo_bench.tasks.perturbations.canopy import HIDDEN, CanopyAndShadow, shaded, shadow
 from sasgeo_bench.tasks.perturbations.crop import CentralCrop
 from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
-from sasgeo_bench.tasks.perturbations.glare import Glare
-from sasgeo_bench.tasks.perturbations.occlusion import Rectangles
-from sasgeo_bench.tasks.perturbations.wedge import TiltWedge, far_side
+from sasgeo_bench.tasks.perturbations.occlusion import (
+    HIDDEN,
+    MASKS,
+    AdversarialMask,
+    CanopyAndShadow,
+    Glare,
+    Rectangles,
+    TiltWedge,
+    far_side,
+    library,
+    shaded,
+    shadow,
+)
 
 BY_SHARE = (Rectangles, Border, TiltWedge, Glare, AdversarialMask, CentralCrop, FalseUnknown)
 

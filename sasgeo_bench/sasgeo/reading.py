@@ -5,12 +5,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.geometry.angles import wrap_deg
+from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
@@ -19,12 +22,171 @@ from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
+from sasgeo_bench.sasgeo.pairs import JUNCTIONS, JunctionPairs
 from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
-from sasgeo_bench.sasgeo.tuples import proposals
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.tasks.query import Query
+
+APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones give no heading, farther ones are seldom both in a view
+SLACK_M: Final = 4.0  # tolerance of their distance
+MOST_PAIRS: Final = 150  # of a view, the longest: they give the best heading
+_PLACE_M, _YAW_DEG, _LOG_SCALE = 12.0, 8.0, 0.08  # votes within these are for one pose
+_ROUNDS: Final = 2
+_TRIED: Final = 10  # cells of votes tried for each requested pose
+_SIGMAS: Final = 3.0
+_REACH: Final = 1.0 + 1e-6  # tolerance, so that a mean keeps some of its votes
+
+
+class Proposal(NamedTuple):
+    """A pose and its votes: the sum of the rarities of agreeing pairs of junctions, nats."""
+
+    pose: Pose
+    votes: float
+
+
+def proposals(
+    seen: ObservedGraph,
+    mapped: MappedGraph,
+    *,
+    count: int,
+    scales: tuple[float, float] = (1.0, 1.0),
+    prior: Prior | None = None,
+) -> list[Proposal]:
+    """Propose poses from pairs of junctions whose arms agree.
+
+    Each pair of the view is looked up among those of the map by length, within the scales, and directions of arms. Each
+    hit votes for one pose, in closed form, with a weight that falls with the number of hits for that length.
+
+    Parameters
+    ----------
+    seen : ObservedGraph
+        The view.
+    mapped : MappedGraph
+        The map.
+    count : int
+        Poses at most.
+    scales : tuple of float
+        Least and greatest scale of the view.
+    prior : Prior, optional
+        Poses outside of its disc, or beyond three sigma of its heading, are dropped.
+
+    Returns
+    -------
+    list of Proposal
+        The most votes first; empty where the view shows no two junctions.
+
+    Raises
+    ------
+    ConfigError
+        If the scales are not positive, finite and in order.
+    """
+    if not 0 < scales[0] <= scales[1] < math.inf:
+        message = f"scales are the least and the greatest scale, both positive and finite, got {scales!r}"
+        raise ConfigError(message)
+    cast = np.concatenate([np.zeros((0, 6)), *(_votes(seen.nodes, mapped, kind, scales) for kind in JUNCTIONS)])
+    if prior is not None:
+        cast = cast[_may_be(cast, prior)]
+    return _counted(cast, count) if len(cast) and count > 0 else []
+
+
+def _votes(nodes: Nodes, mapped: MappedGraph, kind: int, scales: tuple[float, float]) -> Floats:
+    """Return easting, northing, yaw, scale, weight and number of the pair for each hit, shape (V, 6)."""
+    ours, found = JunctionPairs.of(nodes, kind, range_m=APART_M), [np.zeros((0, 6))]
+    for theirs in mapped.junction_pairs[kind]:
+        low, high = (
+            np.searchsorted(theirs.length_m, ours.length_m * scale + slack_m)
+            for scale, slack_m in zip(scales, (-SLACK_M, SLACK_M), strict=True)
+        )
+        for number in range(max(0, len(ours.length_m) - MOST_PAIRS), len(ours.length_m)):
+            first, last = int(low[number]), int(high[number])
+            hits = theirs.like(ours.arms[number], first, last)
+            if len(hits):
+                poses = _similarities(nodes, ours, number, mapped, theirs, hits, scales)
+                rarity = math.log((last - first + 1) / len(hits))  # always positive
+                about = np.broadcast_to([rarity, number], (len(hits), 2))
+                found.append(np.column_stack((poses, about)))
+    return np.concatenate(found)
+
+
+def _similarities(
+    nodes: Nodes,
+    ours: JunctionPairs,
+    number: int,
+    mapped: MappedGraph,
+    theirs: JunctionPairs,
+    hits: Ints,
+    scales: tuple[float, float],
+) -> Floats:
+    """Return the similarities from one pair of the view to pairs of the map: easting, northing, yaw, scale, (H, 4)."""
+    yaw_deg = theirs.bearing_deg[hits] - ours.bearing_deg[number]
+    scale = np.clip(theirs.length_m[hits] / ours.length_m[number], *scales)
+    right_m, up_m = nodes.places_m[ours.ends[number]].mean(axis=0)
+    sine, cosine = np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg))
+    turned_m = np.column_stack((cosine * right_m + sine * up_m, cosine * up_m - sine * right_m))
+    middle_m = mapped.nodes.places_m[theirs.ends[hits]].mean(axis=1) - scale[:, None] * turned_m
+    return np.column_stack((middle_m, yaw_deg, scale))
+
+
+def _may_be(cast: Floats, prior: Prior) -> Bools:
+    """Return which poses a prior allows."""
+    fits = np.ones(len(cast), dtype=bool)
+    if prior.center_m is not None and prior.radius_m is not None:
+        fits &= np.hypot(*(cast[:, :2] - prior.center_m).T) <= prior.radius_m + _PLACE_M
+    if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
+        fits &= np.abs(wrap_deg(cast[:, 2] - prior.yaw_deg)) <= _SIGMAS * prior.yaw_sigma_deg
+    return fits
+
+
+def _counted(cast: Floats, count: int) -> list[Proposal]:
+    """Return poses with the most votes, best first, no two for one place and heading."""
+    at = _spread(cast)
+    tree = cKDTree(at)
+    found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, _TRIED * count)]
+    kept: list[tuple[Proposal, Floats]] = []
+    for proposal, place in sorted(found, key=lambda item: -item[0].votes):
+        if all(np.linalg.norm(place - other) > 2 * _REACH for _, other in kept):
+            kept.append((proposal, place))
+    return [proposal for proposal, _ in kept[:count]]
+
+
+def _spread(cast: Floats) -> Floats:
+    """Return votes as points, shape (V, 5): those for one pose lie within 1 of each other, and headings wrap around."""
+    turn = np.radians(cast[:, 2:3])
+    return np.column_stack(
+        (
+            cast[:, :2] / _PLACE_M,
+            np.concatenate((np.cos(turn), np.sin(turn)), axis=1) / math.radians(_YAW_DEG),
+            np.log(cast[:, 3]) / _LOG_SCALE,
+        )
+    )
+
+
+def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
+    """Return centres of the cells with the most votes, shape (S, 5)."""
+    _, cell = np.unique(np.floor(at).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    weight = np.bincount(cell, weights=cast[:, 4])
+    middle = np.column_stack([np.bincount(cell, weights=part) for part in at.T]) / np.bincount(cell)[:, None]
+    return np.asarray(middle[np.argsort(-weight, kind="stable")[:most]])
+
+
+def _gathered(cast: Floats, at: Floats, tree: cKDTree, start: Floats) -> tuple[Proposal, Floats]:
+    """Return the pose of the votes around a point, and its point; each pair of the view votes once."""
+    place = at[tree.query(start)[1]]
+    for _ in range(_ROUNDS):
+        near = np.array(sorted(tree.query_ball_point(place, _REACH)), dtype=np.int64)
+        some = cast[near]
+        place = np.average(at[near], axis=0, weights=some[:, 4])
+    east_m, north_m = (place[:2] * _PLACE_M).tolist()
+    yaw_deg = math.degrees(math.atan2(place[3], place[2]))
+    best = np.zeros(int(some[:, 5].max()) + 1)
+    np.maximum.at(best, some[:, 5].astype(np.int64), some[:, 4])
+    pose = Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaw_deg, scale=math.exp(place[4] * _LOG_SCALE))
+    return Proposal(pose=pose, votes=float(best.sum())), place
+
 
 DAYS_PER_YEAR: Final = 365.25
 LEAST_SIGMA_M: Final = 1.0  # of a refined position: half a cell of the search

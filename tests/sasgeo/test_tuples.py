@@ -17,7 +17,7 @@ from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.nodes import nothing
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.pairs import JUNCTIONS, SECTORS, JunctionPairs
-from sasgeo_bench.sasgeo.tuples import proposals
+from sasgeo_bench.sasgeo.reading import proposals
 from sasgeo_bench.tasks.suites.base import State
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 

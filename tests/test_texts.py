@@ -31,7 +31,7 @@ from sasgeo_bench.leaderboard.text import board_markdown
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.site import _environment
-from sasgeo_bench.publishing.svg import svg_fault
+from sasgeo_bench.publishing.site_files import svg_fault
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.controls import Verdict

@@ -13,7 +13,7 @@ from sasgeo_bench.ageing.ratebook_file import load_ratebook
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
-from sasgeo_bench.publishing.site_board import contrasts_of, places_of
+from sasgeo_bench.publishing.site import contrasts_of, places_of
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import SiteSource, Spot

@@ -14,10 +14,9 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.leaderboard.board_files import PROTECTION, Extra, check_board, read_board, write_board
-from sasgeo_bench.leaderboard.latex import board_latex
 from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
-from sasgeo_bench.leaderboard.text import board_markdown
+from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Lines, Progress, Tell

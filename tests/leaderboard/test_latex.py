@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.leaderboard.latex import board_latex
+from sasgeo_bench.leaderboard.text import board_latex
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.handmade import about_of, asked
 from tests.test_texts import NASTY

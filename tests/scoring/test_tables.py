@@ -10,9 +10,8 @@ import pytest
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.leaderboard.board_tables import Book, summary
-from sasgeo_bench.leaderboard.latex import board_latex
 from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import board_markdown, tables_of, warnings_of
+from sasgeo_bench.leaderboard.text import board_latex, board_markdown, tables_of, warnings_of
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict

@@ -1,31 +1,175 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board holds of the paper's experiment besides its own files: the order of the steps."""
 
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pandas as pd
 
 from sasgeo_bench.experiments.paper.plots import draw_ablation, draw_example, draw_risk, draw_robustness
 from sasgeo_bench.experiments.paper.tables import (
+    METRICS,
+    PUBLISHED,
     example_of,
     risk_frame,
     robustness_frame,
     summary_frame,
     trials_frame,
+    used_interval,
 )
 from sasgeo_bench.experiments.paper.task import DATA, SUITE
-from sasgeo_bench.experiments.paper.text import paper_markdown
 from sasgeo_bench.experiments.paper.windows import CANDIDATES
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.build import Board
+from sasgeo_bench.leaderboard.text import markdown_table
+from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.sheet import Panel
+
+_LEAST_P: Final = 0.001
+
+
+def paper_markdown(
+    summary: pd.DataFrame, findings: Sequence[Finding], about: Mapping[str, str], figures: Mapping[str, str]
+) -> str:
+    """The summary as a document.
+
+    Parameters
+    ----------
+    summary : pandas.DataFrame
+        From `summary_frame`.
+    findings : sequence of Finding
+        Contrasts of this suite.
+    about : mapping
+        "trials" in words, "made_by" and "data".
+    figures : mapping of str to str
+        File -> caption.
+    """
+    known = [item.matcher for item in PUBLISHED if item.matcher in set(summary["matcher"])]
+    others = [name for name in dict.fromkeys(summary["matcher"]) if name not in known]
+    source = f"{about['trials']}. Made by {about['made_by']}. Data: {about['data']}."
+    lines = ["# The paper's experiment", "", source, "", _interval_note(summary), ""]
+    if known:
+        lines += ["## Beside the paper's Table II", "", *_table(_beside(summary, known)), ""]
+        lines += ["## Each difference", "", *(f"- {line}" for line in difference_lines(summary)), ""]
+    steps = _steps(findings)
+    if len(steps):
+        lines += ["## From variant to variant", "", *_table(steps), ""]
+    if others:
+        lines += ["## Controls and other matchers", "", *_table(_beside(summary, others)), ""]
+    lines += ["## Figures", "", *(f"- [{caption}](figures/{name})" for name, caption in figures.items()), ""]
+    return "\n".join(lines)
+
+
+def _table(table: pd.DataFrame) -> Iterator[str]:
+    return markdown_table(map(str, table.columns), (map(str, row) for row in table.itertuples(index=False)))
+
+
+def _interval_note(summary: pd.DataFrame) -> str:
+    """Explain the intervals and their limits."""
+    first = summary.iloc[0]
+    if first["cluster"] == "tile":
+        return (
+            "Intervals are 95 %: Wilson's, which take trials for independent, as the paper's do. They are not: those "
+            f"of one seed share its tiles. `by tiles` resamples the {first['clusters']} tiles, then trials within "
+            "each, and is never narrower. One seed says nothing of others."
+        )
+    return (
+        f"Intervals are 95 %: {first['clusters']} seeds are resampled, then trials within each, and no interval is "
+        "narrower than Wilson's. `Wilson` takes trials for independent; they are not, for those of one seed share its "
+        "tiles."
+    )
+
+
+def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
+    """Return a matcher a line: each figure of the paper and ours; of Recall@1 the other interval too."""
+    rows = []
+    for matcher in matchers:
+        mine = _by_metric(summary, matcher)
+        row = {"method": mine["recall_1"]["title"]}
+        for metric, title in METRICS.items():
+            one = mine[metric]
+            if not math.isnan(one["paper"]):
+                row[f"{title}, paper"] = shown(one["paper"], one["paper_lo"], one["paper_hi"])
+            row[f"{title}, ours"] = shown(one["value"], *used_interval(one))
+            if metric == "recall_1":
+                is_tile = one["cluster"] == "tile"
+                other = (one["cluster_lo"], one["cluster_hi"]) if is_tile else (one["lo"], one["hi"])
+                row["by tiles" if is_tile else "Wilson"] = shown(one["value"], *other).partition(" ")[2] or "-"
+        rows.append(row | {"n": str(mine["recall_1"]["n"])})
+    return pd.DataFrame(rows).fillna("-")
+
+
+def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]:
+    """Rows of one matcher."""
+    rows = summary[summary["matcher"] == matcher].to_dict("records")
+    return {str(row["metric"]): {str(name): value for name, value in row.items()} for row in rows}
+
+
+def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
+    """Return a figure as the paper prints it.
+
+    Examples
+    --------
+    >>> shown(0.586, 0.52, 0.649), shown(1.0)
+    ('0.586 [0.520, 0.649]', '1.000')
+    """
+    if math.isnan(value):
+        return "-"
+    return f"{value:.3f}" if math.isnan(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
+
+
+def difference_lines(summary: pd.DataFrame) -> Iterator[str]:
+    """Yield a line for each of the paper's variants: the distance of each figure from the paper's."""
+    for item in PUBLISHED:
+        mine = _by_metric(summary, item.matcher)
+        if mine:
+            told = [f"{title} {_difference(mine[metric])}" for metric, title in METRICS.items()]
+            yield f"**{item.title}**: {'; '.join(told)}."
+
+
+def _difference(row: Mapping[str, Any]) -> str:
+    ours, paper = shown(row["value"]), shown(row["paper"])
+    if ours == paper:
+        return f"{ours}, as in the paper"
+    apart = float(ours) - float(paper)  # of the figures as they are printed
+    said = f"{ours} is {abs(apart):.3f} {'above' if apart > 0 else 'below'} the paper's {paper}, which lies "
+    if row["is_within"]:
+        return f"{said}inside our interval"
+    if math.isnan(row["paper_lo"]):
+        return f"{said}outside our interval"
+    lo, hi = used_interval(row)
+    meet = lo <= row["paper_hi"] and row["paper_lo"] <= hi
+    return f"{said}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
+
+
+def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
+    """Consecutive variants: the paper's difference in Recall@1 and ours, paired."""
+    rows = []
+    for before, after in pairwise(PUBLISHED):
+        one = next((item for item in findings if (item.first, item.second) == (after.matcher, before.matcher)), None)
+        if one is not None:
+            rows.append(
+                {
+                    "step": f"{before.title} -> {after.title}",
+                    "paper": f"{after.recall_1 - before.recall_1:+.3f}",
+                    "ours, paired": f"{one.difference:+.3f}"
+                    + ("" if math.isnan(one.lo) else f" [{one.lo:+.3f}, {one.hi:+.3f}]"),
+                    "won and lost": f"{one.first_only} and {one.second_only} of {one.n}",
+                    "p (Holm)": "< 0.001" if one.p_holm < _LEAST_P else f"{one.p_holm:.3f}",
+                    "verdict": one.verdict,
+                }
+            )
+    return pd.DataFrame(rows)
+
 
 KINDS: Final = ("png", "svg")
 CAPTIONS: Final = {

@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sasgeo_bench.experiments.paper.board import difference_lines, paper_markdown
 from sasgeo_bench.experiments.paper.tables import (
     PUBLISHED,
     example_of,
@@ -13,7 +14,6 @@ from sasgeo_bench.experiments.paper.tables import (
     summary_frame,
     trials_frame,
 )
-from sasgeo_bench.experiments.paper.text import difference_lines, paper_markdown
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from sasgeo_bench.running.schedule import LEAST_ITEMS, Schedule, pays
+from sasgeo_bench.running.answers import LEAST_ITEMS, Schedule, pays
 
 
 class Clock:

@@ -6,7 +6,7 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.sasgeo.conformal import risk_threshold, upper_rate
-from sasgeo_bench.scoring.protection_metric import supported_risk
+from sasgeo_bench.scoring.protection import supported_risk
 
 ALPHA, DELTA, SPLITS = 0.05, 0.1, 200
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.intervals import wilson
-from sasgeo_bench.scoring.protection_metric import (
+from sasgeo_bench.scoring.protection import (
     conformal_factor,
     stanford_counts,
     statement,

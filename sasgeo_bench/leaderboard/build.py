@@ -28,7 +28,7 @@ from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame, ho
 from sasgeo_bench.scoring.controls import Verdict, hold_controls, is_control, verdict_frame
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS
-from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out
+from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out, set_apart
 from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame, hold_falsifiers
 from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.scoring.protection import protection_frame
@@ -39,7 +39,6 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.scored_tasks import ScoredTask, read_scored_task
 from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
 from sasgeo_bench.scoring.tables import cost_rows, leaderboard
-from sasgeo_bench.scoring.train_test_overlap import set_apart
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, Truth, base_of
 from sasgeo_bench.tasks.split import Split

@@ -2,15 +2,17 @@
 """Entries of a board: runs of matchers, files of predictions, and submissions."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any, Final
 
+import pandas as pd
+
 from sasgeo_bench.bounds import one_line
-from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError
+from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
 from sasgeo_bench.matching.learned_file import LearnedSaid
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.plugins import ORACLE
@@ -21,6 +23,7 @@ from sasgeo_bench.scoring.cost import run_cost
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, RUN_HERE, is_unranked
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission
 from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.split import Split
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
@@ -262,3 +265,37 @@ def _read_run(path: Path) -> dict[str, Any]:
         message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
         raise StoreError(message)
     return about
+
+
+def set_apart(entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None) -> dict[str, str]:
+    """Return by entry why its rows are excluded from ranks; other entries are missing.
+
+    Rows are excluded if the answers about a place come from training on that place. Controls are unranked anyway.
+    `scores` has the columns suite, region and place of every query the entry was asked; `split` assigns the half of
+    each place.
+    """
+    found = {}
+    for entry in entries:
+        places = [] if is_unranked(entry.name) else sorted(set(_overlaps(entry, scores[entry.name], split)))
+        if places:
+            what = places[0] if len(places) == 1 else named(places, "place")
+            found[entry.name] = f"trained on {what}, which it is tested on"
+    return found
+
+
+def _overlaps(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterator[str]:
+    """Yield places that the answers about them were trained on."""
+    for place in dict.fromkeys(scores["place"]):
+        if place in _declared(entry, str(place), split):
+            yield str(place)
+    for about in entry.runs:
+        learned = LearnedSaid.of(about)
+        is_mine = (scores["suite"] == about["suite"]) & (scores["region"] == about["region"])
+        yield from set() if learned is None else set(scores.loc[is_mine, "place"]) & set(learned.trained_on)
+
+
+def _declared(entry: Entry, place: str, split: Split | None) -> Sequence[str]:
+    """Return the declared training places of the answers about a place."""
+    if entry.submission is None:
+        return entry.declared or ()
+    return entry.submission.card.taught(None if split is None else split.half_of.get(place))

@@ -16,13 +16,13 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _MOST_DRAWS: Final = 1_000_000
 
 
-class _Said(BaseModel):
+class _Record(BaseModel):
     """No silent conversion; what a later version says besides is kept."""
 
     model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
 
 
-class ContrastSaid(_Said):
+class ContrastRecord(_Record):
     """A registered contrast; see `scoring.contrasts.Contrast`."""
 
     model_config = ConfigDict(extra="forbid")
@@ -37,7 +37,7 @@ class ContrastSaid(_Said):
     min_effect: Annotated[float, Field(ge=0, le=1)] = 0.03
 
 
-class PipelineSaid(_Said):
+class PipelineRecord(_Record):
     """The pipeline of a board."""
 
     model_config = ConfigDict(extra="forbid")
@@ -46,18 +46,18 @@ class PipelineSaid(_Said):
     sha256: str
 
 
-class VersionSaid(_Said):
+class VersionRecord(_Record):
     """The schema version of a file; other fields are read once the schema is known."""
 
     schema_version: int
 
 
-class PackSaid(_Said):
+class ArchiveRecord(_Record):
     """All of `pack.json`: how the results were scored, and the hash of every file.
 
     Examples
     --------
-    >>> "files" in PackSaid.model_fields
+    >>> "files" in ArchiveRecord.model_fields
     True
     """
 
@@ -66,10 +66,10 @@ class PackSaid(_Said):
     schema_version: Literal[1, 2, 3]
     split: Plain | None
     rejectors: list[str]
-    contrasts: list[ContrastSaid]
+    contrasts: list[ContrastRecord]
     draws: Annotated[int, Field(ge=1, le=_MOST_DRAWS)]
     by_region: list[str]
-    pipeline: PipelineSaid | Annotated[dict[str, Any], Field(max_length=0)]  # empty where there was none
+    pipeline: PipelineRecord | Annotated[dict[str, Any], Field(max_length=0)]  # empty where there was none
     contestants: list[str]
     dropped: str
     files: dict[str, Sha256] | None = None  # of the first version there are none
@@ -77,14 +77,14 @@ class PackSaid(_Said):
     attribution: str = ATTRIBUTION
 
 
-class _Learned(_Said):
+class _Learned(_Record):
     file: str | None
     trained_on: list[str]
     pairs: int
     asked: list[str]
 
 
-class _Card(_Said):
+class _Card(_Record):
     title: str | None = None
     source: str | None = None
     ours: str | None = None
@@ -94,14 +94,14 @@ class _Card(_Said):
     needs: list[str] | None = None
 
 
-class PrivateSaid(_Said):
+class PrivateRecord(_Record):
     """A private seed: what tells that two boards are of the same one, and how many bits it has."""
 
     commitment: Sha256
     bits: Annotated[int, Field(ge=1)]
 
 
-class SeedSaid(_Said):
+class SeedRecord(_Record):
     """One figure of one matcher on both seeds.
 
     Parameters
@@ -137,13 +137,13 @@ class SeedSaid(_Said):
     is_worse: bool
 
 
-class _OnBothSeeds(_Said):
+class _OnBothSeeds(_Record):
     verdict: Literal["run here", "reproduced", "not reproduced"]
     why: str
-    figures: list[SeedSaid]
+    figures: list[SeedRecord]
 
 
-class _Entry(_Said):
+class _Entry(_Record):
     name: str
     version: str | None = None
     hash: str | None = None
@@ -156,19 +156,19 @@ class _Entry(_Said):
     learned: list[_Learned] = []
 
 
-class _Task(_Said):
+class _Task(_Record):
     region: str
     suite: str
     map_date: str | None = None
     queries_sha256: str | None = None
 
 
-class BoardSaid(_Said):
+class BoardRecord(_Record):
     """The fields of `board.json` that pages use.
 
     Examples
     --------
-    >>> BoardSaid.model_validate({"remarks": ["one"]}).remarks
+    >>> BoardRecord.model_validate({"remarks": ["one"]}).remarks
     ['one']
     """
 
@@ -177,12 +177,12 @@ class BoardSaid(_Said):
     data_version: int | None = None
     made_by: str | None = None
     libraries: dict[str, str] = {}
-    pipeline: PipelineSaid | None = None
-    private_seed: PrivateSaid | None = None
-    private: PrivateSaid | None = None
+    pipeline: PipelineRecord | None = None
+    private_seed: PrivateRecord | None = None
+    private: PrivateRecord | None = None
     split: str | None = None
     draws: int | None = None
-    contrasts: list[ContrastSaid] | None = None
+    contrasts: list[ContrastRecord] | None = None
     by_region: list[str] = []
     without: list[str] = []
     rejectors: list[dict[str, str | bool | None]] = []
@@ -192,7 +192,7 @@ class BoardSaid(_Said):
     tasks: list[_Task] = []
 
 
-class _Picture(_Said):
+class _Picture(_Record):
     file: str
     alt: str = ""
     region: str = ""
@@ -207,12 +207,12 @@ class _Case(_Picture):
     said: dict[str, str | float | int | bool | None] | None = None
 
 
-class PicturesSaid(_Said):
+class PicturesRecord(_Record):
     """The content of `pictures.json`.
 
     Examples
     --------
-    >>> PicturesSaid.model_validate({}).cases
+    >>> PicturesRecord.model_validate({}).cases
     []
     """
 
@@ -221,7 +221,7 @@ class PicturesSaid(_Said):
     cases: list[_Case] = []
 
 
-def parse_said(data: bytes | str, model: type[Model]) -> Model:
+def parse_record(data: bytes | str, model: type[Model]) -> Model:
     """Parse JSON from an untrusted source.
 
     Raises
@@ -231,7 +231,7 @@ def parse_said(data: bytes | str, model: type[Model]) -> Model:
 
     Examples
     --------
-    >>> parse_said('{"remarks": 5}', BoardSaid)
+    >>> parse_record('{"remarks": 5}', BoardRecord)
     Traceback (most recent call last):
         ...
     ValueError: remarks is 5: Input should be a valid list

@@ -22,7 +22,7 @@ from sasgeo_bench.files.file_manifest import (
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
-from sasgeo_bench.leaderboard.archive_record import BoardSaid, parse_said
+from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import csv_cell, json_text
 
@@ -32,7 +32,7 @@ SCORES: Final = "scores"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
 PICTURES: Final = "pictures"
-PICTURES_SAID: Final = "pictures.json"
+PICTURES_FILE: Final = "pictures.json"
 _AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a spreadsheet
 _VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
 BOARD_FILES: Final = (
@@ -180,7 +180,7 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """
     try:
         data = (folder / BOARD).read_bytes()
-        parse_said(data, BoardSaid)
+        parse_record(data, BoardRecord)
         return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
     except StoreError:
         raise

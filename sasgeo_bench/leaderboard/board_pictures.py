@@ -13,7 +13,7 @@ import pandas as pd
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
-from sasgeo_bench.leaderboard.board_files import PICTURES_SAID, Extra
+from sasgeo_bench.leaderboard.board_files import PICTURES_FILE, Extra
 from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
 from sasgeo_bench.leaderboard.case_plot import case_pixels
@@ -118,7 +118,7 @@ def pictures_extra(
 
 def _with_list(files: Mapping[str, bytes], said: Mapping[str, Any]) -> dict[str, bytes]:
     content = {**said, "licence": LICENCE, "attribution": ATTRIBUTION}
-    return {**files, PICTURES_SAID: json_text(content).encode()}
+    return {**files, PICTURES_FILE: json_text(content).encode()}
 
 
 def _is_there(about: Mapping[str, Any], root: Path) -> bool:

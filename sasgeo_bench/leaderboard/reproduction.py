@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.archive_record import SeedSaid
+from sasgeo_bench.leaderboard.archive_record import SeedRecord
 from sasgeo_bench.scoring.base import Bools
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.draws import ClusterDraws
@@ -50,7 +50,7 @@ _IS_PUBLIC: Final = (
 )
 
 
-class SeedFigure(SeedSaid):
+class SeedFigure(SeedRecord):
     """One figure of one matcher on both seeds, and what it tells."""
 
     @property

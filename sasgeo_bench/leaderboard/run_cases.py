@@ -14,7 +14,7 @@ from sasgeo_bench.leaderboard.board_pictures import words_of
 from sasgeo_bench.leaderboard.case_panels import Case, read_picture
 from sasgeo_bench.leaderboard.case_plot import CasePicture
 from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector
-from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.running import prediction_files
@@ -160,7 +160,7 @@ def _judged(
 ) -> dict[tuple[str, str], pd.DataFrame]:
     """Return the results of the matcher's own confidence and of some rejectors, where they apply."""
     usable = scores[~is_control(scores)].reset_index(drop=True)
-    is_taught = any(LearnedSaid.of(about) is not None for about in entry.runs)
+    is_taught = any(TrainingRecord.of(about) is not None for about in entry.runs)
     found = {OWN: own_confidence(usable, split, is_taught=is_taught)}
     for name, rule in rules_of(rejectors, split).items():
         found[name] = judge(usable, predictions, rule.make, rule.split, is_taught=is_taught)

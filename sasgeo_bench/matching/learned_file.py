@@ -16,7 +16,7 @@ FOLDER: Final = "learned"  # beside the suites of a run
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LearnedSaid:
+class TrainingRecord:
     """Record of a training in `run.json`.
 
     Parameters
@@ -47,7 +47,7 @@ class LearnedSaid:
 
         Examples
         --------
-        >>> LearnedSaid.of({"learned": None}) is None
+        >>> TrainingRecord.of({"learned": None}) is None
         True
         """
         said = about.get("learned")

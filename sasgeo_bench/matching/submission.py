@@ -106,7 +106,7 @@ class Card(Document):
         return tuple(said) if isinstance(said, list) else ()
 
 
-class FileSaid(Document):
+class SubmittedFile(Document):
     """Hash and size of a file."""
 
     sha256: Sha256
@@ -135,7 +135,7 @@ class Submission(Document):
     scorer_version: int
     made_by: Short
     tasks: Annotated[list[TaskManifest], Field(min_length=1, max_length=100_000)]
-    files: Annotated[dict[str, FileSaid], Field(max_length=100)]
+    files: Annotated[dict[str, SubmittedFile], Field(max_length=100)]
     licence: Short
     attribution: Line
 

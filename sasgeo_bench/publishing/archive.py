@@ -16,7 +16,7 @@ from sasgeo_bench.leaderboard.board_files import BOARD, read_board
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import Board, ScoreRequest, make_board
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
-from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.plugins import check_registered
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive_file import (
@@ -109,7 +109,7 @@ def pack_board(
 def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
     mine = board.predictions[entry.name]
     for source, about in zip(entry.sources, entry.runs, strict=True):
-        said = LearnedSaid.of(about)
+        said = TrainingRecord.of(about)
         named = ids[about["suite"], about["region"]]
         yield StoredRun(
             about=about,

@@ -27,7 +27,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
-from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive_folder import (
     FORMER_LEARNED,
@@ -433,12 +433,12 @@ def _read_runs(folder: Path) -> pa.Table:
 
 
 def _former_learned(folder: Path, about: Mapping[str, Any]) -> str | None:
-    said = LearnedSaid.of(about)
+    said = TrainingRecord.of(about)
     path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(said)
     return path.read_text("utf-8") if path.is_file() else None
 
 
-def _learned_name(said: LearnedSaid | None) -> str:
+def _learned_name(said: TrainingRecord | None) -> str:
     return "" if said is None or said.file is None else _folder_name(Path(said.file).name)
 
 
@@ -467,7 +467,7 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
         run = into / "runs" / _folder_name(_file_of(about))
         place = run / _folder_name(about["suite"]) / _folder_name(about["region"])
         prediction_files.write_run(place, about)
-        said = LearnedSaid.of(about)
+        said = TrainingRecord.of(about)
         if row[LEARNED] is not None:
             (run / learned_file.FOLDER).mkdir(exist_ok=True)
             (run / learned_file.FOLDER / _learned_name(said)).write_text(row[LEARNED], encoding="utf-8")

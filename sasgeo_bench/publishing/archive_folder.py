@@ -23,7 +23,7 @@ from sasgeo_bench.files.file_manifest import (
     resolve_link,
 )
 from sasgeo_bench.files.hashes import sha256_of
-from sasgeo_bench.leaderboard.archive_record import PackSaid, VersionSaid, parse_said
+from sasgeo_bench.leaderboard.archive_record import ArchiveRecord, VersionRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 
 PACK: Final = "pack.json"
@@ -62,11 +62,11 @@ def read_settings(folder: Path) -> dict[str, Any]:
     """
     with sound(folder):
         data = (folder / PACK).read_bytes()
-        found = parse_said(data, VersionSaid).schema_version
+        found = parse_record(data, VersionRecord).schema_version
         if found not in _READ:
             message = f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
             raise StoreError(message)
-        said = parse_said(data, PackSaid)
+        said = parse_record(data, ArchiveRecord)
         if said.files is None and found != _WITHOUT_HASHES:
             message = f"{PACK} lists no files"
             raise ValueError(message)
@@ -139,7 +139,7 @@ def check_replaced(folder: Path) -> None:
         raise StoreError(message)
     if is_pack(folder):
         try:
-            listed = parse_said((folder / PACK).read_bytes(), PackSaid).files
+            listed = parse_record((folder / PACK).read_bytes(), ArchiveRecord).files
         except (OSError, ValueError):
             listed = None
         known, patterns = ({PACK}, _OLD_FILES) if listed is None else ({PACK, *listed}, ())

@@ -22,7 +22,7 @@ from sasgeo_bench.files.file_manifest import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard.archive_record import PicturesSaid, parse_said
+from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -261,7 +261,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
         return {}
     try:
         data = said.read_bytes()
-        parse_said(data, PicturesSaid)
+        parse_record(data, PicturesRecord)
         content = parse_json(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
         for item in (one for listed in found.values() for one in listed):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
-from sasgeo_bench.matching.learned_file import LearnedSaid, learned_path, read_learned
+from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.matching.results import STATUSES, Status, matcher_hash
@@ -150,13 +150,13 @@ class RunPlan:
         return None if self.lesson is None else learned_path(self.run_folder, self.lesson.sha256)
 
     @property
-    def said(self) -> LearnedSaid | None:
+    def said(self) -> TrainingRecord | None:
         """Record of the training for `run.json`."""
         if self.lesson is None or self.key is None or self.learned_file is None:
             return None
         has_text = self.learned is not None and self.learned.text is not None
         file = self.learned_file.relative_to(self.run_folder).as_posix() if has_text else None
-        return LearnedSaid(key=self.key, file=file, trained_on=self.lesson.places, pairs=self.lesson.count)
+        return TrainingRecord(key=self.key, file=file, trained_on=self.lesson.places, pairs=self.lesson.count)
 
     def lesson_lines(self) -> list[str]:
         """Describe the training in a line; no line if none was requested."""

@@ -15,7 +15,7 @@ from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import read_schema, read_table, write_table
-from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
     PART_SCHEMA,
@@ -196,7 +196,7 @@ def read_key(folder: Path) -> str | None:
         If `run.json` is damaged.
     """
     try:
-        said = LearnedSaid.of(read_run(folder) or {})
+        said = TrainingRecord.of(read_run(folder) or {})
     except MatchError as error:
         message = f"{folder / RUN} is damaged ({error}): remove it and run again, the parts beside it are kept"
         raise StoreError(message) from error

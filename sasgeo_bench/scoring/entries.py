@@ -13,7 +13,7 @@ import pandas as pd
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
-from sasgeo_bench.matching.learned_file import LearnedSaid
+from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.matching.submission import Submission
@@ -69,7 +69,7 @@ class Entry:
         """Return each training by the runner once: its source, its training places and the tasks asked under it."""
         found: dict[str, dict[str, Any]] = {}
         for about in self.runs:
-            training = LearnedSaid.of(about)
+            training = TrainingRecord.of(about)
             if training is not None:
                 fields = asdict(training) | {"trained_on": list(training.trained_on), "asked": []}
                 one = found.setdefault(training.key, fields)
@@ -256,7 +256,7 @@ def _read_run(path: Path) -> dict[str, Any]:
     try:
         check_identity(str(stated["matcher.name"]), str(stated["matcher.version"]))
         run_cost(about)
-        LearnedSaid.of(about)
+        TrainingRecord.of(about)
     except (MatchError, MetricError) as error:
         fault = fault or str(error)
     if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):
@@ -289,7 +289,7 @@ def _overlaps(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterat
         if place in _declared(entry, str(place), split):
             yield str(place)
     for about in entry.runs:
-        learned = LearnedSaid.of(about)
+        learned = TrainingRecord.of(about)
         is_mine = (scores["suite"] == about["suite"]) & (scores["region"] == about["region"])
         yield from set() if learned is None else set(scores.loc[is_mine, "place"]) & set(learned.trained_on)
 

@@ -19,7 +19,7 @@ from sasgeo_bench.files.hashes import file_record
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, FileSaid, Submission
+from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, SubmittedFile
 from sasgeo_bench.running.prediction_rows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.tasks.task_rows import ASKED
 from sasgeo_bench.texts import json_text
@@ -100,7 +100,9 @@ def write_submission(
             write_table(table, scratch / name, compression_level=_LEVEL, write_statistics=False)
             record = file_record(scratch / name)
             _check_bytes(folder / name, record.bytes)
-            whole = submission.model_copy(update={"files": {name: FileSaid(sha256=record.sha256, bytes=record.bytes)}})
+            whole = submission.model_copy(
+                update={"files": {name: SubmittedFile(sha256=record.sha256, bytes=record.bytes)}}
+            )
             text = json_text(whole.model_dump(mode="json"))
             (scratch / SUBMISSION).write_text(text, encoding="utf-8")
     except SasgeoError:
@@ -205,7 +207,7 @@ def _read_document(path: Path) -> Submission:
     return check_document(content, Submission, source=str(path))
 
 
-def _check_file(path: Path, expected: FileSaid) -> None:
+def _check_file(path: Path, expected: SubmittedFile) -> None:
     _check_bytes(path, path.stat().st_size)
     found = file_record(path)
     if (found.sha256, found.bytes) != (expected.sha256, expected.bytes):

@@ -419,7 +419,7 @@ def test_publishing_stored_results_whose_tables_are_of_another_version_says_so(o
         ('{"files": null}', "lists no files"),
         ('{"files": {"a": 5}}', "files.a is 5"),
         ('{"splitt": "crossfit"}', "splitt is 'crossfit': Extra inputs are not permitted"),
-        ('{"pipeline": {"id": "demo", "sha256": "", "x": 1}}', "pipeline.PipelineSaid.x is 1: Extra inputs"),
+        ('{"pipeline": {"id": "demo", "sha256": "", "x": 1}}', "pipeline.PipelineRecord.x is 1: Extra inputs"),
         ('{"schema_version": 4}', "has schema version 4"),
         ("[" * 200_000, "nested too deep"),
     ],

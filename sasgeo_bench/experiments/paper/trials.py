@@ -134,7 +134,7 @@ def map_change(probability: float) -> Ageing:
 
     Examples
     --------
-    >>> rates = map_change(0.32).rates.classes["building"]
+    >>> rates = map_change(0.32).rates["building"]
     >>> round(1 - math.exp(-rates.vanish_per_year), 2), round(math.expm1(rates.appear_per_year), 2)
     (0.24, 0.24)
     """

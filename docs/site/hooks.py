@@ -68,7 +68,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             uri += "/index.md"
         elif uri.startswith("notebooks/"):
             uri = uri.removesuffix(".py") + ".md"
-        if files.get_file_from_path(uri) is not None:
+        found = files.get_file_from_path(uri)
+        if found is not None and not found.inclusion.is_excluded():
             return f"[{text}]({os.path.relpath(uri, Path(own).parent)}{anchor})"
         if (ROOT / path).exists():
             return text if path in text else f"{text} (`{path}`)"

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
-BUILT_IN: Final = "sasgeo-baselines"
-_OURS: Final = ("sasgeo-bench", BUILT_IN)  # the distributions whose names win
+SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
 _MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
 ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
 
@@ -59,13 +58,13 @@ def _installed(group: str) -> list[EntryPoint]:
             f"an installed package has entry points that cannot be read ({message_of(error)}): reinstall or remove it"
         )
         raise MatchError(message) from error
-    return sorted(installed, key=lambda point: (_home(point) not in _OURS, _home(point), point.value))
+    return sorted(installed, key=lambda point: (_home(point) not in SHIPPED, _home(point), point.value))
 
 
 def _clash(first: EntryPoint, other: EntryPoint) -> str:
     """Name two plugins with the same name, and say which is used: ours, otherwise neither."""
     lost = f"{_home(other)} ({other.value})"
-    if _home(first) in _OURS:
+    if _home(first) in SHIPPED:
         return f"two plugins are named {first.name!r}: {_home(first)} is used, {lost} is not"
     return (
         f"two plugins are named {first.name!r}: {_home(first)} ({first.value}) and {lost}, so neither is used: "
@@ -81,7 +80,7 @@ def shipped_names() -> frozenset[str]:
     >>> "oracle_pose" in shipped_names()
     True
     """
-    return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in _OURS)})
+    return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in SHIPPED)})
 
 
 def check_card_name(spec: str, name: str) -> None:
@@ -237,7 +236,7 @@ def _known(name: str, group: str, kind: str) -> EntryPoint:
         raise MatchError(message)
     others = {point.value: point for point in _installed(group) if point.name == name and point != points[name]}
     rival = next((point for value, point in others.items() if value != points[name].value), None)
-    if rival is not None and _home(points[name]) not in _OURS:
+    if rival is not None and _home(points[name]) not in SHIPPED:
         raise MatchError(_clash(points[name], rival))
     return points[name]
 

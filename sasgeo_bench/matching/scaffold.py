@@ -7,7 +7,7 @@ import sys
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.matching.plugins import BUILT_IN, ORACLE, list_entry_points
+from sasgeo_bench.matching.plugins import ORACLE, SHIPPED, list_entry_points
 from sasgeo_bench.matching.submission import example_card
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
@@ -179,7 +179,7 @@ def plugin_files(name: str) -> dict[str, str]:
         raise ConfigError(message)
     known = list_entry_points().get(name)
     home = known.dist.name if known is not None and known.dist is not None else ""
-    if name == ORACLE or home == BUILT_IN:
+    if name == ORACLE or home in SHIPPED:
         message = f"{name!r} is a matcher of sasgeo-bench itself, which would be used instead of yours; choose another"
         raise ConfigError(message)
     words = re.split(r"[-_]", name)

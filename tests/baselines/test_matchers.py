@@ -2,6 +2,7 @@
 """Every registered matcher on an embedded town: its card, its answers, and that they depend on the query alone."""
 
 import tomllib
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -122,7 +123,7 @@ def test_controls_do_not_look_at_the_view(name, prepared, queries) -> None:
     matcher = prepared(name)
     for query in queries[:6]:
         other = query.evidence.replace(np.zeros_like(query.evidence.cells))
-        changed = type(query)(**{field: getattr(query, field) for field in query.__slots__} | {"evidence": other})
+        changed = replace(query, evidence=other)
         assert matcher.match(changed, top_k=5) == matcher.match(query, top_k=5)
 
 

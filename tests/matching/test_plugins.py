@@ -11,8 +11,8 @@ import pytest
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import (
-    BUILT_IN,
     MATCHERS,
+    SHIPPED,
     check_card_name,
     check_names,
     list_entry_points,
@@ -123,7 +123,7 @@ def install(tmp_path, monkeypatch):
 @pytest.fixture
 def own(install):
     """A package of faulty matchers, in module `mine`; the baselines, whatever is installed, are one sound matcher."""
-    install(BUILT_IN, {"raster_uniform": "built_in:Sound"}, built_in=SOUND)
+    install(SHIPPED[1], {"raster_uniform": "built_in:Sound"}, built_in=SOUND)
     return lambda **points: install("x-own", points, mine=FAULTY)
 
 
@@ -145,13 +145,13 @@ def test_a_matcher_is_made_by_its_name_and_listed_with_where_it_comes_from(own) 
     assert (type(made).__module__, type(made).__name__) == ("mine", "Sound")
     assert isinstance(made.card, MatcherCard)
     points = list_entry_points()
-    assert {"mine": "x-own", "another": "x-own", "raster_uniform": BUILT_IN}.items() <= {
+    assert {"mine": "x-own", "another": "x-own", "raster_uniform": SHIPPED[1]}.items() <= {
         name: point.dist.name for name, point in points.items()
     }.items()
     assert list(points) == sorted(points)
 
 
-@pytest.mark.parametrize("ours", ["sasgeo-bench", BUILT_IN])
+@pytest.mark.parametrize("ours", SHIPPED)
 def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, ours) -> None:
     # By name alone the outsider would come first, by the place on the import path too.
     install(ours, {"shared": "built_in:Sound"}, built_in=SOUND)

@@ -3,6 +3,7 @@
 
 import datetime as dt
 import json
+from dataclasses import fields
 
 import geopandas as gpd
 import numpy as np
@@ -130,7 +131,7 @@ truths = st.builds(
 
 def check_same(one, two):
     """Two queries that say the same; arrays and tables do not compare by themselves."""
-    names = [name for name in Query.__slots__ if name not in {"evidence", "vectors"}]
+    names = [field.name for field in fields(Query) if field.name not in {"evidence", "vectors"}]
     assert [getattr(one, name) for name in names] == [getattr(two, name) for name in names]
     first, second = one.evidence, two.evidence
     assert (first.classes, first.cell_size_m) == (second.classes, second.cell_size_m)

@@ -22,7 +22,8 @@ import numpy as np
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.board import ScoreRequest
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.running import prediction_files

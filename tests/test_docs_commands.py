@@ -18,7 +18,8 @@ import typer
 
 from sasgeo_bench import cli
 from sasgeo_bench.cli import program
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.board import ScoreRequest
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.scaffold import plugin_files
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.running.plan import RunRequest, plan_run

@@ -12,9 +12,10 @@ from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.paper.task import region_name
+from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
-from sasgeo_bench.leaderboard.build import Board, ScoreRequest, make_board
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, PipelineFile
 from sasgeo_bench.matching.plugins import check_names
 from sasgeo_bench.progress import Progress, Tell
@@ -209,24 +210,11 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
     dask: str | None = None,
     private: PrivateSeed | None = None,
 ) -> PipelinePlan:
-    """Turn a pipeline file into requests; nothing is read but files of settings.
+    """Turn a pipeline file into requests; only files of settings are read.
 
-    Parameters
-    ----------
-    spec : PipelineFile
-        The file.
-    out : Path
-        Root of what is built.
-    tell : callable
-        Gets a line for what is left out.
-    extract_folders, region_folders : tuple of Path
-        For regions that are not built yet, and of files of one's own.
-    jobs : int
-        Processes of each matcher.
-    dask : str, optional
-        A cluster to run on instead.
-    private : PrivateSeed, optional
-        Draws all queries instead of the file's seed, into the folder `private` of the root.
+    `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
+    serve regions that are not built yet, and files of one's own. `jobs` counts the processes of each matcher, `dask`
+    names a cluster to run on instead. `private` draws all queries instead of the file's seed, below `out/private`.
 
     Raises
     ------

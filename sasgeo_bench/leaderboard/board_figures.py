@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.plot_tables import (
     ages_frame,
     reliability_frame,

@@ -13,8 +13,8 @@ import pandas as pd
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import PICTURES_FILE, Extra
-from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
 from sasgeo_bench.leaderboard.case_plot import case_pixels
 from sasgeo_bench.leaderboard.cases import COLUMNS, MOST_CASES, OPERATING, find_cases, operating_rejector, sample_cases

@@ -11,10 +11,11 @@ from typing import Any
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
-from sasgeo_bench.leaderboard.build import Board, ScoreRequest, make_board
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.plugins import check_registered

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.leaderboard.build import Board
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.matching.plugins import shipped_names
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest

@@ -76,6 +76,7 @@ def stanford_counts(
     count = float(len(areas.nominal)) if trials is None else trials
 
     def share(which: ArrayLike) -> Interval:
+        """Return the share of the queries with its interval."""
         value = weighted_mean(which)
         return wilson(0.0, 0.0) if math.isnan(value) else wilson(min(value * count, count), count, level=level)
 

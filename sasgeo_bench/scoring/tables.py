@@ -107,6 +107,7 @@ class _Group:
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
 
         def stacked(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
+            """Return a column of each matcher, side by side."""
             return np.column_stack([np.asarray(column(frame)) for frame in frames.values()])
 
         return cls(

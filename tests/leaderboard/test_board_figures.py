@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.leaderboard import board_figures
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_plots import Page, page
-from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.plot_tables import (
     BEYOND_M,
     MOST_MATCHERS,

@@ -14,6 +14,7 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_pictures import (
     CASE_BYTES,
     MOST_BYTES,
@@ -22,7 +23,7 @@ from sasgeo_bench.leaderboard.board_pictures import (
     pictures_extra,
     words_of,
 )
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
 from sasgeo_bench.leaderboard.case_plot import case_pixels
 from sasgeo_bench.leaderboard.picture import fitted

@@ -19,8 +19,9 @@ from sasgeo_bench import cli
 from sasgeo_bench.cli.boards import CONTESTANT_FAILED
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.leaderboard import build as boards
+from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import Extra, read_board
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file

@@ -13,8 +13,9 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments.pipeline import plan_pipeline
+from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.leaderboard.reproduction import compare_seeds, seed_lines, verdict_of

@@ -19,8 +19,8 @@ from sasgeo_bench.files import file_manifest
 from sasgeo_bench.files.hashes import sha256_of
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import build as boards
+from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.build import ScoreRequest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.publishing import archive, archive_file
 from sasgeo_bench.publishing.archive import laid_out, pack_board, score_all, stored_settings

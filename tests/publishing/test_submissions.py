@@ -15,8 +15,9 @@ from sasgeo_bench.cli.boards import CONTESTANT_FAILED
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.hashes import file_record
+from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, example_card
 from sasgeo_bench.publishing.archive import laid_tasks, pack_board, stored_settings

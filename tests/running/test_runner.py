@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.leaderboard.build import ScoreRequest, make_board
+from sasgeo_bench.leaderboard.board import ScoreRequest
+from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run

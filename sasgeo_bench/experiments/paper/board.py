@@ -24,8 +24,8 @@ from sasgeo_bench.experiments.paper.tables import (
 )
 from sasgeo_bench.experiments.paper.task import DATA, SUITE
 from sasgeo_bench.experiments.paper.windows import CANDIDATES
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.build import Board
 from sasgeo_bench.leaderboard.text import markdown_table
 from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.rows import is_unranked

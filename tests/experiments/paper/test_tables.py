@@ -167,7 +167,7 @@ def test_more_change_asked_for_is_more_change_seen(pairs):
 
 
 def test_classes_change_by_their_factors_the_most_volatile_by_what_was_drawn():
-    rates = map_change(0.32).rates.classes
+    rates = map_change(0.32).rates
     assert max(CHANGE_FACTORS.values()) == 1.0
     for name, factor in CHANGE_FACTORS.items():
         assert 1 - np.exp(-rates[name].vanish_per_year) == pytest.approx(0.32 * factor)

@@ -56,7 +56,7 @@ def test_what_stored_results_are_called_is_what_is_looked_for():
         board_files.BOARD,
         site_files.MANIFEST,
     } <= signs
-    assert {release_files.INDEX, submission_files.SAID, "truths.parquet"} <= signs
+    assert {release_files.INDEX, submission_files.SUBMISSION, "truths.parquet"} <= signs
 
 
 def test_a_root_of_the_program_hides_all_of_it(tmp_path):

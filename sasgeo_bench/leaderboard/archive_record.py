@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.scoring.entries import CardRecord
 from sasgeo_bench.texts import FOLDER
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -84,16 +85,6 @@ class _Learned(_Record):
     asked: list[str]
 
 
-class _Card(_Record):
-    title: str | None = None
-    source: str | None = None
-    ours: str | None = None
-    licence: str | None = None
-    limits: str | None = None
-    tracks: list[str] | None = None
-    needs: list[str] | None = None
-
-
 class PrivateRecord(_Record):
     """A private seed: what tells that two boards are of the same one, and how many bits it has."""
 
@@ -148,7 +139,7 @@ class _Entry(_Record):
     version: str | None = None
     hash: str | None = None
     how: str | None = None
-    card: _Card | None = None
+    card: CardRecord | None = None
     trained_on: list[str] | None = None
     set_apart: str | None = None
     isolation: dict[str, str] | None = None

@@ -45,11 +45,11 @@ _TELLING: Final = frozenset(
     {
         *("pack.json", "truths.parquet", "truth.parquet", "truth.json", "scores.parquet", "submission.json"),
         *("queries.parquet", "predictions.parquet", "runs.parquet", "tasks"),
-        *("truth", "runs", "boards", "predictions", "learned", "pictures", "cases"),
+        *("truth", "runs", "boards", "predictions", "learned", "pictures", "cases", "sheets"),
     }
 )
 _OUT: Final = frozenset({"tasks", "truth"})
-_OF_OUT: Final = ("tasks", "truth", "runs", "boards", "release", "results")
+_OF_OUT: Final = ("tasks", "truth", "runs", "boards", "release", "results", "sheets")
 _HISTORY: Final = frozenset({".git", ".hg"})  # results that were ever committed are in there
 _PASSED_OVER: Final = frozenset({"site-packages", "dist-packages", "node_modules", "__pycache__"})
 _INTERPRETER: Final = frozenset({"pyvenv.cfg", "conda-meta"})

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of a process and of all that came from it: looked at in a thread of its own as long as the process lives."""
 
+import contextlib
 import os
 import re
 import subprocess
@@ -161,15 +162,28 @@ def _shared(family: Sequence[int], scratch: Path) -> _Shared:
                     sizes[found.st_dev, found.st_ino] = found.st_blocks * _BLOCK
         except OSError:
             pass
-        try:
-            inside = f"/proc/{number}/root{scratch}"
-            if device < 0 and os.stat(inside).st_dev != os.stat(scratch).st_dev:  # noqa: PTH116 - of another process
-                device, of = os.stat(inside).st_dev, os.statvfs(inside)  # noqa: PTH116
-                used = (of.f_blocks - of.f_bfree) * of.f_frsize
-        except OSError:
-            pass
+        if device < 0:
+            with contextlib.suppress(OSError):
+                device, used = _scratch_in_memory(number, scratch)
     sizes = {key: size for key, size in sizes.items() if key[0] != device}
     return _Shared(sizes=sizes, scratch_bytes=used, scratch_device=device)
+
+
+def _scratch_in_memory(number: int, scratch: Path) -> tuple[int, int]:
+    """Return device and used bytes of a process's scratch folder if it lies in memory, or else -1 and 0.
+
+    The path is looked up once: while a process enters its own root, it leads to the system's disk for a moment, whose
+    used space is nobody's memory.
+    """
+    inside = os.open(f"/proc/{number}/root{scratch}", os.O_PATH | os.O_CLOEXEC)
+    try:
+        device = os.fstat(inside).st_dev
+        if device == os.stat(scratch).st_dev:  # noqa: PTH116 - as fstat gives it
+            return -1, 0
+        of = os.fstatvfs(inside)
+    finally:
+        os.close(inside)
+    return device, (of.f_blocks - of.f_bfree) * of.f_frsize
 
 
 def _exact_bytes(family: Iterable[int], shared: _Shared) -> int:

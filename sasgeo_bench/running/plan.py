@@ -26,7 +26,7 @@ MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
-_HIDDEN: Final = ("tasks", "truth", "runs", "boards", "release")  # below a root; a query comes to whom it is asked
+_HIDDEN: Final = ("tasks", "truth", "runs", "boards", "release", "sheets")  # below a root: they tell truths
 _LATER_LIMITS: Final = ("scratch_bytes", "processes")  # they make another run only where somebody changes them
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 

@@ -14,6 +14,7 @@ from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
 BYTES_PER_KB: Final = 1e3
 BYTES_PER_MB: Final = 1e6
+_MOST: Final = 1e18  # seconds or bytes of a run: more is no measurement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,8 +81,8 @@ def _number(about: Mapping[str, Any], name: str) -> float:
     value = about.get(name)
     if value is None:
         return math.nan
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0:
-        message = f"{name} of a run is {value!r}, expected a number that is not negative"
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= _MOST:
+        message = f"{name} of a run is {value!r}, expected a number from 0 to {_MOST:.0e}"
         raise MetricError(message)
     return float(value)
 

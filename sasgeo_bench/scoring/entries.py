@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
@@ -27,6 +28,30 @@ from sasgeo_bench.tasks.split import Split
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
+
+
+class CardRecord(BaseModel):
+    """Texts of a card that boards and pages show; a card of an older version may lack some."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
+
+    title: str | None = None
+    source: str | None = None
+    ours: str | None = None
+    licence: str | None = None
+    limits: str | None = None
+    tracks: list[str] | None = None
+    needs: list[str] | None = None
+    trained_on: list[str] | dict[str, list[str] | str] | str | None = None
+
+
+class _RunRecord(BaseModel):
+    """Fields of a `run.json` that a board takes over as they are."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
+
+    matcher: CardRecord
+    isolation: dict[str, str] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,9 +279,13 @@ def _read_run(path: Path) -> dict[str, Any]:
     wrong = (f"{name} is {value!r}" for name, value in stated.items() if not value or type(value) is not str)
     fault = next(wrong, None)
     try:
+        _RunRecord.model_validate(about)
         check_identity(str(stated["matcher.name"]), str(stated["matcher.version"]))
         run_cost(about)
         TrainingRecord.of(about)
+    except ValidationError as error:
+        first = error.errors()[0]
+        fault = fault or f"{'.'.join(map(str, first['loc']))} is {first['input']!r}: {first['msg']}"
     except (MatchError, MetricError) as error:
         fault = fault or str(error)
     if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):

@@ -618,6 +618,15 @@ def test_what_is_named_twice_counts_once(out, tmp_path):
         ({"region": ""}, "region is ''"),
         ({"queries_sha256": {}}, "queries_sha256 is {}"),
         ({"cpu_s": "long"}, "cpu_s of a run is 'long', expected a number"),
+        ({"cpu_s": 1e308}, r"cpu_s of a run is 1e\+308, expected a number from 0 to 1e\+18"),
+        ({"index_bytes": 10**30}, "index_bytes of a run is 10*, expected a number from 0 to"),
+        ({"isolation": {"truth": 1}}, "isolation.truth is 1: Input should be a valid string"),
+        ({"isolation": ["x"]}, r"isolation is \['x'\]: Input should be a valid dictionary"),
+        ({"matcher": {"name": "x", "version": "1", "title": [1]}}, r"matcher.title is \[1\]: Input should be"),
+        (
+            {"matcher": {"name": "x", "version": "1", "tracks": "x"}},
+            "matcher.tracks is 'x': Input should be a valid list",
+        ),
         ({"learned": {"key": "x"}}, r"learned is \{'key': 'x'\}, expected key, file, trained_on and pairs"),
     ],
 )

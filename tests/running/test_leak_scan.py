@@ -62,7 +62,9 @@ def test_what_stored_results_are_called_is_what_is_looked_for():
 def test_a_root_of_the_program_hides_all_of_it(tmp_path):
     lay(tmp_path, "out/tasks/clean/a/task.json", "out/truth/clean/a/truth.parquet", "out/runs/x/run.json", "out/x.txt")
     lay(tmp_path, "out/regions/a/region.json", "out/regions/a/layers.tif")
-    everything = [*sorted(f"out/{name}" for name in ("boards", "release", "results", "runs", "tasks", "truth"))]
+    everything = [
+        *sorted(f"out/{name}" for name in ("boards", "release", "results", "runs", "sheets", "tasks", "truth"))
+    ]
     assert hidden(tmp_path)[0] == sorted([*everything, "out/regions/a"])
     assert hidden(tmp_path, tmp_path / "out/regions/a")[0] == everything
 

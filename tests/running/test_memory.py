@@ -2,6 +2,7 @@
 """What a matcher takes counts whatever it hides it in, the kernel holds it where it does that, and nothing is left."""
 
 import fcntl
+import os
 import subprocess
 import sys
 import threading
@@ -213,3 +214,22 @@ def test_groups_are_made_where_the_system_lets_us(tmp_path, monkeypatch, own, mo
     assert [(version, *map(str, places)) for version, places in cgroup._places()] == [
         (version, str(tmp_path / memory), str(tmp_path / pids)) for version, memory, pids in expected
     ]
+
+
+def test_where_scratch_lies_is_looked_up_once(monkeypatch, tmp_path):
+    """While a process enters its root the same path leads to memory and to the disk by turns."""
+    opened, system = [], {"open": os.open, "stat": os.stat}
+
+    def look(name):
+        def found(path, *more, **words):
+            if str(path).startswith("/proc/7/"):
+                opened.append((name, str(path)))
+                return system[name](tmp_path, *more, **words)
+            return system[name](path, *more, **words)
+
+        return found
+
+    monkeypatch.setattr(memory.os, "open", look("open"))
+    monkeypatch.setattr(memory.os, "stat", look("stat"))
+    assert memory._scratch_in_memory(7, tmp_path) == (-1, 0)  # the disk's used space is not memory
+    assert opened == [("open", f"/proc/7/root{tmp_path}")]

@@ -195,10 +195,10 @@ def test_the_whole_scorer_learns_weights_of_the_joint_score(training):
 
 
 def test_nothing_to_learn_from_is_said(training):
-    with pytest.raises(ConfigError, match="no view of the train part"):
+    with pytest.raises(ConfigError, match="no view of the training part"):
         Sasgeo().learn(replace(training, pairs=[]))
     absent = [(query, replace(truth, is_present=False)) for query, truth in training.pairs]
-    with pytest.raises(ConfigError, match="no view of the train part"):
+    with pytest.raises(ConfigError, match="no view of the training part"):
         Sasgeo().learn(replace(training, pairs=absent))
 
 

@@ -75,9 +75,11 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
 MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS
 NOTE: Final = (
     "Intervals are 95 %: a bootstrap over blocks, then sites ({draws} draws), and never narrower than Wilson's with as "
-    f"many trials as there are sites; {DAGGER} marks those where Wilson's is wider. The first figure of a suite counts "
-    "the stressed queries, or all where nothing is stressed; matchers are ranked by it. A rank is an interval: "
-    "matchers that share one cannot be distinguished. Nothing is ranked across prior groups."
+    f"many trials as there are sites; {DAGGER} marks those where Wilson's is wider."
+)
+RANKS_NOTE: Final = (
+    "The first figure of a suite counts the stressed queries, or all where nothing is stressed; matchers are ranked by "
+    "it. A rank is an interval: matchers that share one cannot be distinguished. Nothing is ranked across prior groups."
 )
 TERMS: Final = {  # what tables show that is no column
     DAGGER: "Wilson's interval: of a few sites, or where all answers are right, draws alone would be too narrow",

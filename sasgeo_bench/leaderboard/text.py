@@ -9,7 +9,7 @@ import pandas as pd
 
 from sasgeo_bench.errors import counted, named
 from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of, step_tables
-from sasgeo_bench.leaderboard.columns import NOTE, TERMS
+from sasgeo_bench.leaderboard.columns import NOTE, RANKS_NOTE, TERMS
 from sasgeo_bench.leaderboard.reproduction import seed_lines
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
@@ -141,7 +141,7 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -
             "",
             f"Made by {markdown(about['made_by'])}. Split: {markdown(about['split'] or 'none')}. Data: {ATTRIBUTION}.",
             "",
-            NOTE.format(draws=about["draws"]),
+            f"{NOTE.format(draws=about['draws'])} {RANKS_NOTE}",
             "",
             *(f"- {markdown_item(line)}" for line in lines),
             "",

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of
-from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE
+from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.reproduction import seed_lines
 from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text
 from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
@@ -229,6 +229,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     special: dict[str, dict[str, Any]] = {
         "index.html": {
             "sections": sections,
+            "ranks_note": RANKS_NOTE,
             "contrasts": contrasts_of(source),
             "control_lines": control_lines(controls),
             "controls_held": bool(controls) and all(item.holds for item in controls),

@@ -59,6 +59,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     folder = Path(sources.get(own, f"docs/{own}")).parent
 
     def lead(link: re.Match[str]) -> str:
+        """Return one link as the site has it."""
         text, target, anchor = link[1], link[2], link[3] or ""
         path = os.path.normpath(folder / target)
         if "://" in target or target.startswith("mailto:"):

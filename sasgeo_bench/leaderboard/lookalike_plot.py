@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -112,7 +112,7 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
             colour_bar(figure, drawn, bar)
     _class_rows(figure, sheet, rows, top=below - 0.32)
     _term_rows(figure, sheet, top=below - 0.78)
-    _text(figure, _LEFT, 0.1, ATTRIBUTION, size=8.5)
+    _text(figure, _LEFT, 0.1, ATTRIBUTION, fontsize=8.5)
     figure.savefig(path, format="png", metadata={"Title": sheet.title, "Copyright": ATTRIBUTION, "Software": None})
 
 
@@ -121,21 +121,10 @@ def _told(scores: pd.DataFrame) -> list[str]:
     return scores.index[(scores[list(_SHARES)] >= _LEAST_SHARE).any(axis=1)].tolist()
 
 
-def _text(  # noqa: PLR0913 - a line of text has as many looks
-    figure: Figure,
-    left: float,
-    up: float,
-    text: str,
-    *,
-    size: float = 8.0,
-    color: str = "#000000",
-    ha: Literal["left", "right"] = "left",
-    is_bold: bool = False,
-) -> None:
-    """Words at a place in inches from the lower left corner."""
-    weight = "bold" if is_bold else "normal"
+def _text(figure: Figure, left: float, up: float, text: str, **look: Any) -> None:  # noqa: ANN401 - of matplotlib
+    """Write words at a place in inches from the lower left corner."""
     at = (left / _WIDTH, up / figure.get_figheight())
-    figure.text(*at, text, fontsize=size, va="baseline", color=color, ha=ha, fontweight=weight)
+    figure.text(*at, text, **{"fontsize": 8.0, "va": "baseline", **look})
 
 
 def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: float) -> None:
@@ -172,12 +161,12 @@ def _term_rows(figure: Figure, sheet: LookalikeSheet, *, top: float) -> None:
     _text(figure, left, top, "terms of Eq. 11, nats", color=_GREY)
     for number, (name, values) in enumerate(zip(sheet.terms.index, sheet.terms.to_numpy(), strict=True)):
         up = top - _ROW * (number + 1)
-        is_bold = number == len(sheet.terms) - 1
-        _text(figure, left, up, name, is_bold=is_bold)
+        weight = "bold" if number == len(sheet.terms) - 1 else "normal"
+        _text(figure, left, up, name, fontweight=weight)
         for right, value in zip(rights, (*values, values[0] - values[1]), strict=True):
-            _text(figure, right, up, _signed(value), ha="right", is_bold=is_bold)
+            _text(figure, right, up, _signed(value), ha="right", fontweight=weight)
     for number, line in enumerate(wrap(sheet.note, _NOTE_CHARS)):
-        _text(figure, left, top - _ROW * (len(sheet.terms) + 1.6 + 0.85 * number), line, size=7.5, color=_GREY)
+        _text(figure, left, top - _ROW * (len(sheet.terms) + 1.6 + 0.85 * number), line, fontsize=7.5, color=_GREY)
 
 
 def _signed(value: float) -> str:

@@ -2,7 +2,7 @@
 """The figures of a board over many queries at once: each draws a table of `pools` on a page."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -66,11 +66,7 @@ def draw_ablation(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         row_gap_inches=0.62,
     )
     with page(path, about) as charts:
-        for number, chart in enumerate(chart for line in charts for chart in line):
-            if number >= len(pools):
-                chart.set_visible(False)
-                continue
-            mine = rows[rows["pool"] == pools[number]]
+        for number, chart, mine in _panels(charts, rows, "pool", pools):
             _title(chart, pools[number], _counts(mine.iloc[0]))
             draw_bars_of(chart, mine, names)
             if number % across:
@@ -123,11 +119,7 @@ def draw_recall(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     about = _suite_page(rows, names, title="Recall against K", note=note, below=below)
     steps = sorted(set(rows["k"]))
     with page(path, about) as charts:
-        for number, chart in enumerate(chart for line in charts for chart in line):
-            if number >= len(suites):
-                chart.set_visible(False)
-                continue
-            mine = rows[rows["suite"] == suites[number]]
+        for number, chart, mine in _panels(charts, rows, "suite", suites):
             _head_of(chart, mine)
             chart.set_xscale("log")
             chart.set_xlim(0.75, 1.35 * steps[-1])
@@ -141,6 +133,17 @@ def draw_recall(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
                 places = dodged(line_of["k"].to_numpy(float), at, len(names), by=0.025)
                 draw_line(chart, line_of, places, at)
             _outer(chart, number, about, len(suites), "recall@K (share of queries)")
+
+
+def _panels(
+    charts: Iterable[Iterable[Axes]], rows: pd.DataFrame, column: str, names: Sequence[str]
+) -> Iterator[tuple[int, Axes, pd.DataFrame]]:
+    """Yield number, axes and rows of the panel of each name in a column; panels beyond the names are hidden."""
+    for number, chart in enumerate(chart for line in charts for chart in line):
+        if number < len(names):
+            yield number, chart, rows[rows[column] == names[number]]
+        else:
+            chart.set_visible(False)
 
 
 def _head_of(chart: Axes, mine: pd.DataFrame) -> None:
@@ -178,11 +181,7 @@ def draw_errors(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     about = _suite_page(rows, names, title="Distribution of errors", note=note, below="position error (m)")
     ticks = [0.1, 1.0, 10.0, 100.0, 1000.0]
     with page(path, about) as charts:
-        for number, chart in enumerate(chart for line in charts for chart in line):
-            if number >= len(suites):
-                chart.set_visible(False)
-                continue
-            mine = rows[rows["suite"] == suites[number]]
+        for number, chart, mine in _panels(charts, rows, "suite", suites):
             _head_of(chart, mine)
             chart.set_xscale("log")
             chart.set_xlim(LEAST_ERROR_M, MOST_ERROR_M)
@@ -242,11 +241,7 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     ticks = [1.0, *COST_RATIOS]
     high = 1.25 * max(float(rows["withhold_all"].max()), float(rows["cost"].quantile(0.9)))
     with page(path, about) as charts:
-        for number, chart in enumerate(chart for line in charts for chart in line):
-            if number >= len(names):
-                chart.set_visible(False)
-                continue
-            mine = rows[rows["matcher"] == names[number]]
+        for number, chart, mine in _panels(charts, rows, "matcher", names):
             counts = sorted(set(mine["n"]))
             _title(chart, names[number], "n " + ", ".join(f"{count:g}" for count in counts))
             _cost_lines(chart, mine, rejectors)

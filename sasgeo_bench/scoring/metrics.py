@@ -406,18 +406,6 @@ COSTS: Final = (
     ),
 )
 METRICS: Final[tuple[Metric, ...]] = (*_MEANS, *QUANTILES, *REJECTION, *THRESHOLDS, *COSTS)
-_BY_NAME: Final = {metric.name: metric for metric in METRICS}
-
-
-def metric_of(name: str) -> Metric:
-    """Return the metric of a name.
-
-    Examples
-    --------
-    >>> metric_of("aurc").worst, metric_of("success_25m").worst
-    (1.0, 0.0)
-    """
-    return _BY_NAME[name]
 
 
 def means_of(track: str) -> tuple[MeanMetric, ...]:

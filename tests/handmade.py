@@ -2,6 +2,7 @@
 """Boards made by hand, for their sites: ranks, ties, controls, hostile names, pictures of failures."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -117,8 +118,8 @@ def draw(path):
         charts[0][0].plot([0, 1], [1, 0])
 
 
-def full_board(folder, *, shares=SHARES, holds=True, changes=None):
-    """A board with all there can be but pictures; `changes` are of entries, by name."""
+def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=None):
+    """A board with all there can be but pictures; `changes` are of entries, by name, `tested` had the control."""
     scored = {name: asked_everything(share) for name, share in shares.items()}
     facts = {"track": "localization", "n": 160, "answered": 160, "missing": 0, "blocks": 40, "places": 4}
     facts |= {"suite": "all suites", "prior_group": "r500-weak-s3", "better": "lower"}
@@ -148,7 +149,7 @@ def full_board(folder, *, shares=SHARES, holds=True, changes=None):
         table=pd.concat([leaderboard(scored, draws=200), to_frame([*judged, *costs])], ignore_index=True),
         entries=[entry_of(name, **(changes or {}).get(name, {})) for name in shares],
         findings=hold_contrasts(known, scored, {}, draws=200),
-        verdicts=[verdict(holds=holds)],
+        verdicts=[replace(verdict(holds=holds), matcher=tested)],
         scored=pd.concat([frame.assign(matcher=name) for name, frame in scored.items()], ignore_index=True),
         extras=[Extra(figures={"age-real-age-localization-r500-weak-s3.svg": draw})],
         contrasts=[

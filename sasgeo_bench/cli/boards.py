@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, print_table, say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -27,7 +27,6 @@ from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.tasks.private_seed import seed_record
 
 CONTROL_FAILED: Final = 3  # exit status
-CONTESTANT_FAILED: Final = 4
 
 
 def _folder(text: str) -> Path:
@@ -245,9 +244,10 @@ def _check_controls(board: Board) -> None:
         tell(f"failed, and so not on the board: {name}: {why}")
     if board.failures.found and board.failures.log.is_file():
         tell(f"where it failed stands in {board.failures.log}")
-    if not all(item.holds for item in board.verdicts):
+    failed = [item for item in board.verdicts if not item.holds]
+    if any(item.is_of_board for item in failed):
         raise typer.Exit(CONTROL_FAILED)
-    if board.failures.found:
+    if board.failures.found or failed:
         raise typer.Exit(CONTESTANT_FAILED)
 
 

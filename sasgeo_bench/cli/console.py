@@ -17,7 +17,8 @@ from rich.text import Text
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.texts import plain, plain_lines
 
-EXIT_USER: Final = 2
+EXIT_USER: Final = 2  # exit status
+CONTESTANT_FAILED: Final = 4
 PIPE_WIDTH: Final = 200
 
 

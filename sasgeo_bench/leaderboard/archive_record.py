@@ -145,6 +145,7 @@ class _Entry(_Record):
     isolation: dict[str, str] | None = None
     private: _OnBothSeeds | None = None
     learned: list[_Learned] = []
+    failed_controls: list[str] = []
 
 
 class _Task(_Record):

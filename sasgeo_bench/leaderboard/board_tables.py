@@ -453,8 +453,9 @@ def _mean_value(rows: Sequence[Record | None]) -> float:
 
 def _heading(book: Book, key: Key, primary: str) -> str:
     """Return a suite with its number of queries, and what guessing among candidates reaches."""
-    rows = [book.main(key, name, primary) for name in book.matchers[key]]
-    n = max(int(row["n"]) for row in rows if row is not None)
+    rows = [row for name in book.matchers[key] if (row := book.main(key, name, primary)) is not None]
+    # A matcher that does not answer the track has one row of all queries, stressed or not.
+    n = max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
     chance = next(filter(None, (book.main(key, name, CHANCE.name) for name in book.matchers[key])), None)
     return f"{key[0]}, n = {n}" + ("" if chance is None else f", chance {number_text(chance['value'])}")
 

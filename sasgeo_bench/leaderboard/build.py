@@ -26,7 +26,7 @@ from sasgeo_bench.running.failures import Failures, log_beside, stops_all
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.contestants import EntryAnswers, read_entry_answers, score_entries
 from sasgeo_bench.scoring.contrasts import contrast_frame, hold_contrasts
-from sasgeo_bench.scoring.controls import hold_controls, is_control, verdict_frame
+from sasgeo_bench.scoring.controls import failed_controls, hold_controls, is_control, verdict_frame
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out, set_apart
 from sasgeo_bench.scoring.falsifiers import falsifier_frame, hold_falsifiers
@@ -104,7 +104,9 @@ def _made(request: ScoreRequest, failures: Failures, tell: Tell, progress: Progr
     scores = {name: frame for name, frame in scores.items() if len(frame)}
     entries = tuple(item.entry for item in told if item.entry.name in scores)
     _check_some(scores)
-    apart = _apart(entries, scores, request.split, tell)
+    apart = set_apart(entries, scores, request.split, verdicts)
+    for name, why in apart.items():
+        tell(f"{name}: set apart, {why}")
     on_private = _on_private(request, entries, scores, tasks, tell)
     entries = tuple(replace(entry, how=on_private.how(entry)) for entry in entries)
     compare = partial(_leaderboards, whole=whole, draws=request.draws, apart=apart, progress=progress)
@@ -262,16 +264,6 @@ def _judgings(
     ]
 
 
-def _apart(
-    entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None, tell: Tell
-) -> dict[str, str]:
-    """Return and report why rows are set apart."""
-    found = set_apart(entries, scores, split)
-    for name, why in found.items():
-        tell(f"{name}: set apart, {why}")
-    return found
-
-
 def _on_private(
     request: ScoreRequest,
     entries: Sequence[Entry],
@@ -416,6 +408,7 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
                 "isolation": joined(run.get("isolation") or {} for run in entry.runs) if entry.runs else None,
                 "learned": entry.learned(),
                 **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
+                **({"failed_controls": failed} if (failed := _failed_controls(board, entry)) else {}),
             }
             for entry in board.entries
         ],
@@ -431,6 +424,10 @@ def _about(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -
             for item in board.tasks
         ],
     }
+
+
+def _failed_controls(board: Board, entry: Entry) -> list[str]:
+    return [item.to_text() for item in failed_controls(board.verdicts, entry.name)]
 
 
 def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:

@@ -40,7 +40,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "verdict": "Which is better at 5 %; null where neither is shown to be, with or without ruling out a difference "
     f"that matters; not decided with fewer than {LEAST_BLOCKS} blocks",
     "control query": "Queries whose right score is known beforehand",
-    "outcome": "held, or FAILED: then do not trust this board",
+    "outcome": "held, or FAILED: then do not trust the rows of the matcher, nor the board if it is itself a control",
     "found": "How many were right, or were answered where none must be",
     "expected": "How many are right by guessing, or how many there must be",
     "p": "Chance of finding as many or more by guessing; a control fails below 0.0001",
@@ -89,6 +89,7 @@ TERMS: Final = {  # what tables show that is no column
     "chance": "what guessing among the candidates reaches",
     "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
 }
+FAILED_CONTROL: Final = "failed a control"
 MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     RUN_HERE: "the matcher's code was run here, on queries of a public seed, which code can draw again",
     REPRODUCED: "it was run on a private seed of 128 bits too, and no figure is shown to be worse there",
@@ -96,6 +97,7 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     AS_SUBMITTED: "a file of answers; nobody here has run its code",
     "trained on": "the places that its parameters come from",
     "set apart": "in a table of its own and in no rank, for the reason stated there",
+    FAILED_CONTROL: "it fails a control of the board, whose right score is known beforehand: do not trust the row",
     "tie": "shares ranks with others, who are named below the table; neighbouring ties differ in colour",
 }
 CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure means that nobody earned")
@@ -163,6 +165,8 @@ def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:
     if places:
         meaning = f"its parameters come from {', '.join(places)}"
         marks.append(Mark(text=f"trained on {counted(len(places), 'place')}", meaning=meaning))
+    if entry.get("failed_controls"):
+        marks.append(Mark(text=FAILED_CONTROL, meaning="; ".join(entry["failed_controls"]), tone="warn"))
     if entry.get("set_apart"):
         marks.append(Mark(text="set apart", meaning=str(entry["set_apart"]), tone="warn"))
     return tuple(marks)

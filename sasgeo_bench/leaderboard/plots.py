@@ -11,6 +11,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
+from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.axes import (
     ACROSS,
     HALVES,
@@ -160,7 +161,7 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
                 continue
             mine = rows[rows["suite"] == suites[number]]
             counts = mine.iloc[0]
-            head = f"{suites[number]}\nn {counts['n']:g}, {counts['blocks']:g} blocks"
+            head = f"{suites[number]}\nn {counts['n']:g}, {counted(int(counts['blocks']), 'block')}"
             chart.set_title(head, fontsize=8, loc="left")
             draw_bars_of(chart, mine, names)
             if number % columns:
@@ -186,8 +187,8 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
     better = f"right of 0: {contrast.first} is better" if is_mean else f"left of 0: {contrast.first} is better"
     least = contrast.min_effect * (1.0 if is_mean else abs(finding.second_value))
     kinds = f", kinds {', '.join(contrast.kinds)}" if contrast.kinds else ""
-    labels = [f"{one.place} (n {one.n}, {one.blocks} {'block' if one.blocks == 1 else 'blocks'})" for one in places]
-    labels.append(f"all places (n {finding.n}, {finding.blocks} blocks)")
+    labels = [f"{one.place} (n {one.n}, {counted(one.blocks, 'block')})" for one in places]
+    labels.append(f"all places (n {finding.n}, {counted(finding.blocks, 'block')})")
     about = Page(
         title=f"Contrast {contrast.name}: {contrast.first} less {contrast.second}",
         note=(

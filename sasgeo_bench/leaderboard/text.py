@@ -53,10 +53,17 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """
     if not verdicts:
         return ["Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them)."]
-    failed = [item.to_text() for item in verdicts if not item.holds]
-    if not failed:
+    failed = [item for item in verdicts if not item.holds]
+    lines = [item.to_text() for item in failed]
+    of_board = sum(item.is_of_board for item in failed)
+    if of_board:
+        return [f"CONTROLS FAILED, {of_board} of {len(verdicts)}: do not trust this board.", *lines]
+    rivals = list(dict.fromkeys(item.matcher for item in failed))
+    if not rivals:
         return [f"Controls: all {len(verdicts)} held."]
-    return [f"CONTROLS FAILED, {len(failed)} of {len(verdicts)}: do not trust this board.", *failed]
+    head = f"Controls: {len(verdicts) - len(failed)} of {len(verdicts)} held."
+    more = "; if these share no code, the queries may reveal the truth" if len(rivals) > 1 else ""
+    return [f"{head} Do not trust the rows of {', '.join(rivals)}{more}:", *lines]
 
 
 def training_lines(about: Mapping[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
 _MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
+YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are never ranked
 ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
 
 
@@ -83,8 +84,8 @@ def shipped_names() -> frozenset[str]:
     return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in SHIPPED)})
 
 
-def check_card_name(spec: str, name: str) -> None:
-    """Refuse the card name of a shipped matcher for any other matcher: its row would pass for the shipped one's.
+def check_card_name(spec: str, name: str, *, is_oracle: bool = False) -> None:
+    """Refuse a card name by which a row would pass for another: that of a shipped matcher, or an oracle's.
 
     Parameters
     ----------
@@ -92,6 +93,8 @@ def check_card_name(spec: str, name: str) -> None:
         How it was named: a name, or module:Class.
     name : str
         Of its card.
+    is_oracle : bool
+        Whether a pipeline names it among its oracles.
 
     Raises
     ------
@@ -108,6 +111,12 @@ def check_card_name(spec: str, name: str) -> None:
     is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped_names()
     if not is_ours and name in shipped_names():
         message = f"{one_line(spec)}: its card is named {name!r}, as a matcher that ships: rename it"
+        raise MatchError(message)
+    if name.startswith(YARDSTICK) and not (is_ours or is_oracle):
+        message = (
+            f"{one_line(spec)}: its card is named {name!r}, and names that begin with {YARDSTICK} are of oracles, "
+            "which use the truth: rename it"
+        )
         raise MatchError(message)
 
 

@@ -232,7 +232,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
             "ranks_note": RANKS_NOTE,
             "contrasts": contrasts_of(source),
             "control_lines": control_lines(controls),
-            "controls_held": bool(controls) and all(item.holds for item in controls),
+            "controls_state": _controls_state(controls),
             "has_controls": bool(controls),
             "seed_line": seed_lines(source.about)[0],
             "seeds": seed_table(source.about),
@@ -294,6 +294,14 @@ def _verdicts(source: SiteSource) -> list[Verdict]:
         )
         for row in source.controls.to_dict("records")
     ]
+
+
+def _controls_state(verdicts: Sequence[Verdict]) -> str:
+    """Return the class of the page's box: what failed is the board, or rows of some entries alone."""
+    failed = [item for item in verdicts if not item.holds]
+    if any(item.is_of_board for item in failed):
+        return "failed"
+    return "held" if verdicts and not failed else "doubtful"
 
 
 def _counts(source: SiteSource, book: Book) -> dict[str, int]:

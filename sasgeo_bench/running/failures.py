@@ -103,6 +103,7 @@ class Failures:
         if not isinstance(error, SasgeoError):
             write_log(self.log, name, error)
         self.errors.setdefault(name, error)
+        line = line.removeprefix(f"{name}: ")
         if self.found.setdefault(name, line) == line:
             self._tell(f"{name} failed: {line}")
 

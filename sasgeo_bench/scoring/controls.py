@@ -11,7 +11,7 @@ import pandas as pd
 
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.metrics import is_present, primary_of
-from sasgeo_bench.scoring.rows import name_alone
+from sasgeo_bench.scoring.rows import UNRANKED, name_alone
 from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
@@ -42,6 +42,19 @@ class Verdict:
     expected: float
     p: float
     holds: bool
+
+    @property
+    def is_of_board(self) -> bool:
+        """Return True if a failure is the board's fault: a rival's failure is that of its own rows.
+
+        Examples
+        --------
+        >>> names = ("random 1 (c85212)", "fft_vote", "oracle_of_mine")
+        >>> same = {"control": "c", "n": 1, "found": 1.0, "expected": 0.0, "p": 0.0, "holds": False}
+        >>> [Verdict(matcher=name, **same).is_of_board for name in names]
+        [True, True, False]
+        """
+        return name_alone(self.matcher) in {ORACLE, REFERENCE, *UNRANKED}
 
     def to_text(self) -> str:
         """Return the result in one line.
@@ -81,6 +94,27 @@ def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
         if name == REFERENCE:
             verdicts += _nearly_all(matcher, controls)
     return tuple(sorted(verdicts, key=lambda item: (item.holds, item.control, item.matcher)))
+
+
+def failed_controls(verdicts: Sequence[Verdict], matcher: str) -> tuple[Verdict, ...]:
+    """Return the controls that an entry failed, of those that speak of its rows alone."""
+    return tuple(item for item in verdicts if item.matcher == matcher and not (item.holds or item.is_of_board))
+
+
+def knows_too_much(verdicts: Sequence[Verdict], matcher: str) -> str | None:
+    """Return why the answers of an entry cannot come from the view and the map alone; None if they can.
+
+    Examples
+    --------
+    >>> one = Verdict(control=_AT_CHANCE[TWINS], matcher="mine", n=24, found=24.0, expected=12.0, p=6e-8, holds=False)
+    >>> knows_too_much([one], "mine")
+    'right 24 of 24 times at the control "identical twins tie", where guessing is right 12 times'
+    """
+    for item in failed_controls(verdicts, matcher):
+        if item.control in _AT_CHANCE.values():
+            guessed = f"where guessing is right {item.expected:.3g} times"
+            return f'right {item.found:g} of {item.n} times at the control "{item.control}", {guessed}'
+    return None
 
 
 def verdict_frame(verdicts: Sequence[Verdict]) -> pd.DataFrame:

@@ -20,6 +20,7 @@ from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.scoring.controls import Verdict, knows_too_much
 from sasgeo_bench.scoring.cost import run_cost
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, RUN_HERE, is_unranked
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission
@@ -296,19 +297,28 @@ def _read_run(path: Path) -> dict[str, Any]:
     return about
 
 
-def set_apart(entries: Sequence[Entry], scores: Mapping[str, pd.DataFrame], split: Split | None) -> dict[str, str]:
+def set_apart(
+    entries: Sequence[Entry],
+    scores: Mapping[str, pd.DataFrame],
+    split: Split | None,
+    verdicts: Sequence[Verdict] = (),
+) -> dict[str, str]:
     """Return by entry why its rows are excluded from ranks; other entries are missing.
 
-    Rows are excluded if the answers about a place come from training on that place. Controls are unranked anyway.
-    `scores` has the columns suite, region and place of every query the entry was asked; `split` assigns the half of
-    each place.
+    Rows are excluded if the answers about a place come from training on that place, or if the entry is right more often
+    than chance explains where nothing but the truth could help. Controls are unranked anyway. `scores` has the columns
+    suite, region and place of every query the entry was asked; `split` assigns the half of each place.
     """
     found = {}
     for entry in entries:
-        places = [] if is_unranked(entry.name) else sorted(set(_overlaps(entry, scores[entry.name], split)))
-        if places:
-            what = places[0] if len(places) == 1 else named(places, "place")
-            found[entry.name] = f"trained on {what}, which it is tested on"
+        if is_unranked(entry.name):
+            continue
+        places = sorted(set(_overlaps(entry, scores[entry.name], split)))
+        what = places[0] if len(places) == 1 else named(places, "place")
+        trained = f"trained on {what}, which it is tested on" if places else None
+        reasons = [reason for reason in (knows_too_much(verdicts, entry.name), trained) if reason]
+        if reasons:
+            found[entry.name] = "; ".join(reasons)
     return found
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final, Self, TypeVar
 
 import pandas as pd
 
+from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.intervals import Interval
 from sasgeo_bench.scoring.metrics import Metric
 from sasgeo_bench.scoring.score import MISSING
@@ -20,7 +21,6 @@ RUN_HERE: Final = "run here"  # our run of the code, on queries of a public seed
 REPRODUCED: Final = "reproduced"  # or of a private seed too, where it is not shown to be worse,
 NOT_REPRODUCED: Final = "not reproduced"  # or is shown to be worse
 UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: not ranked
-YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth: not ranked either
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Item = TypeVar("Item")

@@ -16,12 +16,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench import cli
-from sasgeo_bench.cli.boards import CONTESTANT_FAILED
+from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.leaderboard import build as boards
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import Extra, read_board
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
@@ -688,7 +689,9 @@ def test_a_board_may_not_be_named_like_a_path(out, monkeypatch, capsys):
 
 
 def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, monkeypatch, capsys):
-    verdict = Verdict(control="shuffled map at chance", matcher="m", n=8, found=8.0, expected=0.8, p=1e-8, holds=False)
+    verdict = Verdict(
+        control="shuffled map at chance", matcher="random", n=8, found=8.0, expected=0.8, p=1e-8, holds=False
+    )
     monkeypatch.setattr(boards, "hold_controls", lambda _: (verdict,))
     words = ("score", "--predictions", str(out / "runs"), "--out", str(out), "--name", "mine", "--draws", "200")
     monkeypatch.setattr("sys.argv", ["sasgeo-bench", *words])
@@ -701,6 +704,30 @@ def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, mo
     assert told.out.splitlines()[-1] == str(out / "boards" / "mine")  # written all the same
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
     assert text.index("CONTROLS FAILED") < text.index("## ")
+
+
+def test_a_rival_that_knows_too_much_is_set_apart_and_the_board_stands(out, tmp_path, monkeypatch, program):
+    submission(out, tmp_path / "mine.parquet")
+    chance = {"n": 8, "found": 8.0, "expected": 0.8, "p": 1e-8}
+    failed = Verdict(control="shuffled map at chance", matcher="mine", holds=False, **chance)
+    monkeypatch.setattr(boards, "hold_controls", lambda _: (failed, replace(failed, matcher="random", holds=True)))
+    given = ("--predictions", out / "runs", "--predictions", tmp_path / "mine.parquet")
+    code, _, err = program("score", *given, "--out", out, "--name", "both", "--draws", "200", "--no-cases")
+    assert code == CONTESTANT_FAILED
+    assert "Controls: 1 of 2 held. Do not trust the rows of mine:" in err
+    why = 'right 8 of 8 times at the control "shuffled map at chance", where guessing is right 0.8 times'
+    assert f"mine: set apart, {why}" in err
+    about, table = read_board(out / "boards" / "both")
+    mine, oracle = about["entries"]
+    assert mine["set_apart"] == why
+    assert mine["failed_controls"] == [failed.to_text()]
+    assert "failed_controls" not in oracle
+    assert table.loc[table["matcher"] == "mine", "rank_best"].isna().all()
+    text = (out / "boards" / "both" / "leaderboard.md").read_text(encoding="utf-8")
+    assert "do not trust this board" not in text
+    assert "mine is set apart: right 8 of 8 times" in text
+    marks = [mark.text for mark in marks_of(mine, is_control=False)]
+    assert marks == ["as submitted", "failed a control", "set apart"]
 
 
 # --- one contestant that fails ----------------------------------------------------------------------------------------

@@ -192,6 +192,15 @@ def test_a_matcher_of_others_whose_card_bears_a_shipped_name_is_refused(name) ->
     check_card_name("fft_vote", "fft_vote")
 
 
+def test_the_name_of_an_oracle_is_kept_for_those_that_a_pipeline_names() -> None:
+    with pytest.raises(MatchError, match=r"^mine:Matcher: its card is named 'oracle_mine', and names that begin with "):
+        check_card_name("mine:Matcher", "oracle_mine")
+    check_card_name("mine:Matcher", "oracle_mine", is_oracle=True)
+    check_card_name("sasgeo_baselines.ablations:Oracle", "oracle_sasgeo")
+    with pytest.raises(MatchError, match="as a matcher that ships"):
+        check_card_name("mine:Matcher", "oracle_pose", is_oracle=True)
+
+
 def test_every_one_of_three_that_loses_is_told(install) -> None:
     for name in ("a-first", "b-second", "c-third"):
         install(name, {"mine": f"{name[0]}:Sound"})

@@ -306,12 +306,19 @@ def test_a_board_without_a_row_says_so(tmp_path):
 
 
 def test_a_failed_control_is_told_where_it_cannot_be_overlooked(tmp_path):
-    full_board(tmp_path / "mine", shares={"graph": 0.9, "weak": 0.2}, holds=False)
-    page = read(publish(tmp_path / "mine", tell=quiet).folder)["index.html"]
-    failed = [
-        text for (_, said), (_, text) in zip(page.found, page.texts, strict=True) if said.get("class") == "failed"
-    ]
-    assert "CONTROLS FAILED, 1 of 1: do not trust this board." in failed[0]
+    def box_of(name, tested):
+        full_board(tmp_path / name, shares={"graph": 0.9, "weak": 0.2}, holds=False, tested=tested)
+        page = read(publish(tmp_path / name, tell=quiet).folder)["index.html"]
+        parts = zip(page.found, page.texts, strict=True)
+        kinds = ((said.get("class"), text) for (_, said), (_, text) in parts)
+        return next((kind, text) for kind, text in kinds if kind in {"held", "doubtful", "failed"})
+
+    kind, text = box_of("mine", "random")
+    assert kind == "failed"
+    assert "CONTROLS FAILED, 1 of 1: do not trust this board." in text
+    kind, text = box_of("yours", "graph")  # a rival's failure is of its own rows
+    assert kind == "doubtful"
+    assert "Controls: 0 of 1 held. Do not trust the rows of graph:" in text
 
 
 def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path):

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.cli.boards import CONTESTANT_FAILED
+from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.hashes import file_record

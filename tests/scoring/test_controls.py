@@ -9,7 +9,15 @@ import pytest
 from scipy import stats
 
 from sasgeo_bench.leaderboard.text import control_lines
-from sasgeo_bench.scoring.controls import at_least, chances, hits, hold_controls, verdict_frame
+from sasgeo_bench.scoring.controls import (
+    at_least,
+    chances,
+    failed_controls,
+    hits,
+    hold_controls,
+    knows_too_much,
+    verdict_frame,
+)
 from sasgeo_bench.tasks.query import BLIND, NOISE_FREE, SHUFFLED, TURNED, TWINS
 
 
@@ -120,13 +128,39 @@ def test_what_is_no_control_has_no_verdict():
 
 
 def test_lines_say_what_failed_first():
-    verdicts = hold_controls({"mine": rows(SHUFFLED, [1] * 8), "other": rows(SHUFFLED, [0] * 8)})
+    verdicts = hold_controls({"random": rows(SHUFFLED, [1] * 8), "other": rows(SHUFFLED, [0] * 8)})
     assert [item.holds for item in verdicts] == [False, True]
     first, second = control_lines(verdicts)
     assert first == "CONTROLS FAILED, 1 of 2: do not trust this board."
-    assert second.startswith("shuffled map at chance: FAILED by mine, 8 of 8 where 0.8 are expected (p 1e-08)")
+    assert second.startswith("shuffled map at chance: FAILED by random, 8 of 8 where 0.8 are expected (p 1e-08)")
     assert control_lines(verdicts[1:]) == ["Controls: all 1 held."]
     assert "none were drawn" in control_lines([])[0]
+
+
+def test_a_rival_that_fails_a_control_spoils_its_own_rows_alone():
+    verdicts = hold_controls(
+        {
+            "mine": rows(SHUFFLED, [1] * 8),
+            "yours 2 (ab12cd)": rows(BLIND, [0] * 4),
+            "fft_vote": rows(SHUFFLED, [0] * 8),
+        }
+    )
+    first, *rest = control_lines(verdicts)
+    assert first == (
+        "Controls: 1 of 3 held. Do not trust the rows of yours 2 (ab12cd), mine; if these share no code, the queries "
+        "may reveal the truth:"
+    )
+    assert [line.partition(":")[0] for line in rest] == ["blind views withheld", "shuffled map at chance"]
+    assert control_lines([item for item in verdicts if item.matcher != "mine"])[0] == (
+        "Controls: 1 of 2 held. Do not trust the rows of yours 2 (ab12cd):"
+    )
+    assert [item.control for item in failed_controls(verdicts, "mine")] == ["shuffled map at chance"]
+    assert failed_controls(verdicts, "fft_vote") == ()
+    # To answer a view that shows nothing is unwise; to find the place on a shuffled map is to know it from elsewhere.
+    assert knows_too_much(verdicts, "mine") == (
+        'right 8 of 8 times at the control "shuffled map at chance", where guessing is right 0.8 times'
+    )
+    assert knows_too_much(verdicts, "yours 2 (ab12cd)") is None
 
 
 def test_verdicts_become_a_table():

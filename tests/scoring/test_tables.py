@@ -321,6 +321,16 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert len(warnings_of(board)) == 2
 
 
+def test_the_head_of_a_suite_counts_the_queries_of_its_figures_whoever_does_not_answer_them():
+    said = {"role": ["stress", "control"] * 4}
+    able = scores([1.0, 99.0] * 4, **said)
+    board = leaderboard({"able": able, "not": scores([math.inf] * 8, status="not applicable", **said)}, draws=200)
+    (short,) = summary(Book.of(board, {}))
+    assert short.columns[1].name == "occlusion, n = 4"
+    (alone,) = summary(Book.of(board[board["matcher"] == "not"], {}))
+    assert alone.columns[1].name == "occlusion, n = 8"
+
+
 def test_two_versions_of_a_control_are_controls_both():
     names = ("oracle_pose 1 (aaaaaa)", "oracle_pose 1 (bbbbbb)", "mine")
     board = leaderboard({name: scores([1.0, 99.0] * 10, blocks=6) for name in names}, draws=200)

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.running import runner
@@ -20,6 +20,7 @@ from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks.split import Split, find_split, list_split_files
 from sasgeo_bench.tasks.task_files import read_asked, read_task
 
+_SOUND: Final = frozenset({"ok", "refused", "not applicable"})  # statuses of a matcher that works
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 
@@ -133,9 +134,12 @@ def run_command(options: RunOptions) -> None:
     """Ask a matcher every query of some tasks; goes on where an earlier run was cut off."""
     lines: list[object] = []  # said when the bars are gone, which would draw stdout to stderr
     with shown_progress() as progress:
-        run(**vars(options) | {"say": lines.append, "tell": tell, "progress": progress})
+        report = run(**vars(options) | {"say": lines.append, "tell": tell, "progress": progress})
     for line in lines:
         say(line)
+    if report.counts and not report.counts.keys() & _SOUND:
+        tell(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
+        raise typer.Exit(CONTESTANT_FAILED)
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, PipelineFile
-from sasgeo_bench.matching.plugins import check_names
+from sasgeo_bench.matching.plugins import YARDSTICK, check_names
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.publishing.archive_folder import check_results
@@ -27,7 +27,7 @@ from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.rows import YARDSTICK, is_unranked
+from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.build import is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
@@ -323,10 +323,14 @@ def run_pipeline(
         raise ConfigError(message)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
-    folders: list[Path] = []
-    for spec, mine in ({spec: [*tasks, *controls] for spec in (*plan.matchers, REFERENCE)}).items():
+    goes: dict[str, list[_Go]] = {}
+    for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
         with failures.of(spec, but=(ConfigError,)):
-            folders += _run(plan, spec, mine if spec in plan.matchers else controls, tell, progress)
+            goes[spec] = _plan_goes(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
+    folders: list[Path] = []
+    for spec, found in goes.items():
+        with failures.of(spec, but=(ConfigError,)):
+            folders += _run(spec, found, tell, progress)
     if not folders and failures.first is not None:
         raise failures.first
     split = plan.requests[0].split if plan.requests else None
@@ -355,20 +359,6 @@ def run_pipeline(
     return board
 
 
-def _run(plan: PipelinePlan, spec: str, tasks: list[Path], tell: Tell, progress: Progress | None) -> list[Path]:
-    """Folders of the runs of one matcher, after whatever had no row was asked."""
-    folders: list[Path] = []
-    for go in _plan_goes(plan, spec, tasks):
-        left, done = _count([go])
-        label = f"{spec}, {go.name}" if go.name else spec
-        tell(f"{label}: {left} queries to ask, {done} answered before")
-        for line in () if go.plan.lesson is not None else go.lines():
-            tell(f"{label}: {line}")
-        run(go.plan, tell=tell if left else _silent, progress=progress)
-        folders += [part.folder for part in go.plan.parts]
-    return folders
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Go:
     """One run of a matcher; one that learns has one for each half, and its name says which."""
@@ -381,6 +371,20 @@ class _Go:
         if self.name and self.plan.lesson is None:
             return ["nothing to learn from, asked untaught"]
         return self.plan.lesson_lines()
+
+
+def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) -> list[Path]:
+    """Folders of the runs of one matcher, after whatever had no row was asked."""
+    folders: list[Path] = []
+    for go in goes:
+        left, done = _count([go])
+        label = f"{spec}, {go.name}" if go.name else spec
+        tell(f"{label}: {left} queries to ask, {done} answered before")
+        for line in () if go.plan.lesson is not None else go.lines():
+            tell(f"{label}: {line}")
+        run(go.plan, tell=tell if left else _silent, progress=progress)
+        folders += [part.folder for part in go.plan.parts]
+    return folders
 
 
 def _count(goes: Sequence[_Go]) -> tuple[int, int]:
@@ -397,7 +401,7 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
     mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
     whole = plan_run(_run_request(plan, spec, mine))
     learning = plan.spec.learning
-    is_oracle = learning is not None and spec in learning.oracles
+    is_oracle = _is_oracle(plan, spec)
     if is_oracle and not is_unranked(whole.card.name):
         message = (
             f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
@@ -423,11 +427,14 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
             train=train,
             most_trained=learning.most,
             split=plan.requests[0].split,
-            is_oracle=is_oracle,
         )
         if asked:
             goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
     return goes
+
+
+def _is_oracle(plan: PipelinePlan, spec: str) -> bool:
+    return plan.spec.learning is not None and spec in plan.spec.learning.oracles
 
 
 def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
@@ -454,6 +461,7 @@ def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest
         limits=Limits(match_s=plan.spec.match_s),
         jobs=plan.jobs,
         dask=plan.dask,
+        is_oracle=_is_oracle(plan, spec),
         hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
     )
 

@@ -67,7 +67,7 @@ class RunRequest:
     split : Split, optional
         Says what is one place, and how far from each other places to learn from and places that are asked must lie.
     is_oracle : bool
-        Lets it learn from what it is asked: a yardstick, never ranked.
+        Lets it learn from what it is asked, and be named as an oracle: a yardstick, never ranked.
     hidden : sequence of Path
         Files that the matcher must not see besides truths and the like, as that of a private seed.
     """
@@ -304,7 +304,7 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
     if reply.status != "ok" or reply.card is None:
         said = reply.message or "the plugin says nothing of itself"
         raise MatchError(said if request.spec in said else f"{request.spec}: cannot be made ({said})")
-    check_card_name(request.spec, reply.card.name)
+    check_card_name(request.spec, reply.card.name, is_oracle=request.is_oracle)
     return reply.card, reply.code, reply.learns
 
 

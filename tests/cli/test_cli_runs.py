@@ -11,6 +11,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.matching.plugins import MATCHERS
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files
@@ -215,6 +216,16 @@ def test_several_tasks_are_run_and_validated_at_once(program, out) -> None:
     assert program("merge", *merged, "--into", "all.parquet")[0] == 0
     code, told, _ = program("validate", "--predictions", "all.parquet", *tasks)
     assert (code, told) == (0, "all.parquet: answers every query of 2 tasks, and nothing else\n")
+
+
+def test_a_run_without_a_sound_row_ends_with_a_status_that_a_script_sees(program, out, ids) -> None:
+    code, told, err = program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK)
+    assert code == CONTESTANT_FAILED
+    assert f"{len(ids)} crash" in err
+    assert err.splitlines()[-1] == "no query was answered, so the command ends with status 4; the rows are kept"
+    assert len(prediction_files.read_ties(out.parent / told.strip())) == len(ids)
+    again = program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK)
+    assert again[0] == 0, again[2]  # nothing was left to ask
 
 
 def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_folder, ids, monkeypatch) -> None:

@@ -103,6 +103,25 @@ def test_every_board_has_controls_and_figures_without_them(made):
     assert "## Controls" in text
 
 
+def test_every_card_is_read_before_the_first_query_is_asked(made, tmp_path, monkeypatch):
+    """A name that is taken is told at once, not after the hours of all others."""
+
+    def stop(*_, **__):
+        message = "here begins the first run"
+        raise ConfigError(message)
+
+    (tmp_path / "taken.py").write_text(
+        "from sasgeo_bench.matching.controls.fft_vote import FftVote\n\n\nclass Mine(FftVote):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(pipeline, "run", stop)
+    spec = small().model_copy(update={"matchers": ["random", "taken:Mine"]})
+    lines = []
+    with pytest.raises(ConfigError, match="here begins the first run"):
+        run_pipeline(plan_pipeline(spec, out=made[0].out, tell=lambda _: None), tell=lines.append)
+    assert "taken:Mine failed: its card is named 'fft_vote', as a matcher that ships: rename it" in lines
+
+
 def test_the_command_ends_with_the_board_and_what_to_do_next(made, program, monkeypatch, tmp_path):
     _, board, _ = made
     monkeypatch.setattr("sasgeo_bench.cli.boards.run_pipeline", lambda *_, **__: board)

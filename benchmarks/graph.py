@@ -18,8 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.graph import verify
 from sasgeo_bench.sasgeo.mapped import MappedGraph

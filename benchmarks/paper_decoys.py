@@ -15,7 +15,7 @@ import numpy as np
 from sasgeo_baselines.global_descriptor import GlobalDescriptor
 
 from sasgeo_bench.experiments.paper.task import SUITE, TRIALS, VERSION, PaperDrawer, region_name
-from sasgeo_bench.experiments.paper.windows import Windows
+from sasgeo_bench.experiments.paper.tiles import Windows
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.query import Query

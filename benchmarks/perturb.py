@@ -21,11 +21,17 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import Perturbation, share_changed, share_hidden
-from sasgeo_bench.tasks.perturbations.border import Border
-from sasgeo_bench.tasks.perturbations.crop import CentralCrop
-from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
-from sasgeo_bench.tasks.perturbations.occlusion import AdversarialMask, CanopyAndShadow, Glare, Rectangles, TiltWedge
+from sasgeo_bench.tasks.perturbations.occlusion import (
+    AdversarialMask,
+    Border,
+    CanopyAndShadow,
+    CentralCrop,
+    FalseUnknown,
+    Glare,
+    Rectangles,
+    TiltWedge,
+)
 from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.perturbations.season import Season
 

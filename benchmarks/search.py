@@ -41,9 +41,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
-from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region

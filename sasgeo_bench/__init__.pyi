@@ -17,8 +17,8 @@ from .matching.controls.answers import middle_m as middle_m
 from .matching.controls.answers import offsets_m as offsets_m
 from .matching.controls.answers import points_of as points_of
 from .matching.controls.answers import ranked_candidates as ranked_candidates
-from .matching.controls.dense_matcher import DenseMatcher as DenseMatcher
-from .matching.controls.dense_matcher import PoseCheck as PoseCheck
+from .matching.controls.fft_vote import DenseMatcher as DenseMatcher
+from .matching.controls.fft_vote import PoseCheck as PoseCheck
 from .matching.matcher import WITHHELD as WITHHELD
 from .matching.matcher import Learner as Learner
 from .matching.matcher import Match as Match
@@ -50,8 +50,8 @@ from .running.testing import tiny_place as tiny_place
 from .search.chart import Chart as Chart
 from .search.chart import block_max as block_max
 from .search.chart import fade as fade
+from .search.plan import Disc as Disc
 from .search.plan import Mode as Mode
-from .search.space import Disc as Disc
 from .search.vote_search import VotePlan as VotePlan
 from .search.votes import VoteGains as VoteGains
 from .search.votes import make_template as make_template

@@ -33,7 +33,7 @@ from sasgeo_bench.files.file_manifest import check_site
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.board_schema import check_shape
+from sasgeo_bench.leaderboard.board_files import check_shape
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.learned_file import read_learned
 from sasgeo_bench.matching.results import Prediction

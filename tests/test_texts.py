@@ -25,7 +25,7 @@ from sasgeo_bench.cli.console import Bars, errors, print_table, say, tell
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import write_board
 from sasgeo_bench.leaderboard.board_plots import Page, page
-from sasgeo_bench.leaderboard.picture import pixels_of
+from sasgeo_bench.leaderboard.case_plot import pixels_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction

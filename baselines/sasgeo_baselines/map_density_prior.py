@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_baselines.places import Sums, first_apart, lattice_m
+from sasgeo_baselines.global_descriptor import Sums, first_apart, lattice_m
 from sasgeo_bench import (
     WITHHELD,
     Match,

@@ -1,13 +1,76 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that examines the set-up."""
+"""The command that examines a user's set-up: versions, folders, extracts, and what is missing."""
 
+import os
+import platform
+import shutil
+from collections.abc import Iterator, Sequence
+from importlib import metadata
 from pathlib import Path
+from typing import Final
 
+import pyproj
+import rasterio
+import shapely
 from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table
-from sasgeo_bench.cli.environment import examine
 from sasgeo_bench.cli.options import ExtractFolders, Out
+from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.osm.locate import Extract, answers, extract_folders, find_extract
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+
+_LIBRARIES: Final = ("osmium", "shapely", "geopandas", "rasterio", "numpy", "pandas", "pyarrow")
+
+
+def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
+    """Yield name and finding, one pair for each thing looked at; changes nothing and downloads nothing.
+
+    Examples
+    --------
+    >>> dict(examine((), out=Path("out")))["python"].count(".")
+    2
+    """
+    yield "sasgeo-bench", metadata.version("sasgeo-bench")
+    yield "python", platform.python_version()
+    for name in _LIBRARIES:
+        yield name, metadata.version(name)
+    yield "GDAL, GEOS, PROJ", f"{rasterio.__gdal_version__}, {shapely.geos_version_string}, {pyproj.proj_version_str}"
+    yield "SASGEO_EXTRACTS", os.environ.get("SASGEO_EXTRACTS", "not set")
+    for folder in extract_folders(folders):
+        yield "extracts in", f"{folder}" + ("" if folder.is_dir() else " (no such folder)")
+    root = next(parent for parent in (out.absolute(), *out.absolute().parents) if parent.exists())
+    is_writable = os.access(root, os.W_OK)
+    free_gb = shutil.disk_usage(root).free / 1e9
+    yield "output", f"{out.absolute()}, {free_gb:.1f} GB free" + ("" if is_writable else ", NOT WRITABLE")
+    yield from _missing(folders)
+
+
+def _missing(folders: Sequence[Path]) -> Iterator[tuple[str, str]]:
+    """Extracts of the shipped regions that are not on this machine, by what can be done about it."""
+    wanted: set[str] = set()
+    missing: dict[str, list[str]] = {}
+    for path in list_region_files().values():
+        for extract in read_region_file(path).extract:
+            if extract.town is not None or extract.file in wanted:
+                continue
+            wanted.add(extract.file)
+            try:
+                find_extract(extract.model_copy(update={"urls": ()}), folders=folders)
+            except ExtractError:
+                missing.setdefault(_mend(extract), []).append(extract.file)
+    found = len(wanted) - sum(map(len, missing.values()))
+    yield "extracts found", f"{found} of {len(wanted)} that the shipped regions name"
+    for mend, files in sorted(missing.items()):
+        yield "missing", f"{mend}: {', '.join(sorted(files))}"
+
+
+def _mend(extract: Extract) -> str:
+    if not extract.urls:
+        return "no address is known, put them into one of the folders"
+    if not any(map(answers, extract.urls)):
+        return "the server does not answer now, put them into one of the folders or try again later"
+    return "the server answers, build-region downloads them"
 
 
 def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:

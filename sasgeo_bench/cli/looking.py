@@ -10,9 +10,8 @@ from rich.table import Table
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
 from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.leaderboard.case_plot import case_pixels
+from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
-from sasgeo_bench.leaderboard.picture import write_png
 from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest

@@ -11,8 +11,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
-from sasgeo_bench.matching.plugin_files import write_plugin
-from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
 from sasgeo_bench.running.testing import check_matcher
 
 

@@ -8,8 +8,7 @@ import typer
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.tasks.private_seed import LEAST_BITS, REPRODUCING_BITS, PrivateSeed
-from sasgeo_bench.tasks.seed_file import VARIABLE, take_seed
+from sasgeo_bench.tasks.private_seed import LEAST_BITS, REPRODUCING_BITS, VARIABLE, PrivateSeed, take_seed
 from sasgeo_bench.tasks.task_plan import PRIVATE_ROOT
 
 SeedFile = Annotated[

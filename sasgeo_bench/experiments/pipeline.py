@@ -28,12 +28,11 @@ from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.rows import is_unranked
-from sasgeo_bench.tasks.build import is_of_region, made_tasks, why_to_draw
+from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.tasks.split import HALVES, Half
 from sasgeo_bench.tasks.suites.base import Choice
-from sasgeo_bench.tasks.task_batch import carry_out
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.

@@ -1,18 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of unknown origin: list and hash their files, and compare them with a list of known ones."""
+"""Sizes and hashes of files, and folders of unknown origin compared with a list of known files."""
 
+import hashlib
 import os
 import stat
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+from pydantic import ConfigDict, Field
 
 from sasgeo_bench.bounds import one_line
+from sasgeo_bench.config import Document
 from sasgeo_bench.errors import StoreError, named
-from sasgeo_bench.files.hashes import sha256_of
 from sasgeo_bench.files.json import read_json
+
+
+class FileRecord(Document):
+    """Size and SHA-256 of one file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+    sha256: str
+    bytes: Annotated[int, Field(ge=0)]
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal, read in pieces."""
+    with path.open("rb") as source:
+        return hashlib.file_digest(source, "sha256").hexdigest()
+
+
+def file_record(path: Path) -> FileRecord:
+    """Return size and hash of a file."""
+    return FileRecord(sha256=sha256_of(path), bytes=path.stat().st_size)
+
 
 SITE: Final = "site"
 SITE_MANIFEST: Final = "site.json"  # without it a folder is no site, and is not replaced

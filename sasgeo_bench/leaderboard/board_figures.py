@@ -41,7 +41,7 @@ from sasgeo_bench.progress import Tell
 from sasgeo_bench.scoring.contrasts import Contrast, by_place
 from sasgeo_bench.scoring.protection import ProtectionLevels, protection_levels
 from sasgeo_bench.scoring.score import FIX_M
-from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
+from sasgeo_bench.scoring.strata import GROUP, queries_of, steps_frame
 from sasgeo_bench.tasks.split import Split
 
 Draw = Callable[[Path], None]

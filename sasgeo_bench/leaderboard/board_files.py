@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boards on disk: `leaderboard.parquet` is the master, all others say the same for other readers."""
+"""Boards on disk: `leaderboard.parquet` is the master; tables of unknown origin are checked when read."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,19 +11,16 @@ import pyarrow as pa
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import (
-    FIGURE_FILES,
-    PICTURE_FILES,
-    SITE,
-    SITE_FOLDERS,
-    check_known,
-    check_site,
-)
+from sasgeo_bench.files.file_manifest import FIGURE_FILES, PICTURE_FILES, SITE, SITE_FOLDERS, check_known, check_site
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.scoring import falsifiers, protection
+from sasgeo_bench.scoring.contrasts import Finding
+from sasgeo_bench.scoring.controls import Verdict
+from sasgeo_bench.scoring.rows import Row
 from sasgeo_bench.texts import csv_cell, json_text
 
 LEADERBOARD: Final = "leaderboard"
@@ -208,3 +205,64 @@ def read_scores(folder: Path) -> pd.DataFrame:
     sasgeo_bench.errors.StoreError: nowhere/scores.parquet cannot be read (No such file or directory): score it again
     """
     return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
+
+
+_TEXTS: Final = frozenset({"contrast", "suite", "kind", "matcher", "prior_group", "method", "supports"})
+_FINDING: Final = {item.name: item.type for item in fields(Finding)}
+_SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
+    "leaderboard": {item.name: item.type for item in fields(Row)},
+    "contrasts": _FINDING,
+    "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in falsifiers.COLUMNS},
+    "controls": {item.name: item.type for item in fields(Verdict)},
+    "protection": {name: str if name in _TEXTS else float for name in protection.COLUMNS},
+    "scores": {
+        **dict.fromkeys(("query_id", "matcher", "suite", "track", "kind", "role", "place"), str),
+        "is_present": bool,
+    },
+}
+
+
+def check_shape(name: str, table: pd.DataFrame) -> None:
+    """Refuse a table whose columns are missing, of another type, or without a name where there must be one.
+
+    Parameters
+    ----------
+    name : str
+        Of the table, as in "leaderboard".
+    table : pandas.DataFrame
+        As it was read; one that no board has to have may be without columns.
+
+    Raises
+    ------
+    StoreError
+        Naming the file and the column.
+
+    Examples
+    --------
+    >>> check_shape("controls", pd.DataFrame({"control": ["blind"]}))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.StoreError: controls.parquet has no column 'matcher': score it again
+    """
+    if name != "leaderboard" and not len(table.columns):
+        return
+    for column, kind in _SHAPES[name].items():
+        if list(table.columns).count(column) != 1:
+            fault = "two columns" if column in table else "no column"
+            message = f"{name}.parquet has {fault} {column!r}: score it again"
+            raise StoreError(message)
+        if len(table) and not _is_of(table[column], kind):
+            message = f"{name}.parquet: {column} holds something else than it should, or nothing: score it again"
+            raise StoreError(message)
+
+
+def _is_of(values: "pd.Series[Any]", kind: object) -> bool:
+    """Return whether a column holds texts, booleans or whole numbers without a gap, or numbers with gaps."""
+    if kind is str:
+        return bool(values.map(lambda one: isinstance(one, str)).all())
+    if kind is bool:
+        return bool(pd.api.types.is_bool_dtype(values)) and not values.isna().any()
+    is_number = pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_bool_dtype(values)
+    if kind is int:
+        return bool(pd.api.types.is_integer_dtype(values)) and not values.isna().any()
+    return bool(is_number) or bool(values.isna().all())

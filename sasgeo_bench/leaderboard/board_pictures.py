@@ -15,11 +15,17 @@ from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import PICTURES_FILE, Extra
-from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
-from sasgeo_bench.leaderboard.case_plot import case_pixels
-from sasgeo_bench.leaderboard.cases import COLUMNS, MOST_CASES, OPERATING, find_cases, operating_rejector, sample_cases
-from sasgeo_bench.leaderboard.picture import WEBP, fitted, pixels_of, thumbnail
+from sasgeo_bench.leaderboard.case_plot import WEBP, case_pixels, fitted, pixels_of, thumbnail
+from sasgeo_bench.leaderboard.cases import (
+    COLUMNS,
+    MOST_CASES,
+    find_cases,
+    operating_rejector,
+    sample_cases,
+    words_of,
+)
 from sasgeo_bench.leaderboard.plot_tables import shown_matchers
+from sasgeo_bench.leaderboard.run_cases import Case, read_picture, said_of
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layer_file import read_overview
@@ -279,28 +285,3 @@ def _cases(
                 prediction=board.predictions[matcher].get(query_id),
                 **words_of(words, matcher, query_id),
             )
-
-
-def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
-    """Describe what rejectors state of one answer: chance to be false or rank, and whether they accept it.
-
-    Parameters
-    ----------
-    words : mapping of (matcher, rejector) to pandas.DataFrame
-        RejectionResult rows by query id.
-    matcher, query_id : str
-        Whose answer to what.
-    """
-    p_false: dict[str, float] = {}
-    orders: dict[str, float] = {}
-    accepted: dict[str, bool] = {}
-    for (name, rejector), frame in words.items():
-        if name != matcher or query_id not in frame.index:
-            continue
-        row: Any = frame.loc[query_id]
-        if pd.notna(row["p_right"]):
-            is_chance = bool(row.get("is_calibrated", True))
-            (p_false if is_chance else orders)[rejector] = 1.0 - float(row["p_right"])
-        if pd.notna(row[OPERATING]) and row["is_answered"]:
-            accepted[rejector] = bool(row[OPERATING])
-    return {"p_false": p_false, "orders": orders, "accepted": accepted}

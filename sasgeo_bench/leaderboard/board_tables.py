@@ -30,11 +30,10 @@ from sasgeo_bench.leaderboard.tables import (
     text_cells,
     ties_of,
 )
-from sasgeo_bench.scoring.integrity import AS_DRAWN
 from sasgeo_bench.scoring.metrics import CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.rejection import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
-from sasgeo_bench.scoring.steps import GROUP
-from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS
+from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS
 
 _REJECTION: Final = (  # metrics of the tables of rejectors
     *("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),

@@ -24,7 +24,13 @@ from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
 from sasgeo_bench.running.sandbox import joined
-from sasgeo_bench.scoring.contestants import EntryAnswers, read_entry_answers, score_entries
+from sasgeo_bench.scoring.contestants import (
+    EntryAnswers,
+    ScoredTask,
+    read_entry_answers,
+    read_scored_task,
+    score_entries,
+)
 from sasgeo_bench.scoring.contrasts import contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.controls import failed_controls, hold_controls, is_control, verdict_frame
 from sasgeo_bench.scoring.cost import Costs
@@ -32,12 +38,10 @@ from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out, set_apa
 from sasgeo_bench.scoring.falsifiers import falsifier_frame, hold_falsifiers
 from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.scoring.protection import protection_frame
-from sasgeo_bench.scoring.rejection import OWN, Rule, remarks_of, rules_of
-from sasgeo_bench.scoring.rejector_evaluation import RejectionTask, apply_rejectors
+from sasgeo_bench.scoring.rejection import OWN, RejectionTask, Rule, apply_rejectors, remarks_of, rules_of
 from sasgeo_bench.scoring.rows import EntryLabel, name_alone, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.scored_tasks import ScoredTask, read_scored_task
-from sasgeo_bench.scoring.steps import GROUP, queries_of, steps_frame
+from sasgeo_bench.scoring.strata import GROUP, queries_of, steps_frame
 from sasgeo_bench.scoring.tables import cost_rows, leaderboard
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of

@@ -28,7 +28,7 @@ rejection. Falsifiers are no cases: of some of them nothing else is asked than n
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -198,3 +198,28 @@ def count_cases(cases: pd.DataFrame) -> dict[str, int]:
     """
     counts = cases["failure"].value_counts()
     return {name: int(counts.get(name, 0)) for name in FAILURES}
+
+
+def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
+    """Describe what rejectors state of one answer: chance to be false or rank, and whether they accept it.
+
+    Parameters
+    ----------
+    words : mapping of (matcher, rejector) to pandas.DataFrame
+        RejectionResult rows by query id.
+    matcher, query_id : str
+        Whose answer to what.
+    """
+    p_false: dict[str, float] = {}
+    orders: dict[str, float] = {}
+    accepted: dict[str, bool] = {}
+    for (name, rejector), frame in words.items():
+        if name != matcher or query_id not in frame.index:
+            continue
+        row: Any = frame.loc[query_id]
+        if pd.notna(row["p_right"]):
+            is_chance = bool(row.get("is_calibrated", True))
+            (p_false if is_chance else orders)[rejector] = 1.0 - float(row["p_right"])
+        if pd.notna(row[OPERATING]) and row["is_answered"]:
+            accepted[rejector] = bool(row[OPERATING])
+    return {"p_false": p_false, "orders": orders, "accepted": accepted}

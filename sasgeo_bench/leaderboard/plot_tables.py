@@ -16,8 +16,7 @@ from sasgeo_bench.scoring.intervals import effective_count, wilson
 from sasgeo_bench.scoring.protection import ProtectionLevels
 from sasgeo_bench.scoring.rejection import answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_apart, is_unranked
-from sasgeo_bench.scoring.steps import GROUP, primary_rows
-from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS
+from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, primary_rows
 
 MOST_MATCHERS: Final = 8  # more are not told apart at a glance
 ARMS: Final = ("uniform", "hand", "oracle")  # parts of names of what contrasts are seen beside

@@ -12,19 +12,23 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.axes import (
+from sasgeo_bench.leaderboard.board_plots import (
     ACROSS,
+    FAINT,
+    GREY,
     HALVES,
     INTERVALS,
     PRIMARY,
+    Page,
     draw_bars_of,
     draw_line,
     dress_share,
+    look_of,
     of_which,
+    page,
     panels_across,
     those_there,
 )
-from sasgeo_bench.leaderboard.board_plots import FAINT, GREY, Page, look_of, page
 from sasgeo_bench.leaderboard.plot_tables import AS_DRAWN, BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, PlaceDifference
 from sasgeo_bench.scoring.metrics import primary_of

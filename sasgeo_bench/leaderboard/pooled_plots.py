@@ -11,17 +11,20 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.axes import (
+from sasgeo_bench.leaderboard.board_plots import (
+    FAINT,
     INTERVALS,
     PRIMARY,
+    Page,
     dodged,
     draw_bars_of,
     draw_line,
     dress_share,
+    look_of,
+    page,
     panels_across,
     those_there,
 )
-from sasgeo_bench.leaderboard.board_plots import FAINT, Page, look_of, page
 from sasgeo_bench.leaderboard.pooled_tables import LEAST_ERROR_M, MOST_ERROR_M, front_of
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.metrics import primary_of

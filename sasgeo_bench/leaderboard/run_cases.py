@@ -1,31 +1,278 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A matcher's runs looked at query by query: how each went wrong, and what the picture of any of them shows."""
+"""Failures of a matcher's runs, query by query, and the content of the picture of each."""
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
-from sasgeo_bench.leaderboard.board_pictures import words_of
-from sasgeo_bench.leaderboard.case_panels import Case, read_picture
-from sasgeo_bench.leaderboard.case_plot import CasePicture
-from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart
+from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector, words_of
 from sasgeo_bench.matching.learned_file import TrainingRecord
+from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Tell
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
+from sasgeo_bench.regions.layer_file import read_layers
+from sasgeo_bench.regions.layers import PRESENT
+from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.sasgeo.integrity import EVIDENCE
+from sasgeo_bench.scoring.contestants import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
 from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
-from sasgeo_bench.scoring.score import score_task, settle_not_applicable
-from sasgeo_bench.scoring.scored_tasks import AskedTask, ScoredTask, read_scored_task
+from sasgeo_bench.scoring.score import MISSING, score_task, settle_not_applicable
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import Truth
+from sasgeo_bench.tasks.build import built_anew
+from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.sheet import strength_text
 from sasgeo_bench.tasks.split import Split
+
+_MOST_CELLS: Final = 560  # of a piece of a map, along a side: more are no more to see
+_ROOM: Final = 1.25  # around both places
+_LEAST_SIDES: Final = 2.4  # of a view, a piece of a map is at least
+_MOST_LINES: Final = 17
+_MOST_LETTERS: Final = 40  # of a name there
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One query and all that is known of its answer.
+
+    Parameters
+    ----------
+    matcher, failure : str
+        Who answered, and how it failed; "" where it did not.
+    query, truth : Query, Truth
+        What was asked.
+    prediction : Prediction, optional
+        The answer; None for a missing row.
+    p_false : mapping of str to float
+        By rejector, how likely it says that the answer is false.
+    orders : mapping of str to float
+        The same of rejectors that order answers by it, and tell no probability.
+    accepted : mapping of str to bool
+        By rejector, whether the threshold for a risk of 5 % accepts it.
+    """
+
+    matcher: str
+    failure: str
+    query: Query
+    truth: Truth
+    prediction: Prediction | None
+    p_false: Mapping[str, float] = field(default_factory=dict)
+    orders: Mapping[str, float] = field(default_factory=dict)
+    accepted: Mapping[str, bool] = field(default_factory=dict)
+
+    @property
+    def fix(self) -> Pose | None:
+        """The first pose of the answer."""
+        has_pose = self.prediction is not None and self.prediction.status == "ok" and self.prediction.candidates
+        return self.prediction.candidates[0][0] if has_pose and self.prediction is not None else None
+
+    @property
+    def error_m(self) -> float | None:
+        """Return the distance of the answer from the true place; None if either is unknown."""
+        fix, true = self.fix, self.truth.pose
+        if fix is None or true is None:
+            return None
+        return math.hypot(fix.easting_m - true.easting_m, fix.northing_m - true.northing_m)
+
+
+def said_of(case: Case) -> dict[str, float | str]:
+    """Return the known facts of a case as plain numbers and words.
+
+    `error_m` is the distance from where the view was taken, also of absent places; `score_margin` the score of the
+    first pose less that of the second; `p_false_<rejector>` (`order_<rejector>` where it is no probability) and
+    `accepted_<rejector>` what a rejector says, and `told_<name>` what the answer told of itself.
+    """
+    prediction, truth = case.prediction, case.truth
+    status: str = MISSING if prediction is None else prediction.status
+    if prediction is not None and status == "ok" and case.fix is None:
+        status = "withheld"
+    scores = [score for _, score in prediction.candidates] if prediction is not None else []
+    found: dict[str, Any] = {
+        "status": status,
+        "error_m": case.error_m,
+        "score_margin": scores[0] - scores[1] if len(scores) > 1 else None,
+        "confidence": None if prediction is None else prediction.confidence,
+        **{f"p_false_{name}": value for name, value in case.p_false.items()},
+        **{f"order_{name}": value for name, value in case.orders.items()},
+        **{f"accepted_{name}": "yes" if value else "no" for name, value in case.accepted.items()},
+        "present": "yes" if truth.is_present else "no",
+        "strength": truth.strength,
+        "strength_unit": truth.strength_unit,
+        "unknown_share": truth.unknown_share,
+        "changed_share": truth.changed_share,
+        "alias_index": truth.alias_index,
+        "map_age_years": truth.measured.get("age_years"),
+        **{f"told_{name}": value for name, value in (() if prediction is None else prediction.diagnostics.items())},
+    }
+    return {name: _plain(value) for name, value in found.items() if _is_told(value)}
+
+
+def _is_told(value: object) -> bool:
+    return value is not None and (isinstance(value, str) or math.isfinite(float(str(value))))
+
+
+def _plain(value: float | str) -> float | str:
+    """Return a number as JSON, rounded to meaningful digits."""
+    return value if isinstance(value, str) else float(f"{float(value):.6g}")
+
+
+def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePicture:
+    """Read the map, evidence and poses that the picture of a case shows.
+
+    Parameters
+    ----------
+    case : Case
+        The query and its answer.
+    region : Path
+        Folder of the map that is searched.
+    about : mapping
+        What `task.json` says: the map must be that very build.
+
+    Raises
+    ------
+    StoreError
+        If the map is missing, damaged, or was built anew since the queries were drawn.
+    """
+    manifest = region_files.read_manifest(region)
+    if not task_files.is_of_map(about, manifest):
+        raise StoreError(built_anew(str(about["region"])))
+    query, truth = case.query, case.truth
+    modes = case.prediction.candidates if case.prediction is not None and case.fix is not None else ()
+    row, col, rows, cols = window = _window(case, manifest.grid)
+    layers, grid = read_layers(region / region_files.LAYERS, window=window), manifest.grid.window(row, col, rows, cols)
+    bits = LayerBits.of(layers)
+    return CasePicture(
+        title=_title(case),
+        view=query.evidence,
+        part=_map_part(layers, grid, manifest),
+        true=truth.pose,
+        is_present=truth.is_present,
+        modes=modes,
+        at_true=_seen_at(truth.pose, case, bits, grid, manifest),
+        at_answer=_seen_at(case.fix, case, bits, grid, manifest),
+        disc=_disc(query),
+        said=_lines(case),
+        attribution=manifest.attribution,
+    )
+
+
+def _disc(query: Query) -> tuple[float, float, float] | None:
+    """Middle and radius of what is searched, where that is a disc."""
+    center_m, radius_m = query.prior.center_m, query.prior.radius_m
+    return None if center_m is None or radius_m is None or query.candidates else (*center_m, radius_m)
+
+
+def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
+    """Return row, column, rows and columns of the part of the map to draw, square unless the map ends."""
+    side_m = max(case.query.evidence.size_m)
+    poses = [pose for pose in (case.truth.pose, case.fix) if pose is not None]
+    if not poses:
+        return (0, 0, grid.rows, grid.cols)
+    places = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
+    span_m = float(np.ptp(places, axis=0).max()) + math.sqrt(2.0) * side_m
+    half_m = max(_ROOM * span_m, _LEAST_SIDES * side_m) / 2
+    middle_m = (places.min(axis=0) + places.max(axis=0)) / 2
+    corners = grid.to_cells(middle_m + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
+    row, col = np.clip(corners[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
+    end_row, end_col = np.clip(corners[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
+    return (row, col, end_row - row, end_col - col)
+
+
+def _map_part(layers: NDArray[np.uint8], grid: Grid, manifest: Manifest) -> MapPart:
+    """Layers as colours, at most `_MOST_CELLS` along a side: one shows what is there in any cell it is made of."""
+    step = max(1, min(-(-max(grid.shape) // _MOST_CELLS), *grid.shape))
+    rows, cols = (side // step for side in grid.shape)
+    parts = layers[:, : rows * step, : cols * step].reshape(len(layers), rows, step, cols, step)
+    is_there = (parts == PRESENT).any(axis=(2, 4))
+    coarse = np.where(is_there, np.uint8(PRESENT), parts.max(axis=(2, 4)))
+    west_m, south_m, east_m, north_m = grid.window(0, 0, rows * step, cols * step).bounds_m
+    colours = paint_overview(manifest, coarse)
+    return MapPart(colours=colours, west_m=west_m, south_m=south_m, east_m=east_m, north_m=north_m)
+
+
+def _seen_at(pose: Pose | None, case: Case, bits: LayerBits, grid: Grid, manifest: Manifest) -> Evidence | None:
+    """Return the map at a place, of the classes that were looked for."""
+    if pose is None:
+        return None
+    view = case.query.evidence
+    cells = observe(bits, grid, pose, size_cells=view.shape[0], cell_size_m=view.cell_size_m)
+    kept = cells[[manifest.classes.index(name) for name in view.classes]]
+    return Evidence(classes=view.classes, cells=kept, cell_size_m=view.cell_size_m)
+
+
+def _title(case: Case) -> str:
+    truth, query = case.truth, case.query
+    what = truth.kind if truth.role == "control" else f"{truth.kind}, {strength_text(truth)}"
+    return (
+        f"{case.failure or 'no failure'}: {case.matcher} on {query.suite} / {query.region} ({what}; {query.track})\n"
+        f"query {query.query_id}"
+    )
+
+
+def _lines(case: Case) -> list[str]:
+    """Return the lines of a picture about an answer: result, rejectors, diagnostics."""
+    said = said_of(case)
+    lines = ["what is known of the answer", f"status: {said['status']}"]
+    if case.error_m is not None:
+        lines.append(f"error: {case.error_m:.1f} m" + ("" if case.truth.is_present else " (of an absent place)"))
+    if case.query.track == "retrieval":
+        lines.append(f"right candidate: {_right_candidate(case)}")
+    if "confidence" in said:
+        lines.append(f"own confidence: {said['confidence']:.3g}")
+    said_by = [(f"P(false) {name}", name, value) for name, value in case.p_false.items()]
+    said_by += [(f"{name} (an order, no probability)", name, value) for name, value in case.orders.items()]
+    for label, name, value in said_by:
+        taken = "" if name not in case.accepted else f", {'accepted' if case.accepted[name] else 'rejected'}"
+        lines.append(f"{label}: {value:.3g}{taken}")
+    lines.append(f"unknown {case.truth.unknown_share:.2f}, changed {case.truth.changed_share:.2f}" + _alias(case))
+    told = {} if case.prediction is None else dict(case.prediction.diagnostics)
+    lines += ["", "what the integrity model saw"] if told or said_by else ["", "the answer told nothing of itself"]
+    known = [(item.name, item.unit) for item in EVIDENCE if item.name in told]
+    known += [(name, "") for name in sorted(told) if name not in {name for name, _ in known}]
+    lines += [f"{_short(name)}: {told[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known]
+    rest = len(lines) - _MOST_LINES
+    return lines if rest <= 0 else [*lines[: _MOST_LINES - 1], f"and {rest + 1} more"]
+
+
+def _short(name: str) -> str:
+    """Shorten a name so that it does not reach into the map next to it."""
+    return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 3]}..."
+
+
+def _alias(case: Case) -> str:
+    return "" if case.truth.alias_index is None else f", alias {case.truth.alias_index:.2f}"
+
+
+def _right_candidate(case: Case) -> str:
+    """Return the position of the right candidate in the answer."""
+    candidates, right = case.query.candidates, case.truth.candidate
+    if not 0 <= right < len(candidates):
+        return f"none of {len(candidates)}"
+    place = candidates[right]
+    poses = [] if case.prediction is None else [pose for pose, _ in case.prediction.candidates]
+    at = [
+        number
+        for number, pose in enumerate(poses, start=1)
+        if math.hypot(pose.easting_m - place.easting_m, pose.northing_m - place.northing_m) <= SAME_PLACE_M
+    ]
+    return f"{at[0] if at else 'not'} in the list of {len(poses)}"
+
 
 _NAMED: Final = 3
 

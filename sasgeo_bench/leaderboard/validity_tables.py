@@ -8,7 +8,7 @@ import pandas as pd
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.columns import column, words
-from sasgeo_bench.leaderboard.reproduction import SEEDS_NOTE
+from sasgeo_bench.leaderboard.private_board import SEEDS_NOTE
 from sasgeo_bench.leaderboard.tables import (
     Cell,
     Row,

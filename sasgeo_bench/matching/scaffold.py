@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plugin package to begin with: complete, small, and good enough to pass the conformance kit at once."""
+"""Write a new plugin package into an empty folder: complete, small, and passing the conformance kit."""
 
 import keyword
 import re
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.matching.plugins import ORACLE, SHIPPED, list_entry_points
 from sasgeo_bench.matching.submission import example_card
 
@@ -200,3 +202,47 @@ def plugin_files(name: str) -> dict[str, str]:
     }
     made = {path.format(**said): text.format(**said) for path, text in files.items()}
     return made | {"card.toml": example_card(name)}
+
+
+def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
+    """Write every file of a package, or leave things as they were.
+
+    Raises
+    ------
+    StoreError
+        If the folder is there and not empty, or cannot be written.
+    """
+    if not _is_free(folder):
+        message = f"{folder} is there already and not empty: name another folder"
+        raise StoreError(message)
+    made: list[Path] = []
+    try:
+        for name, text in files.items():
+            target = folder / name
+            missing = [parent for parent in target.parents if not parent.exists()]
+            for parent in reversed(missing):
+                parent.mkdir()
+                made.append(parent)
+            made.append(target)
+            target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        for path in reversed(made):
+            _remove(path)
+        message = f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
+        raise StoreError(message) from error
+
+
+def _is_free(folder: Path) -> bool:
+    try:
+        return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    except OSError as error:
+        message = f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
+        raise StoreError(message) from error
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or an empty folder; what cannot be removed stays."""
+    try:
+        path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
+    except OSError:
+        return

@@ -16,7 +16,7 @@ import numpy as np
 import osmium
 import shapely
 
-from sasgeo_bench.osm.cuts import find_gaps
+from sasgeo_bench.osm.coverage import find_gaps
 from sasgeo_bench.osm.snapshot import elements
 from sasgeo_bench.osm.taxonomy import Classification, Label, Taxonomy, classify
 

@@ -31,8 +31,8 @@ from sasgeo_bench.publishing.archive_file import (
 )
 from sasgeo_bench.publishing.archive_folder import check_results, is_pack, read_settings
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import read_ids
 

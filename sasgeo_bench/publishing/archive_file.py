@@ -32,23 +32,21 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive_folder import (
     FORMER_LEARNED,
     FORMER_PREDICTIONS,
+    LEARNED,
+    MATCHER,
     PACK,
     PREDICTIONS,
     RUNS,
+    RUNS_SCHEMA,
     SCHEMA_VERSION,
     TABLES,
-    check_replaced,
-    read_settings,
-    sound,
-)
-from sasgeo_bench.publishing.archive_rows import (
-    LEARNED,
-    MATCHER,
-    RUNS_SCHEMA,
     TASK,
     TASK_SCHEMA,
     check_predictions,
+    check_replaced,
     check_tables,
+    read_settings,
+    sound,
 )
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.regions.region_files import MANIFEST

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of stored results: what it says of itself, whether it is what it says, and what may take its place."""
+"""A folder of stored results: check its record, files and rows; replace it only by its like."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from sasgeo_bench.bounds import one_line
-from sasgeo_bench.errors import MatchError, StoreError
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.files.file_manifest import (
     FIGURE_FILES,
     PICTURE_FILES,
@@ -21,10 +23,13 @@ from sasgeo_bench.files.file_manifest import (
     first_difference,
     list_files,
     resolve_link,
+    sha256_of,
 )
-from sasgeo_bench.files.hashes import sha256_of
 from sasgeo_bench.leaderboard.archive_record import ArchiveRecord, VersionRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
+from sasgeo_bench.running.prediction_rows import differing_columns, row_faults
+from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, TRUTH_SCHEMA, VIEW_BYTES
 
 PACK: Final = "pack.json"
 SCHEMA_VERSION: Final = 3
@@ -145,3 +150,150 @@ def check_replaced(folder: Path) -> None:
         known, patterns = ({PACK}, _OLD_FILES) if listed is None else ({PACK, *listed}, ())
         check_known(folder, known, "stored results", patterns=patterns, without=SITE_FOLDERS)
         check_site(folder / SITE)
+
+
+TASK: Final = "task"  # column: number of the row in tasks.parquet
+TASK_SCHEMA: Final = pa.schema([(name, pa.string()) for name in ("task_json", "truth_json", "region_json")])
+MATCHER: Final = "matcher"  # column: whose answer it is
+LEARNED: Final = "learned"  # column: text that was learnt for a run
+RUNS_SCHEMA: Final = pa.schema(
+    [("contestant", pa.string()), ("rows", pa.int64()), ("about", pa.string()), (LEARNED, pa.string())]
+)
+_HEADS: Final = HEAD_SCHEMA.append(pa.field(ASKED, pa.string())).append(pa.field(VIEW_BYTES, pa.int64()))
+_SCHEMAS: Final = {
+    "runs": RUNS_SCHEMA,
+    "tasks": TASK_SCHEMA,
+    "queries": _HEADS.append(pa.field(TASK, pa.int32())),
+    "truths": TRUTH_SCHEMA.append(pa.field(TASK, pa.int32())),
+}
+_PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
+_MAY_BE_NULL: Final = {*POSE_FIELDS, "alias_index", "region_json", LEARNED}
+_TRACKS: Final = ("retrieval", "localization")
+_ROLES: Final = ("control", "stress", "falsifier")
+_KINDS: Final = (
+    *(pa.types.is_string, pa.types.is_integer, pa.types.is_floating),
+    *(pa.types.is_boolean, pa.types.is_list, pa.types.is_map),
+)
+
+
+def check_tables(tables: Mapping[str, pa.Table]) -> None:
+    """Refuse tables of stored results that no board can be made of.
+
+    Parameters
+    ----------
+    tables : mapping of str to pyarrow.Table
+        "tasks", "queries" and "truths", and "runs" where they are read.
+
+    Raises
+    ------
+    ValueError
+        Naming the table and the column.
+    """
+    for name, table in tables.items():
+        _check_columns(name, table)
+    if "runs" in tables:
+        _refuse("runs", "rows", _numbers(tables["runs"]["rows"]) < 0)
+    queries, truths = tables["queries"], tables["truths"]
+    for name in ("queries", "truths"):
+        number = _numbers(tables[name][TASK])
+        _refuse(name, TASK, (number < 0) | (number >= len(tables["tasks"])) | (np.diff(number, prepend=0) < 0))
+    if queries["query_id"].combine_chunks() != truths["query_id"].combine_chunks():
+        message = "truths.parquet: its rows are not those of queries.parquet"
+        raise ValueError(message)
+    if pc.count_distinct(queries["query_id"]).as_py() != len(queries):
+        message = "queries.parquet: a query_id is there twice"
+        raise ValueError(message)
+    _check_queries(queries)
+    _check_truths(truths, queries)
+
+
+def _numbers(column: pa.ChunkedArray) -> np.ndarray:
+    return np.asarray(column.to_numpy())
+
+
+def _refuse(name: str, column: str, is_wrong: np.ndarray) -> None:
+    """Refuse a column with a wrong value, naming the first row that has one."""
+    if is_wrong.any():
+        message = f"{name}.parquet, row {int(np.argmax(is_wrong))}: {column} holds no such value"
+        raise ValueError(message)
+
+
+def _check_columns(name: str, table: pa.Table) -> None:
+    """Refuse columns that are missing, there twice, of another type, or null where none may be."""
+    for field in _SCHEMAS[name]:
+        if table.column_names.count(field.name) != 1:
+            message = f"{name}.parquet holds no column {field.name!r}, or two"
+            raise ValueError(message)
+        column = table[field.name]
+        if not any(kind(field.type) and kind(column.type) for kind in _KINDS):
+            message = f"{name}.parquet: {field.name} is of type {column.type}"
+            raise ValueError(message)
+        if field.name not in _MAY_BE_NULL:
+            _refuse(name, field.name, _numbers(column.is_null()))
+
+
+def _check_queries(queries: pa.Table) -> None:
+    _refuse("queries", VIEW_BYTES, _numbers(queries[VIEW_BYTES]) < 0)
+    _refuse("queries", "rows", _numbers(queries["rows"]) < 1)
+    _refuse("queries", "cell_size_m", ~_is_positive(_numbers(queries["cell_size_m"])))
+    _refuse("queries", "track", ~_is_in(queries["track"], _TRACKS))
+    try:
+        for prior_group in queries["prior_group"].unique().to_pylist():
+            PriorGroup.parse(prior_group)
+    except ConfigError as error:
+        message = f"queries.parquet: {error}"
+        raise ValueError(message) from error
+    _check_poses("queries", _listed(queries["candidates"]))
+
+
+def _check_truths(truths: pa.Table, queries: pa.Table) -> None:
+    for column in ("strength", "unknown_share", "changed_share", "feature_density"):
+        _refuse("truths", column, ~np.isfinite(_numbers(truths[column])))
+    _refuse("truths", "role", ~_is_in(truths["role"], _ROLES))
+    is_present, candidate = _numbers(truths["is_present"]).astype(bool), _numbers(truths["candidate"])
+    counts = _numbers(pc.list_value_length(queries["candidates"]))
+    is_retrieval = _is_in(queries["track"], ("retrieval",))
+    _refuse("truths", "candidate", (candidate < -1) | (candidate >= counts) & (candidate >= 0))
+    _refuse("truths", "candidate", is_present & is_retrieval & (candidate < 0))
+    has_pose = np.array([_numbers(truths[name].is_valid()) for name in POSE_FIELDS])
+    _refuse("truths", "easting_m", has_pose.any(axis=0) != has_pose.all(axis=0))
+    _refuse("truths", "easting_m", is_present & ~is_retrieval & ~has_pose.any(axis=0))
+    _check_poses("truths", truths.filter(pa.array(has_pose.all(axis=0))).select(list(POSE_FIELDS)))
+    _refuse("truths", "measured", _numbers(_listed(truths["measured"].cast(_PAIRS))["value"].is_null()))
+
+
+def check_predictions(table: pa.Table) -> None:
+    """Refuse answers that no runner has written.
+
+    Raises
+    ------
+    ValueError
+        Naming the column.
+    """
+    for column, found, expected in differing_columns(table):
+        message = f"predictions.parquet: {column}: found {found}, expected {expected}"
+        raise ValueError(message)
+    for wrong in row_faults(table):
+        place = f"predictions.parquet, row {wrong.row}, {wrong.column}"
+        message = f"{place}: found {wrong.found}, expected {wrong.expected}"
+        raise ValueError(message)
+
+
+def _listed(column: pa.ChunkedArray) -> pa.Table:
+    """All items of a column of lists of structs."""
+    return pa.Table.from_struct_array(pc.list_flatten(column))
+
+
+def _check_poses(name: str, poses: pa.Table) -> None:
+    """Refuse poses with a number that is none, or a scale that shrinks to nothing."""
+    for column in POSE_FIELDS:
+        _refuse(name, column, ~np.isfinite(_numbers(poses[column]).astype(float)))
+    _refuse(name, "scale", ~_is_positive(_numbers(poses["scale"]).astype(float)))
+
+
+def _is_positive(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.isfinite(values) & (values > 0))
+
+
+def _is_in(column: pa.ChunkedArray, values: Sequence[str]) -> np.ndarray:
+    return _numbers(pc.is_in(column, pa.array(values)))

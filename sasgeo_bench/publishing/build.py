@@ -10,12 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.ageing.ratebook_file import load_ratebook
+from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.file_manifest import SITE, resolve_link
-from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOARD, read_board
-from sasgeo_bench.leaderboard.board_schema import check_shape
+from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOARD, check_shape, read_board
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Progress, Tell

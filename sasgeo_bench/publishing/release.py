@@ -15,8 +15,7 @@ from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.croissant import write_croissant
-from sasgeo_bench.publishing.dataset_card import CARD, card_text
-from sasgeo_bench.publishing.datasheet import DATASHEET, datasheet_text
+from sasgeo_bench.publishing.dataset_card import CARD, DATASHEET, card_text, datasheet_text
 from sasgeo_bench.publishing.release_files import (
     Release,
     ReleaseMap,

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
-from sasgeo_bench.leaderboard.reproduction import seed_lines
+from sasgeo_bench.leaderboard.private_board import seed_lines
 from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text
 from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures that a site has besides those of its board: where its places lie, and how fast maps grow old."""
+"""Figures that a site has besides those of its board: maps of its places, and rates of ageing.
 
+Coastlines: Natural Earth, 1:110m physical vectors (land), public domain.
+"""
+
+import json
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Final
 
@@ -11,8 +16,12 @@ from matplotlib.axes import Axes
 from sasgeo_bench.ageing.ratebook import Estimate, RateBook
 from sasgeo_bench.leaderboard.board_plots import FAINT, GREY, Page, look_of, page
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.publishing.coast import COASTS
 from sasgeo_bench.publishing.site_pages import PlaceOnMap
+
+_FEATURE: Final = json.loads(resources.files("sasgeo_bench.publishing").joinpath("coast.geojson").read_text("utf-8"))
+# Longitude and latitude of each line, shape (N, 2), degrees.
+COASTS: Final = tuple(np.array(line, dtype=float) for line in _FEATURE["geometry"]["coordinates"])
+
 
 _EUROPE: Final = (-25.0, 45.0, 34.0, 72.0)  # west, east, south, north; degrees
 _MARGIN_DEG: Final = 3.0

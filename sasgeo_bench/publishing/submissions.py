@@ -19,9 +19,9 @@ from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, sc
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.rows import is_unranked, name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.scored_tasks import AskedTask
 from sasgeo_bench.scoring.submission_files import list_submissions, read_card, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
 from sasgeo_bench.tasks import task_files

@@ -18,8 +18,8 @@ import geopandas as gpd
 import shapely
 
 from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.files.file_manifest import file_record, sha256_of
 from sasgeo_bench.files.folders import fresh_folder, locked
-from sasgeo_bench.files.hashes import file_record, sha256_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.locate import Extract, find_extract

@@ -11,7 +11,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.angles import bearing_deg
+from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.osm.features import SEA, check_features
 from sasgeo_bench.regions.network import (
     LAYERS,

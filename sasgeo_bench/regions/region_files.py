@@ -11,7 +11,7 @@ import shapely
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, GridError, StoreError
-from sasgeo_bench.files.hashes import FileRecord, file_record, sha256_of
+from sasgeo_bench.files.file_manifest import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
 from sasgeo_bench.osm.features import check_features

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of the Linux kernel that Python has no name for."""
+"""Calls of the Linux kernel that Python has no name for; Landlock, and a seccomp filter in classic BPF."""
 
 import ctypes
+import errno
 import os
+import struct
 import sys
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 PR_SET_PDEATHSIG: Final = 1
@@ -47,3 +50,248 @@ def mount(source: str, target: str, kind: str | None, flags: int, data: str = ""
     given = (os.fsencode(source), os.fsencode(target), kind.encode() if kind else None)
     if libc().mount(*given, ctypes.c_ulong(flags), data.encode() or None) != 0:
         raise last_error()
+
+
+LANDLOCK_CREATE: Final = 444
+LANDLOCK_ADD: Final = 445
+LANDLOCK_RESTRICT: Final = 446
+LANDLOCK_VERSION: Final = 1
+RULE_PATH: Final = 1
+
+# Rights of Landlock by the version that brought them; https://docs.kernel.org/userspace-api/landlock.html
+READ_RIGHTS: Final = 0b1101  # execute, read file, read directory
+WRITE_RIGHT: Final = 0b10  # write file
+LIST_RIGHT: Final = 0b1000  # read directory
+_FIRST_RIGHTS: Final = (1 << 13) - 1
+TRUNCATE_SINCE: Final = 3
+_LATER_RIGHTS: Final = {2: 1 << 13, TRUNCATE_SINCE: 1 << 14, 5: 1 << 15}  # refer, truncate, ioctl on devices
+_FILE_RIGHTS: Final = 0b111 | 1 << 14 | 1 << 15  # those that a rule on a single file may hold
+NET_SINCE: Final = 4
+_NET_RIGHTS: Final = 0b11  # bind and connect of TCP
+SCOPE_SINCE: Final = 6
+_SCOPES: Final = 0b11  # abstract sockets and signals leave the domain
+
+
+def landlock_version() -> int:
+    """Version of Landlock that the kernel offers; 0 where it has none.
+
+    Examples
+    --------
+    >>> landlock_version() >= 0
+    True
+    """
+    if sys.platform != "linux":
+        return 0
+    found = syscall(LANDLOCK_CREATE, None, 0, LANDLOCK_VERSION)
+    return max(0, found)
+
+
+def restrict(allowed: Sequence[tuple[str, int]], writable: Sequence[str], version: int) -> None:
+    """Refuse every file that is not allowed; there is no way back for this process and its children.
+
+    Parameters
+    ----------
+    allowed : sequence of (str, int)
+        Files and folders, and the rights to them and all within.
+    writable : sequence of str
+        Folders with all rights.
+    version : int
+        Of Landlock, at least 1.
+    """
+    rights = _FIRST_RIGHTS
+    for since, later in _LATER_RIGHTS.items():
+        rights |= later if version >= since else 0
+    attributes = struct.pack(
+        "QQQ", rights, _NET_RIGHTS if version >= NET_SINCE else 0, _SCOPES if version >= SCOPE_SINCE else 0
+    )
+    size = 24 if version >= SCOPE_SINCE else 16 if version >= NET_SINCE else 8
+    ruleset = syscall(LANDLOCK_CREATE, ctypes.c_char_p(attributes), ctypes.c_size_t(size), 0)
+    if ruleset < 0:
+        raise OSError(-ruleset, os.strerror(-ruleset))
+    for path, granted in (*allowed, *((path, rights) for path in writable)):
+        _allow(ruleset, path, granted & rights)
+    prctl(PR_SET_NO_NEW_PRIVS, 1)
+    refused = syscall(LANDLOCK_RESTRICT, ruleset, 0)
+    os.close(ruleset)
+    if refused < 0:
+        raise OSError(-refused, os.strerror(-refused))
+
+
+def _allow(ruleset: int, path: str, rights: int) -> None:
+    """Add a rule for a folder or a file; one that is not there is passed over."""
+    try:
+        descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    except OSError:
+        return
+    try:
+        if not os.path.isdir(path):  # noqa: PTH112 - no pathlib before the door is shut
+            rights &= _FILE_RIGHTS
+        rule = struct.pack("=Qi", rights, descriptor)
+        added = syscall(LANDLOCK_ADD, ruleset, RULE_PATH, ctypes.c_char_p(rule), 0)
+        if added < 0 and added != -errno.EINVAL:
+            raise OSError(-added, os.strerror(-added), path)
+    finally:
+        os.close(descriptor)
+
+
+def outermost(paths: Sequence[str]) -> list[str]:
+    """Resolve paths that exist, and drop those inside another one: a covered folder needs no second cover.
+
+    Examples
+    --------
+    >>> outermost(["/usr/lib", "/usr", "/usr/../usr", "/nowhere"])
+    ['/usr']
+    """
+    found: list[str] = []
+    for path in sorted({os.path.realpath(path) for path in paths}, key=lambda path: path.split("/")):
+        if os.path.exists(path) and not (found and path.startswith(f"{found[-1]}/")):  # noqa: PTH110 - no pathlib yet
+            found.append(path)
+    return found
+
+
+def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
+    """A path with the right to read it; where something hidden lies within, all else that lies there now.
+
+    Of a folder that holds something hidden the names can be listed, or nothing in it could be imported. Links in it
+    are passed over: what they lead to is read where it lies, if that is in reach, and nobody looked through it else.
+
+    Examples
+    --------
+    >>> [name for name, _ in around("/usr", ["/home/me/truth"])]
+    ['/usr']
+    >>> list(around("/home/me/truth/vaduz", ["/home/me/truth"]))
+    []
+    """
+    real = os.path.realpath(path)
+    if any(real == folder or real.startswith(f"{folder}/") for folder in hidden):
+        return
+    inside = [folder for folder in hidden if folder.startswith(f"{real.rstrip('/')}/")]
+    if not inside:
+        yield path, READ_RIGHTS
+        return
+    try:
+        names = sorted(os.listdir(real))  # noqa: PTH208 - no pathlib before the door is shut
+    except OSError:
+        return
+    yield real, LIST_RIGHT
+    for name in names:
+        inner = f"{real.rstrip('/')}/{name}"
+        if not os.path.islink(inner):  # noqa: PTH114 - no pathlib before the door is shut
+            yield from around(inner, hidden)
+
+
+_SECCOMP: Final = {"x86_64": 317, "aarch64": 277}
+_ARCHITECTURE: Final = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}  # AUDIT_ARCH_..., of linux/audit.h
+_SET_FILTER, _SPEC_ALLOW = 1, 1 << 2  # the second one: no slower memory for the sake of a filter
+_X32: Final = 0x40000000  # calls of x86_64 with short pointers have numbers of their own
+_ALLOW, _REFUSE = 0x7FFF0000, 0x00050000
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _AND, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x54, 0x06
+_NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
+
+# Names, and numbers on x86_64 and aarch64 as in asm/unistd_64.h and asm-generic/unistd.h; 0 where there is no call.
+DANGEROUS: Final = (
+    # Mounts, namespaces and roots: whoever changes them looks behind what is hidden.
+    "mount 165 40, umount2 166 39, pivot_root 155 41, chroot 161 51, unshare 272 97, setns 308 268",
+    "open_tree 428 428, move_mount 429 429, fsopen 430 430, fsconfig 431 431, fsmount 432 432, fspick 433 433",
+    "mount_setattr 442 442, open_tree_attr 467 467, open_by_handle_at 304 265",
+    # Memory and files of other processes.
+    "ptrace 101 117, process_vm_readv 310 270, process_vm_writev 311 271, process_madvise 440 440",
+    "pidfd_getfd 438 438, kcmp 312 272",
+    # Keys, programs in the kernel, rings of calls that no filter sees, what faults and counters tell.
+    "add_key 248 217, request_key 249 218, keyctl 250 219, bpf 321 280",
+    "io_uring_setup 425 425, userfaultfd 323 282, perf_event_open 298 241",
+    # Sockets: no namespace parts those that have a path. Connected pairs remain.
+    "socket 41 198, connect 42 203",
+    # Memory and queues that outlive their process, or that nobody can count from outside.
+    "memfd_secret 447 447, shmget 29 194, semget 64 190, msgget 68 186, mq_open 240 180",
+)
+# What Landlock does not refuse: modes, owners, times and attributes, and before version 3 the length of a file by path.
+METADATA: Final = (
+    "chmod 90 0, fchmod 91 52, fchmodat 268 53, fchmodat2 452 452",
+    "chown 92 0, fchown 93 55, lchown 94 0, fchownat 260 54",
+    "utime 132 0, utimes 235 0, futimesat 261 0, utimensat 280 88",
+    "setxattr 188 5, lsetxattr 189 6, fsetxattr 190 7, setxattrat 463 463",
+    "removexattr 197 14, lremovexattr 198 15, fremovexattr 199 16, removexattrat 466 466",
+    "file_setattr 469 469, truncate 76 45",
+)
+_IOCTL: Final = {"x86_64": 16, "aarch64": 29}
+_FILE_GROUPS: Final = (0x6600, 0x5800)  # groups "f" and "X" of ioctl: flags of files, sealing them
+_GROUP: Final = 0xFF00
+_SOCKETPAIR: Final = {"x86_64": 53, "aarch64": 199}
+_KIND, _DATAGRAM = 0xF, 2
+_PRCTL: Final = {"x86_64": 157, "aarch64": 167}
+_FCNTL: Final = {"x86_64": 72, "aarch64": 25}
+_LEASES: Final = (1024, 1026)  # F_SETLEASE and F_NOTIFY: the first has all others wait who open a file
+_CLONE: Final = {"x86_64": 56, "aarch64": 220}
+_NEW_SPACES: Final = 0x7E020000  # all CLONE_NEW... that clone takes
+_CLONE3: Final = 435
+
+
+def is_offered() -> bool:
+    """True if the system call numbers of this processor are known here."""
+    return os.uname().sysname == "Linux" and os.uname().machine in _ARCHITECTURE and struct.calcsize("P") == 8  # noqa: PLR2004 - bytes of a pointer
+
+
+def refuse(*, metadata: bool) -> bool:
+    """Refuse dangerous calls to this process and all its children, for good; False where the kernel cannot.
+
+    Parameters
+    ----------
+    metadata : bool
+        Refuse changes of modes, owners, times and attributes, too, of whatever file.
+    """
+    if not is_offered():
+        return False
+    prctl(PR_SET_NO_NEW_PRIVS, 1)
+    code = program(os.uname().machine, metadata=metadata)
+    buffer = ctypes.create_string_buffer(code, len(code))
+    given = struct.pack("HxxxxxxQ", len(code) // 8, ctypes.addressof(buffer))
+    number = _SECCOMP[os.uname().machine]
+    return any(syscall(number, _SET_FILTER, flags, ctypes.c_char_p(given)) == 0 for flags in (_SPEC_ALLOW, 0))
+
+
+def program(machine: str, *, metadata: bool) -> bytes:
+    """Filter for a kind of processor: eight bytes for each step.
+
+    Examples
+    --------
+    >>> len(program("aarch64", metadata=True)) > len(program("aarch64", metadata=False))
+    True
+    """
+    refused = ", ".join((*DANGEROUS, *(METADATA if metadata else ()))).split(", ")
+    numbers = [int(call.split()[1 + list(_ARCHITECTURE).index(machine)]) for call in refused]
+    steps = [_step(_LOAD, _ARCHITECTURE_AT), _step(_EQUAL, _ARCHITECTURE[machine], yes=1), _answer(errno.EPERM)]
+    steps += [_step(_LOAD, _NUMBER_AT), _step(_AT_LEAST, _X32, no=1), _answer(errno.ENOSYS)]
+    # What clone3 wants stands in memory, where no filter sees it: libraries then use clone.
+    steps += [_step(_EQUAL, _CLONE3, no=1), _answer(errno.ENOSYS)]
+    for number in filter(None, numbers):
+        steps += [_step(_EQUAL, number, no=1), _answer(errno.EPERM)]
+    steps += _by_argument(_CLONE[machine], 0, [_step(_ANY_BIT, _NEW_SPACES, no=1), _answer(errno.EPERM)])
+    # A pair of datagram sockets can be connected anew, to a path; one of streams cannot.
+    kinds = [_step(_AND, _KIND), _step(_EQUAL, _DATAGRAM, no=1), _answer(errno.EPERM)]
+    steps += _by_argument(_SOCKETPAIR[machine], 1, kinds)
+    # A process that cannot be looked into hides its memory from whoever watches it.
+    dumpable = [_step(_EQUAL, PR_SET_DUMPABLE, no=1), _answer(errno.EPERM)]
+    steps += _by_argument(_PRCTL[machine], 0, dumpable)
+    leases = [step for command in _LEASES for step in (_step(_EQUAL, command, no=1), _answer(errno.EPERM))]
+    steps += _by_argument(_FCNTL[machine], 1, leases)
+    if metadata:
+        groups = [step for group in _FILE_GROUPS for step in (_step(_EQUAL, group, no=1), _answer(errno.EPERM))]
+        steps += _by_argument(_IOCTL[machine], 1, [_step(_AND, _GROUP), *groups])
+    return b"".join([*steps, _step(_RETURN, _ALLOW)])
+
+
+def _by_argument(number: int, argument: int, steps: list[bytes]) -> Iterator[bytes]:
+    """Steps on the low half of an argument of one call, which is let through if none of them refuses it."""
+    yield _step(_EQUAL, number, no=len(steps) + 2)
+    yield _step(_LOAD, _ARGUMENTS_AT + 8 * argument)
+    yield from steps
+    yield _step(_RETURN, _ALLOW)
+
+
+def _step(code: int, value: int, *, yes: int = 0, no: int = 0) -> bytes:
+    return struct.pack("HBBI", code, yes, no, value)
+
+
+def _answer(number: int) -> bytes:
+    return _step(_RETURN, _REFUSE | number)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.running.root import SYSTEM
-from sasgeo_bench.tasks.seed_file import SUFFIX as SEED
+from sasgeo_bench.tasks.private_seed import SUFFIX as SEED
 
 MOST_ENTRIES: Final = 200_000  # names that are looked at: about a second of a disk that is awake
 MOST_DEPTH: Final = 12

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from sasgeo_bench.running import kernel
-from sasgeo_bench.running.landlock import outermost
+from sasgeo_bench.running.kernel import outermost
 
 MS_RDONLY: Final = 0x1
 MS_NOSUID: Final = 0x2

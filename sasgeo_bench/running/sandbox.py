@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass
 from types import FrameType
 from typing import Final, NoReturn
 
-from sasgeo_bench.running import kernel, landlock, seccomp
-from sasgeo_bench.running.landlock import READ_RIGHTS, WRITE_RIGHT, around, landlock_version, outermost, restrict
+from sasgeo_bench.running import kernel
+from sasgeo_bench.running.kernel import READ_RIGHTS, WRITE_RIGHT, around, landlock_version, outermost, restrict
 from sasgeo_bench.running.root import DEVICES, SHARED_MEMORY, SYSTEM, enter_root, has_own_proc
 
 CLONE_NEWNS: Final = 0x00020000
@@ -139,7 +139,7 @@ def enter(policy: Policy) -> Isolation:
         has_root=has_root,
         has_proc=has_proc,
         landlock=version,
-        has_filter=seccomp.refuse(metadata=not has_root),
+        has_filter=kernel.refuse(metadata=not has_root),
     )
     return _said(walls, policy)
 
@@ -172,7 +172,7 @@ def _changed_words(walls: _Walls) -> str:
         no_metadata = "not limited, but no modes, owners, times and attributes (seccomp)"
         return no_metadata if walls.has_filter else "not limited"
     kept = f"only its scratch folder (Landlock {walls.landlock})"
-    emptied = "" if walls.landlock >= landlock.TRUNCATE_SINCE else "; others can be emptied"
+    emptied = "" if walls.landlock >= kernel.TRUNCATE_SINCE else "; others can be emptied"
     metadata = "can be changed everywhere" if not walls.has_filter else "cannot be changed anywhere (seccomp)"
     return f"{kept}{emptied}; modes, owners, times and attributes {metadata}"
 
@@ -221,7 +221,7 @@ def _network_words(walls: _Walls) -> str:
     if walls.spaces & CLONE_NEWNET:
         where = "in folders that it may read" if walls.has_root else "anywhere"
         return f"no way out (a namespace of its own); local sockets with a path {where} can be reached"
-    if walls.landlock >= landlock.NET_SINCE:
+    if walls.landlock >= kernel.NET_SINCE:
         return "no TCP (Landlock); all else can be reached, local sockets too"
     return "not cut"
 
@@ -230,7 +230,7 @@ def _process_words(walls: _Walls) -> str:
     apart = "not apart, all end together while the one that keeps them lives"
     if walls.spaces & CLONE_NEWPID:
         apart = "a namespace of their own, all end together"
-    elif walls.landlock >= landlock.SCOPE_SINCE:
+    elif walls.landlock >= kernel.SCOPE_SINCE:
         apart = "not apart, others cannot be signalled (Landlock), all end together"
     if walls.has_proc:
         return f"{apart}; /proc shows no others"

@@ -24,12 +24,11 @@ import psutil
 import sasgeo_bench.running.child
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files.removal import remove_tree
+from sasgeo_bench.files.folders import remove_tree
 from sasgeo_bench.running import wire
-from sasgeo_bench.running.cgroup import Group
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import walk_code
-from sasgeo_bench.running.memory import WATCH_S, MemoryWatch
+from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.replies import Reply, read_reply
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_rows import pairs_bytes

@@ -13,11 +13,9 @@ from typing import Final, Self
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose, inverse
-from sasgeo_bench.sasgeo.kinds import KINDS
+from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
 from sasgeo_bench.sasgeo.mapped import MappedGraph
-from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints
+from sasgeo_bench.sasgeo.nodes import KINDS, Bools, Floats, Ints
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 
 

@@ -12,19 +12,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.distinct import Rarity
+from sasgeo_bench.sasgeo.class_weights import Rarity
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.learnt import ScorerModel
-from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.pairs import JUNCTIONS, JunctionPairs
 from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template

@@ -1,11 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ablations of the scorer as plugins: a card for each setting of the switches."""
+"""The SASGeo scorer as a matcher, and its ablations as plugins: a card for each setting of the switches."""
 
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
 
-from sasgeo_bench.matching.matcher import MatcherCard
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard, Training
+from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.matchers import LearningMatcher, SasgeoMatcher
+from sasgeo_bench.sasgeo.graph import GraphScore
+from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
+from sasgeo_bench.sasgeo.learning import learn
+from sasgeo_bench.sasgeo.learnt import ScorerModel
+from sasgeo_bench.sasgeo.protection import levels_of
+from sasgeo_bench.sasgeo.reading import Reader, Reading
+from sasgeo_bench.search.find import rank, search
+from sasgeo_bench.search.plan import Mode, Null, Plan
+from sasgeo_bench.tasks.query import Query
+
+LISTED: Final = 20  # modes of one search, or candidates, that are ranked by the joint score
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ranked:
+    """Modes by the joint score: `order`, best first, terms of Eq. 11, and graph scores of each mode."""
+
+    order: NDArray[np.int64]
+    terms: NDArray[np.float64]
+    verified: Sequence[GraphScore] | None
+
+
+class SasgeoMatcher:
+    """The scorer with the parts that `switches` select; `plan` sets the search."""
+
+    card: MatcherCard
+    switches: ClassVar[Switches] = Switches()
+
+    def __init__(self, plan: Plan | None = None) -> None:
+        self.plan = plan or Plan()
+        self._reader: Reader | None = None
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Read a map with a trained model, or the one set by hand."""
+        model = ScorerModel.from_text(learned) if learned else ScorerModel.by_hand(region.classes)
+        self._reader = Reader.of(region, model, self.switches)
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Return the best modes, or rank the candidates by the best pose near each."""
+        if self._reader is None:
+            message = f"{self.card.name}: call prepare() with a region before match()"
+            raise RuntimeError(message)
+        if bool((query.evidence.cells == UNKNOWN).all()):
+            return WITHHELD
+        reading = self._reader.read(query)
+        if query.track == "retrieval":
+            return _of_candidates(reading, self.plan, top_k=top_k)
+        starts = reading.proposed()
+        found = search(self._reader.field, reading.template, query.prior, self.plan, count=LISTED, starts=starts)
+        if not found.modes:
+            return WITHHELD
+        ranked = _ranked(reading, found.modes)
+        poses = [found.modes[at].pose for at in ranked.order]
+        return _answer(reading, poses, ranked, null=found.null, top_k=top_k)
+
+
+class LearningMatcher(SasgeoMatcher):
+    """The scorer with fitted weights."""
+
+    def learn(self, training: Training) -> str:
+        """Fit the model to views of known place."""
+        return learn(training, self.switches, plan=self.plan).to_text()
+
+
+def _ranked(reading: Reading, modes: Sequence[Mode]) -> _Ranked:
+    """Rank modes by Eq. 11; ties keep their order."""
+    poses = [mode.pose for mode in modes]
+    verified = reading.verified(poses)
+    terms = reading.terms(poses, verified)
+    order = np.argsort(-terms.sum(axis=1), kind="stable")
+    return _Ranked(order=order, terms=terms, verified=verified)
+
+
+def _answer(
+    reading: Reading, poses: Sequence[Pose], ranked: _Ranked, *, null: Null, top_k: int, rest: Sequence[Pose] = ()
+) -> Match:
+    """Return an answer with poses in the order of `ranked` and, below them, the rest."""
+    terms = ranked.terms[ranked.order]
+    scores = terms.sum(axis=1)
+    places_m = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
+    modes = Modes(
+        positions_m=places_m,
+        by_class=terms,
+        sigma_m=reading.sigma_m(poses[0]),
+        none_nats=float(np.log(max(null.places, 1))),
+    )
+    best = None if ranked.verified is None else ranked.verified[int(ranked.order[0])]
+    diagnostics = evidence_of(
+        modes,
+        null=null,
+        unknown_share=reading.query.evidence.unknown_share,
+        information_nats=reading.information_nats,
+        map_age_years=reading.age_years,
+        graph_consistency=None if best is None else best.consistency,
+    )
+    diagnostics |= levels_of(modes)
+    given = [*poses, *rest][:top_k]
+    low = float(scores[-1]) - 1.0
+    values = [*scores.tolist(), *(low - at for at in range(len(rest)))][:top_k]
+    return Match(poses=given, scores=values, confidence=float(modes.masses[0]), diagnostics=diagnostics)
+
+
+def _of_candidates(reading: Reading, plan: Plan, *, top_k: int) -> Match:
+    """Rank the candidates of a query; drop those off the map."""
+    query = reading.query
+    found, null = rank(reading.reader.field, reading.template, query.prior, query.candidates, plan)
+    scored = sorted(((at, mode) for at, mode in enumerate(found) if mode is not None), key=lambda item: -item[1].score)
+    if not scored:
+        return WITHHELD
+    looked, rest = scored[:LISTED], scored[LISTED:]
+    ranked = _ranked(reading, [mode for _, mode in looked])
+    poses = [_at_candidate(query, *looked[at]) for at in ranked.order]
+    return _answer(reading, poses, ranked, null=null, top_k=top_k, rest=[_at_candidate(query, *item) for item in rest])
+
+
+def _at_candidate(query: Query, at: int, mode: Mode) -> Pose:
+    """Return the place of a candidate with heading and scale of the best pose near it."""
+    return replace(query.candidates[at], yaw_deg=mode.pose.yaw_deg, scale=mode.pose.scale)
+
 
 _SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), {what}"
 _OURS: Final = (

@@ -11,22 +11,22 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact
-from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.integrity import SLOW_DRAWS
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact, sensitivity
 from sasgeo_bench.scoring.integrity_metric import aurc, drawn_areas
 from sasgeo_bench.scoring.intervals import (
+    DRAWS,
+    ClusterDraws,
     Interval,
     bootstrap_statistic,
     difference_interval,
     effective_count,
     mean_interval,
     percentile_interval,
+    seed_of_text,
     wilson,
 )
 from sasgeo_bench.scoring.metrics import primary_of
-from sasgeo_bench.scoring.power import sensitivity
-from sasgeo_bench.scoring.rejection import answers_of
+from sasgeo_bench.scoring.rejection import SLOW_DRAWS, answers_of
 
 ALPHA: Final = 0.05
 LESS_THAN_MATTERS: Final = ", by less than would matter"  # suffix of a verdict

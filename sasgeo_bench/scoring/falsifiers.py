@@ -10,7 +10,7 @@ import pandas as pd
 from sasgeo_bench.errors import counted
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, both_on, mean_finding
-from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.intervals import DRAWS
 
 EVERY: Final = "all"  # suites, or kinds
 

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.base import Bools, Floats, check_column
 from sasgeo_bench.scoring.ranking import MISS, Rank, rank_of

@@ -5,7 +5,7 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -16,14 +16,141 @@ from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.rejector import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.base import Bools, Floats
-from sasgeo_bench.scoring.decisions import Answers, accept
-from sasgeo_bench.scoring.integrity_metric import choose_threshold
+from sasgeo_bench.parallel import spread
+from sasgeo_bench.scoring.base import Bools, Floats, weighted_mean
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept, presence_weights
+from sasgeo_bench.scoring.integrity_metric import choose_threshold, drawn_areas
+from sasgeo_bench.scoring.intervals import ClusterDraws, Interval, effective_count, seed_of_text, share_interval
+from sasgeo_bench.scoring.metrics import REJECTION, RISKS, THRESHOLDS, RejectionMetric, ThresholdMetric
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, to_frame
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
 
+AS_DRAWN: Final = "as drawn"
+_CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
+SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
+_NO_DRAWS: Final = np.empty(0)
+
+
+def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
+    """Yield every integrity metric of a matcher with a rejector, from rows of `rejection.judge` or `own_confidence`.
+
+    They cover each suite, track and prior group, and all suites of a track and prior group together. The latter also
+    come with present places reweighted to a share of 0.9, 0.7 and 0.5. Without `is_calibrated`, skip metrics that need
+    probabilities.
+    """
+    parts = [
+        (
+            RowKey.of(
+                part,
+                matcher=matcher,
+                rejector=rejector,
+                suite=str(suite),
+                track=str(track),
+                prior_group=str(prior_group),
+                stratum=AS_DRAWN,
+            ),
+            part,
+        )
+        for (track, prior_group), whole in rows.groupby(["track", "prior_group"], sort=True)
+        for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
+    ]
+    metrics = [metric for metric in REJECTION if is_calibrated or not metric.needs_chances]
+    yield from in_threads(lambda item: _rows(*item, metrics), parts)
+
+
+def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -> Iterator[Row]:
+    some = answers_of(part)
+    # The seed depends on the queries alone, so that all rejectors share draws.
+    seed = seed_of_text(f"{key.suite}/{key.track}/{key.prior_group}")
+    sites = np.unique(part["pair_id"], return_inverse=True)[1]
+    drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)
+    is_pooled = key.suite == ALL_SUITES
+    mixtures = dict(_mixtures(some, is_pooled=is_pooled))
+    areas = _drawn_areas(some, mixtures, drawn) if is_pooled and drawn.blocks_count > 1 else {}
+    shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
+    drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
+    for stratum, mass in mixtures.items():
+        mine, trials = replace(key, stratum=stratum), effective_count(sites, mass)
+        for metric in metrics:
+            value = metric.compute(some, weights=mass)
+            if is_pooled and metric.has_interval:
+                drawn_values = areas.get((stratum, metric.name), _NO_DRAWS)
+                found, how = _area_interval(value, drawn_values, trials, metric.bounds[1])
+                yield mine.row(metric, found, how)
+            else:
+                yield mine.row(metric, bare(value))
+        for share in shares[stratum]:
+            value = weighted_mean(share.counted, share.mass)
+            found, how = share_interval(value, next(drawn_shares), effective_count(sites, share.mass))
+            yield mine.row(share.metric, found, how)
+
+
+def _area_interval(value: float, draws: Floats, trials: float, most: float) -> tuple[Interval, str]:
+    """Return the interval of an area in [0, `most`]: it is a mean risk, so scale it to [0, 1] and back."""
+    found, how = share_interval(value / most, draws / most, trials)
+    return Interval(value=value, lo=found.lo * most, hi=found.hi * most), how
+
+
+def _drawn_areas(
+    answers: Answers, mixtures: Mapping[str, Floats], drawn: ClusterDraws
+) -> Mapping[tuple[str, str], Floats]:
+    """Return every draw of the areas that have intervals, by mixture and name."""
+    found: dict[tuple[str, str], list[Floats]] = {}
+    parts = (part for some in drawn.weights() for part in np.array_split(some, 1 + some.size // _CACHED))
+    for weights in parts:
+        for stratum, mass in mixtures.items():
+            areas = drawn_areas(answers, weights * mass)
+            found.setdefault((stratum, "aurc"), []).append(areas.aurc)
+            found.setdefault((stratum, "augrc"), []).append(areas.augrc)
+    return {key: np.concatenate(listed) for key, listed in found.items()}
+
+
+def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
+    """Yield names and weights: as drawn, and for pooled suites the declared mixtures of present and absent places."""
+    yield AS_DRAWN, np.ones(len(some))
+    if is_pooled and some.is_present.any() and not some.is_present.all():
+        for share in PRESENT_SHARES:
+            yield f"present {share:g}", presence_weights(some.is_present, share)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Share:
+    """A weighted share of the queries, as the coverage of a threshold; each column has shape (N,)."""
+
+    metric: ThresholdMetric
+    counted: Floats
+    mass: Floats
+
+
+def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
+    """Yield the coverage at thresholds chosen on calibration places, and the risk reached here.
+
+    Skip thresholds that some rows lack: the coverage of the others would not be that of these queries.
+    """
+    is_false = (~part["is_right"].to_numpy(bool)).astype(float)
+    for metric in THRESHOLDS:
+        column = part[f"accepted_{metric.risk:g}"]
+        if not column.isna().any():
+            accepted = column.to_numpy(float)
+            counted, counts = (is_false, mass * accepted) if metric.is_of_accepted else (accepted, mass)
+            yield _Share(metric=metric, counted=counted, mass=counts)
+
+
+def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Floats]:
+    """Yield each share in every draw, with one pass over the draws; NaN where a draw has no weight.
+
+    For fewer than two blocks the draws are empty.
+    """
+    if not shares or drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
+        yield from (np.empty(0) for _ in shares)
+        return
+    columns = [share.counted * share.mass for share in shares] + [share.mass for share in shares]
+    top, bottom = np.hsplit(np.vstack(list(drawn.sums(np.column_stack(columns)))), 2)
+    yield from np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0).T
+
+
 OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
-RISKS: Final = (0.01, 0.05)
 _NUMBER: Final = r"\d+(?:\.\d+)?"
 _SAID: Final = ("p_right", "remark", "is_calibrated")
 _PARTS: Final = 5  # folds of the calibration blocks: thresholds need answers that the rejector was not fitted on
@@ -258,3 +385,72 @@ def answers_of(judged: pd.DataFrame) -> Answers:
         is_right=judged["is_right"].to_numpy(bool),
         is_present=judged["is_present"].to_numpy(bool),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RejectionTask:
+    """Answers of one entry to evaluate with rejectors, by name; its own confidence is always added.
+
+    `split` assigns calibration places. `is_taught` is True if the entry was trained on other places of the split.
+    """
+
+    matcher: str
+    scores: pd.DataFrame
+    predictions: Mapping[str, Prediction]
+    rules: Mapping[str, Rule]
+    split: Split | None
+    is_taught: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class RejectionResult:
+    """Result for one entry.
+
+    By rejector: the rows of `judge`, and the errors of those that failed. Then rows of the board, and lines that say
+    why rejectors were not applied.
+    """
+
+    matcher: str
+    by_rejector: Mapping[str, pd.DataFrame]
+    rows: tuple[pd.DataFrame, ...] = ()
+    skipped: tuple[str, ...] = field(default=())
+    failed: Mapping[str, Exception] = field(default_factory=dict)
+
+
+def apply_rejectors(tasks: Sequence[RejectionTask], *, jobs: int = 1) -> Iterator[RejectionResult]:
+    """Yield the result of each task in order; the number of processes does not affect it."""
+    yield from spread(_evaluated, tasks, jobs=jobs)
+
+
+def _evaluated(task: RejectionTask) -> RejectionResult:
+    """Apply all rejectors to one entry, and its own confidence; a rejector that is not applied has no rows."""
+    by_rejector, rows, skipped, failed = {}, [], [], {}
+    for name in (OWN, *task.rules):
+        try:
+            frame = _rows_of(task, name)
+            rows += [_metrics(task, name, frame)] if len(frame) else []
+        except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
+            failed[name] = error
+            continue
+        if len(frame) or name != OWN:
+            by_rejector[name] = frame
+        if not len(frame) and name != OWN:
+            why = why_not(task.scores, is_taught=task.is_taught)
+            skipped.append(f"{name} on {task.matcher}: not applied, {why}")
+    return RejectionResult(
+        matcher=task.matcher, by_rejector=by_rejector, rows=tuple(rows), skipped=tuple(skipped), failed=failed
+    )
+
+
+def _rows_of(task: RejectionTask, name: str) -> pd.DataFrame:
+    """Return the rows of a rejector, or of the matcher's own confidence."""
+    if name == OWN:
+        return own_confidence(task.scores, task.split, is_taught=task.is_taught)
+    rule = task.rules[name]
+    return judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
+
+
+def _metrics(task: RejectionTask, name: str, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of the board; a matcher's own confidence counts as a probability."""
+    is_calibrated = name == OWN or task.rules[name].card.is_calibrated
+    return to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))

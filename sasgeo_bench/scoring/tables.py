@@ -13,16 +13,21 @@ from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
-from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.intervals import Interval, bootstrap_means, effective_count, share_interval
+from sasgeo_bench.scoring.intervals import (
+    DRAWS,
+    ClusterDraws,
+    Interval,
+    bootstrap_means,
+    effective_count,
+    seed_of_text,
+    share_interval,
+)
 from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
-from sasgeo_bench.scoring.power import sensitivity
 from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
-from sasgeo_bench.scoring.steps import GROUP
-from sasgeo_bench.scoring.strata import ALL, CONTROL, STRESS, strata
+from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, strata
 
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 

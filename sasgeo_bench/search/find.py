@@ -10,14 +10,25 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.search.dense import dense
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
+from sasgeo_bench.search.dense import Guess, LevelView, Stride, climbed, dense, polished
 from sasgeo_bench.search.field import Field, Template
-from sasgeo_bench.search.local_refinement import Guess, LevelView, Stride, climbed, polished
-from sasgeo_bench.search.plan import Found, Mode, Null, Plan, place_m, thinned
-from sasgeo_bench.search.space import NO_PLACE, Disc, Tile, Turns, all_around, tiles_of, turns_of
+from sasgeo_bench.search.plan import (
+    NO_PLACE,
+    Disc,
+    Found,
+    Mode,
+    Null,
+    Plan,
+    Tile,
+    Turns,
+    all_around,
+    place_m,
+    thinned,
+    tiles_of,
+    turns_of,
+)
 
 _NOTHING: Final = 1e-9
 _CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner

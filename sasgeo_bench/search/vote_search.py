@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.search.chart import Chart
-from sasgeo_bench.search.plan import Mode, place_m, thinned
-from sasgeo_bench.search.space import Disc
+from sasgeo_bench.search.plan import Disc, Mode, place_m, thinned
 from sasgeo_bench.search.view import NOWHERE, Patch, Samples, View
 from sasgeo_bench.search.votes import ByPlanes, ByRows
 

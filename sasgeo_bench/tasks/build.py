@@ -15,10 +15,10 @@ from typing import Any
 import geopandas as gpd
 import numpy as np
 
-from sasgeo_bench.ageing.ratebook import pool_rates
-from sasgeo_bench.ageing.ratebook_file import load_ratebook
+from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.parallel import spread
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_edited, build_region, plan_build
@@ -408,3 +408,29 @@ def has_truths(task_folder: Path, *, out: Path) -> bool:
 def built_anew(region: str) -> str:
     """Return the message that a map is no longer the one its queries were drawn on."""
     return f"{region} was built anew since: make the queries again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """Result of a request: its folders, or what the region lacks for it, and the lines of progress."""
+
+    lines: tuple[str, ...]
+    folders: tuple[Path, ...] = ()
+    lack: str | None = None
+
+
+def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
+    """Draw the tasks of requests with several processes, whose number changes no query; yield results in order.
+
+    Tasks that are up to date stay. Raise a StoreError if a folder cannot be written or holds foreign files.
+    """
+    yield from spread(_carry_out, requests, jobs=jobs)
+
+
+def _carry_out(request: Request) -> Drawn:
+    lines: list[str] = []
+    try:
+        folders = ensure_tasks(request, tell=lines.append)
+    except ConfigError as error:
+        return Drawn(lines=tuple(lines), lack=str(error).removesuffix(" (--skip passes on to the next suite)"))
+    return Drawn(lines=tuple(lines), folders=folders)

@@ -12,10 +12,10 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.ageing import rates
+from sasgeo_bench.ageing import measure
 from sasgeo_bench.ageing.files import read_ageing, summary_text, write_ageing
 from sasgeo_bench.ageing.measure import DTYPES as COLUMNS
-from sasgeo_bench.ageing.measure import measure_ageing
+from sasgeo_bench.ageing.measure import bootstrap_rate, loss_rate, measure_ageing, seeded_rng
 from sasgeo_bench.ageing.pairing import (
     compare_areas,
     compare_pieces,
@@ -25,11 +25,9 @@ from sasgeo_bench.ageing.pairing import (
     make_pieces,
     polygons_of,
 )
-from sasgeo_bench.ageing.rates import bootstrap_rate, loss_rate, seeded_rng
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.osm.features import DTYPES, make_features
-from sasgeo_bench.osm.history import History, State
-from sasgeo_bench.osm.lifecycle import Lifecycle, ObjectKey, Span
+from sasgeo_bench.osm.history import History, Lifecycle, ObjectKey, Span, State
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 OLD, NEW = dt.date(2015, 1, 1), dt.date(2020, 1, 1)
@@ -299,7 +297,7 @@ def test_one_block_has_no_interval():
 
 
 def test_the_block_interval_covers_a_known_rate_about_as_often_as_it_says(monkeypatch):
-    monkeypatch.setattr(rates, "DRAWS", 400)
+    monkeypatch.setattr(measure, "DRAWS", 400)
     rate, years, rng = 0.03, np.array([1.5, 4.0]), seeded_rng("coverage")
     hits, trials = 0, 200
     for _ in range(trials):

@@ -10,8 +10,15 @@ import pytest
 from pydantic import ValidationError
 
 from sasgeo_bench.ageing.files import read_ageing
-from sasgeo_bench.ageing.ratebook import ClassAgeing, PlaceAgeing, RateBook, pool_rates
-from sasgeo_bench.ageing.ratebook_file import PACKAGED, load_ratebook, ratebook_text
+from sasgeo_bench.ageing.ratebook import (
+    PACKAGED,
+    ClassAgeing,
+    PlaceAgeing,
+    RateBook,
+    load_ratebook,
+    pool_rates,
+    ratebook_text,
+)
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.descriptor import BINS, LEAST_M2, MOST_THINGS, Descriptor, components
+from sasgeo_baselines.global_descriptor import BINS, LEAST_M2, MOST_THINGS, Descriptor, components
 from sasgeo_baselines.raster import REACH_M, THIN
 
 from sasgeo_bench.geometry.pose import Pose

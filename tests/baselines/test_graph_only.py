@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import shapely
 from sasgeo_baselines import graph_only
-from sasgeo_baselines.graph_only import GraphOnly
-from sasgeo_baselines.nodes import KINDS, Nodes
+from sasgeo_baselines.graph_only import KINDS, GraphOnly, Nodes
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import WITHHELD, check_match

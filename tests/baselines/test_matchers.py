@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sasgeo_baselines.global_descriptor import GlobalDescriptor
+from sasgeo_baselines.global_descriptor import GlobalDescriptor, Sums
 from sasgeo_baselines.map_density_prior import MapDensityPrior
-from sasgeo_baselines.places import Sums
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match

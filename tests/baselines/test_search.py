@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sasgeo_baselines.full_unknown import FullUnknown
-from sasgeo_baselines.raster_graph import RasterGraph
-from sasgeo_baselines.raster_uniform import RasterUniform
+from sasgeo_baselines.raster import FullUnknown, RasterGraph, RasterUniform
 
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.matching.controls.fft_vote import FftVote
 from sasgeo_bench.matching.matcher import WITHHELD, check_match
 from sasgeo_bench.regions.evidence import UNKNOWN
-from sasgeo_bench.search.space import Disc
+from sasgeo_bench.search.plan import Disc
 from sasgeo_bench.search.view import Patch, View
 from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, turns
 

@@ -9,16 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.full_unknown import FullUnknown
-from sasgeo_baselines.raster import stability
-from sasgeo_baselines.raster_graph import RasterGraph
-from sasgeo_baselines.raster_graph_stability import RasterGraphStability
-from sasgeo_baselines.raster_uniform import RasterUniform
-from sasgeo_baselines.verification import BETA, GraphCheck, blended
+from sasgeo_baselines.raster import (
+    BETA,
+    FullUnknown,
+    GraphCheck,
+    RasterGraph,
+    RasterGraphStability,
+    RasterUniform,
+    blended,
+    stability,
+)
 
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.controls.dense_matcher import PoseCheck
-from sasgeo_bench.matching.controls.fft_vote import FftVote
+from sasgeo_bench.matching.controls.fft_vote import FftVote, PoseCheck
 from sasgeo_bench.matching.matcher import check_match
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence

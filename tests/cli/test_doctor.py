@@ -3,8 +3,8 @@
 
 import pytest
 
-from sasgeo_bench.cli import environment as doctor
-from sasgeo_bench.cli.environment import examine
+from sasgeo_bench.cli import doctor
+from sasgeo_bench.cli.doctor import examine
 
 
 @pytest.fixture

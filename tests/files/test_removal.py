@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from sasgeo_bench.files.removal import remove_tree
+from sasgeo_bench.files.folders import remove_tree
 
 
 def dig(folder, depth, name="d"):
@@ -45,7 +45,7 @@ def test_what_a_link_leads_to_stays_and_the_link_goes(tmp_path):
 
 TAKES_RIGHTS = """
 import os, pathlib, sys
-from sasgeo_bench.files.removal import remove_tree
+from sasgeo_bench.files.folders import remove_tree
 root = pathlib.Path(sys.argv[1])
 if os.getuid() == 0:
     os.chown(root, 65534, 65534)

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.geometry.angles import bearing_deg, normalize_deg, rotation, wrap_deg
+from sasgeo_bench.geometry.pose import bearing_deg, normalize_deg, rotation, wrap_deg
 
 angles = st.floats(-1e4, 1e4)
 

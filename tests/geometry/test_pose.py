@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import PoseError
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose, Prior, inverse
+from sasgeo_bench.geometry.pose import Pose, Prior, inverse, wrap_deg
 
 poses = st.builds(
     Pose,

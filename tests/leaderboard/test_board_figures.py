@@ -30,7 +30,7 @@ from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import protection_frame, protection_levels
 from sasgeo_bench.scoring.rejection import answers_of
-from sasgeo_bench.scoring.steps import queries_of, steps_frame
+from sasgeo_bench.scoring.strata import queries_of, steps_frame
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.scoring.test_tables import scores
 

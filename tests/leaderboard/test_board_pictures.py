@@ -21,12 +21,11 @@ from sasgeo_bench.leaderboard.board_pictures import (
     REGION_BYTES,
     SUITE_BYTES,
     pictures_extra,
-    words_of,
 )
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.case_panels import Case, read_picture, said_of
-from sasgeo_bench.leaderboard.case_plot import case_pixels
-from sasgeo_bench.leaderboard.picture import fitted
+from sasgeo_bench.leaderboard.case_plot import case_pixels, fitted
+from sasgeo_bench.leaderboard.cases import words_of
+from sasgeo_bench.leaderboard.run_cases import Case, read_picture, said_of
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.tasks import task_files

@@ -18,7 +18,7 @@ from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.leaderboard.reproduction import compare_seeds, seed_lines, verdict_of
+from sasgeo_bench.leaderboard.private_board import compare_seeds, seed_lines, verdict_of
 from sasgeo_bench.leaderboard.validity_tables import seed_table
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
 from sasgeo_bench.publishing.build import publish

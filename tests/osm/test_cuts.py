@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.osm.cuts import LONGEST_M, ground_within_reach
+from sasgeo_bench.osm.coverage import LONGEST_M, ground_within_reach
 from sasgeo_bench.osm.mapped import CUT
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.regions.build import build_region, plan_build

@@ -10,8 +10,7 @@ import shapely
 
 from sasgeo_bench.ageing.measure import measure_ageing
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
-from sasgeo_bench.osm.history import DatedExtract, date_extracts, read_history
-from sasgeo_bench.osm.lifecycle import ObjectKey, parse_start, read_lifecycle
+from sasgeo_bench.osm.history import DatedExtract, ObjectKey, date_extracts, parse_start, read_history, read_lifecycle
 from sasgeo_bench.osm.synthetic.town import BULK_REDRAW, TownPlan, _things, write_town
 
 DAYS = (dt.date(2014, 1, 1), dt.date(2019, 1, 1), dt.date(2025, 1, 1))

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import SEA
 from sasgeo_bench.osm.history import DatedExtract, read_history
-from sasgeo_bench.osm.mapped import project
+from sasgeo_bench.osm.mapped import CONTRARY, OPEN, find_shore, project
 from sasgeo_bench.osm.read import read_extract
-from sasgeo_bench.osm.sea import CONTRARY, OPEN, find_shore
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.graph import build_graph

@@ -16,7 +16,7 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.files import file_manifest
-from sasgeo_bench.files.hashes import sha256_of
+from sasgeo_bench.files.file_manifest import sha256_of
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import build as boards
 from sasgeo_bench.leaderboard.board import ScoreRequest

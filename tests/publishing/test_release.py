@@ -25,7 +25,7 @@ from PIL import Image
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rio_cogeo.cogeo import cog_validate
 
-from sasgeo_bench.files.hashes import file_record
+from sasgeo_bench.files.file_manifest import file_record
 from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.release_files import Release, open_release

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.ageing.ratebook_file import load_ratebook
+from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of

@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.running import cluster, prediction_files
+from sasgeo_bench.running import prediction_files, runner
 from sasgeo_bench.running.answers import pool_costs
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
@@ -60,10 +60,10 @@ def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
     run(alone, tell=lambda _: None)
     plan = plan_run(request_of(task, tmp_path / "two", name="Held", dask="local:2"))
     part = plan.parts[0]
-    (place / "hold").write_text(" ".join(next(iter(cluster._chunks(part.left, 2)))), encoding="utf-8")
+    (place / "hold").write_text(" ".join(next(iter(runner._chunks(part.left, 2)))), encoding="utf-8")
     killed, asked, costs = [], [], []
-    with cluster.connected("local:2") as client:
-        for number, _, cost in cluster.answer_on(client, plan, [part]):
+    with runner.connected("local:2") as client:
+        for number, _, cost in runner.answer_on(client, plan, [part]):
             assert number == 0
             costs.append(cost)
             if not killed:  # the first chunk is answered, and both are held at work on another one
@@ -86,7 +86,7 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
     plan = plan_run(request_of(task, tmp_path))
     asked = task_files.read_asked(task)
     chunk = replace(plan.parts[0], left=tuple(asked)[:5], asked=asked)
-    assert cluster._answer_chunk(plan, chunk).counts == {"ok": 2}
+    assert runner._answer_chunk(plan, chunk).counts == {"ok": 2}
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
     ],
 )
 def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeypatch, address, words):
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(runner, "_CONNECT_S", 0.5)
     plan = plan_run(request_of(task, tmp_path, dask=address))
     with pytest.raises(ConfigError, match=words):
         run(plan, tell=lambda _: None)
@@ -109,7 +109,7 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeyp
 
 def test_without_the_extra_the_way_to_it_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ConfigError, match=r"pip install 'sasgeo-bench\[dask\]'"), cluster.connected("local:2"):
+    with pytest.raises(ConfigError, match=r"pip install 'sasgeo-bench\[dask\]'"), runner.connected("local:2"):
         pass
 
 
@@ -121,7 +121,7 @@ def test_jobs_and_a_cluster_are_not_asked_for_together(task, tmp_path):
 def test_chunks_hold_every_id_once_and_are_neither_tiny_nor_huge():
     for count, threads in ((1, 4), (60, 2), (5000, 2), (100_000, 64)):
         ids = tuple(map(str, range(count)))
-        chunks = list(cluster._chunks(ids, threads))
+        chunks = list(runner._chunks(ids, threads))
         assert tuple(name for chunk in chunks for name in chunk) == ids
         assert all(8 <= len(chunk) <= 256 for chunk in chunks[:-1])
 
@@ -141,7 +141,7 @@ def test_workers_that_die_over_and_over_end_the_run_with_one_line(task, tmp_path
     monkeypatch.setattr("distributed.as_completed", iter)
     plan = plan_run(request_of(task, tmp_path))
     with pytest.raises(StoreError, match="died over and over"):
-        list(cluster.answer_on(Client(), plan, plan.parts))
+        list(runner.answer_on(Client(), plan, plan.parts))
 
 
 @pytest.mark.slow

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.running import cgroup, memory, worker
-from sasgeo_bench.running.cgroup import Group
+from sasgeo_bench.running import memory, worker
+from sasgeo_bench.running.memory import Group
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 
 MOST = 300 * 10**6
@@ -209,9 +209,9 @@ def test_groups_are_made_where_the_system_lets_us(tmp_path, monkeypatch, own, mo
     (tmp_path / "user/cgroup.subtree_control").write_text("cpu memory pids", encoding="utf-8")
     (tmp_path / "own").write_text(own, encoding="utf-8")
     (tmp_path / "mounts").write_text(mounts.format(root=tmp_path), encoding="utf-8")
-    monkeypatch.setattr(cgroup, "_OWN", tmp_path / "own")
-    monkeypatch.setattr(cgroup, "_MOUNTS", tmp_path / "mounts")
-    assert [(version, *map(str, places)) for version, places in cgroup._places()] == [
+    monkeypatch.setattr(memory, "_OWN", tmp_path / "own")
+    monkeypatch.setattr(memory, "_MOUNTS", tmp_path / "mounts")
+    assert [(version, *map(str, places)) for version, places in memory._places()] == [
         (version, str(tmp_path / memory), str(tmp_path / pids)) for version, memory, pids in expected
     ]
 

@@ -23,7 +23,7 @@ import sys
 from pathlib import Path
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.tasks.seed_file import take_seed
+from sasgeo_bench.tasks.private_seed import take_seed
 
 tasks = [Path("out/private/tasks/clean/town-riverside")]
 assert take_seed(Path("my.seed") if sys.argv[1] == "file" else None) is not None

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.running import landlock, root, sandbox, seccomp
+from sasgeo_bench.running import kernel, root, sandbox
 
 HAS_SPACES = subprocess.run(["unshare", "-Urm", "true"], capture_output=True, check=False).returncode == 0  # noqa: S607
-HAS_LANDLOCK = sandbox.landlock_version() >= landlock.SCOPE_SINCE
+HAS_LANDLOCK = sandbox.landlock_version() >= kernel.SCOPE_SINCE
 HERE = Path(__file__).parent
 MOST_BYTES = 4 * 2**20  # of the scratch folder; the attack writes twice as much
 
@@ -34,7 +34,7 @@ really = kernel.mount
 without = {
     "namespaces": lambda: setattr(sandbox, "_enter_namespaces", lambda: 0),
     "Landlock": lambda: setattr(sandbox, "landlock_version", lambda: 0),
-    "seccomp": lambda: setattr(seccomp, "is_offered", lambda: False),
+    "seccomp": lambda: setattr(kernel, "is_offered", lambda: False),
     "mounts": lambda: setattr(kernel, "mount", lambda *given: refused() if "tmpfs" in given else really(*given)),
     "proc": lambda: setattr(kernel, "mount", lambda *given: refused() if "proc" in given else really(*given)),
 }
@@ -355,7 +355,7 @@ def test_what_a_link_leads_to_beside_something_hidden_is_not_read(tmp_path):
     (inside / "truth").mkdir(parents=True)
     elsewhere.mkdir()
     (inside / "link").symlink_to(elsewhere)
-    found = [path for path, _ in landlock.around(str(inside), [str(inside / "truth")])]
+    found = [path for path, _ in kernel.around(str(inside), [str(inside / "truth")])]
     assert found == [str(inside)]
 
 
@@ -364,7 +364,7 @@ def test_numbers_of_refused_calls_are_those_of_this_system():
     if os.uname().machine != "x86_64" or not header.is_file():
         pytest.skip("no list of this system's calls is installed")
     known = dict(re.findall(r"#define __NR_(\w+) (\d+)", header.read_text(encoding="utf-8")))
-    refused = [call.split() for call in ", ".join((*seccomp.DANGEROUS, *seccomp.METADATA)).split(", ")]
+    refused = [call.split() for call in ", ".join((*kernel.DANGEROUS, *kernel.METADATA)).split(", ")]
     assert {name: known[name] for name, _, _ in refused if name in known} == {
         name: number for name, number, _ in refused if name in known
     }

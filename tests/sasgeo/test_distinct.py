@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.sasgeo.distinct import LEAST, MOST, Rarity
+from sasgeo_bench.sasgeo.class_weights import LEAST, MOST, Rarity
 
 CLASSES = ("road_minor", "building")
 

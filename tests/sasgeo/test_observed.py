@@ -6,9 +6,8 @@ import pytest
 import shapely
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.kinds import INDEX, KINDS
-from sasgeo_bench.sasgeo.observed import ObservedGraph, bridged
-from sasgeo_bench.sasgeo.skeleton import lines_of_mask, middle_lines
+from sasgeo_bench.sasgeo.nodes import INDEX, KINDS
+from sasgeo_bench.sasgeo.observed import ObservedGraph, bridged, lines_of_mask, middle_lines
 from sasgeo_bench.tasks.vectors import vector_table
 
 CLASSES = ("road_minor", "railway", "waterway", "building", "water")

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.mapped import JUNCTIONS, SECTORS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import nothing
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.pairs import JUNCTIONS, SECTORS, JunctionPairs
 from sasgeo_bench.sasgeo.reading import proposals
 from sasgeo_bench.tasks.suites.base import State
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors

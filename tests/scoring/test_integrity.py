@@ -8,11 +8,9 @@ import pytest
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.scoring.decisions import COST_RATIOS
-from sasgeo_bench.scoring.draws import ClusterDraws
-from sasgeo_bench.scoring.integrity import integrity_rows
 from sasgeo_bench.scoring.integrity_metric import aurc
-from sasgeo_bench.scoring.intervals import bootstrap_statistic, percentile_interval, wilson
-from sasgeo_bench.scoring.rejection import OWN, answers_of, own_confidence, turns, why_not
+from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_statistic, percentile_interval, wilson
+from sasgeo_bench.scoring.rejection import OWN, answers_of, integrity_rows, own_confidence, turns, why_not
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.tasks.split import SplitFile, make_split
 from tests.scoring.test_tables import scores

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.stats import f_oneway, norm
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.compare import mcnemar_exact
-from sasgeo_bench.scoring.power import (
+from sasgeo_bench.scoring.compare import (
     design_effect,
     detectable_difference,
     intraclass_correlation,
+    mcnemar_exact,
     sensitivity,
 )
 

@@ -16,9 +16,8 @@ from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.cost import Costs
-from sasgeo_bench.scoring.integrity import integrity_rows
 from sasgeo_bench.scoring.intervals import wilson
-from sasgeo_bench.scoring.rejection import own_confidence
+from sasgeo_bench.scoring.rejection import integrity_rows, own_confidence
 from sasgeo_bench.scoring.rows import COLUMNS, EntryLabel, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata

@@ -10,15 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.geometry.angles import wrap_deg
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.search.dense import _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.find import exhaustive, rank, score_at, search
-from sasgeo_bench.search.plan import Plan, posterior
-from sasgeo_bench.search.space import all_around
+from sasgeo_bench.search.plan import Plan, all_around, posterior
 
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
 AGREE, EXTRA, MISSED = 1.0, 0.6, 0.4

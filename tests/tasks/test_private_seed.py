@@ -9,8 +9,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, make_tasks, why_to_draw
-from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record
-from sasgeo_bench.tasks.seed_file import take_seed
+from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record, take_seed
 from sasgeo_bench.tasks.suites.base import Seeds
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 

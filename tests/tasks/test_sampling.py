@@ -14,8 +14,7 @@ from scipy.spatial.distance import cdist
 
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.geometry.angles import wrap_deg
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build

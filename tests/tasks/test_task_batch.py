@@ -5,10 +5,10 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Variant
-from sasgeo_bench.tasks.task_batch import carry_out
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWNS = ("town-suburb", "town-agricultural")

@@ -23,7 +23,7 @@ from sasgeo_bench.experiments.paper.tables import (
     used_interval,
 )
 from sasgeo_bench.experiments.paper.task import DATA, SUITE
-from sasgeo_bench.experiments.paper.windows import CANDIDATES
+from sasgeo_bench.experiments.paper.tiles import CANDIDATES
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.text import markdown_table

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiment as a region and a task on disk: the order of the steps."""
+"""The experiment as a region and a task on disk, and its trials: candidates and transformed views."""
 
 import datetime as dt
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,18 +13,22 @@ from typing import Any, Final
 import numpy as np
 import pyproj
 import shapely
+from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.experiments.paper.tiles import CELL_M, EPSG, TILES, make_tiles, mosaic_grid, tile_boxes
-from sasgeo_bench.experiments.paper.trials import (
-    Transformation,
-    View,
-    draw_crops,
-    draw_transformation,
-    draw_view,
-    true_pose,
+from sasgeo_bench.experiments.paper.tiles import (
+    CELL_M,
+    CLASSES,
+    EPSG,
+    MARGIN_M,
+    TILES,
+    WINDOW_CELLS,
+    WINDOW_M,
+    Windows,
+    make_tiles,
+    mosaic_grid,
+    tile_boxes,
 )
-from sasgeo_bench.experiments.paper.windows import MARGIN_M, WINDOW_CELLS, WINDOW_M, Windows
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE
 from sasgeo_bench.osm.locate import Extract
@@ -32,11 +37,14 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_made
-from sasgeo_bench.regions.evidence import PRESENT
+from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION, Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import check_task, has_truths, put_task
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
+from sasgeo_bench.tasks.perturbations.base import check_ranges, hide
+from sasgeo_bench.tasks.perturbations.occlusion import CentralCrop
 from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.tasks.sampling import make_prior
@@ -44,6 +52,189 @@ from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, Seeds, State, changed_
 from sasgeo_bench.tasks.suites.mining import Windows as MinedWindows
 from sasgeo_bench.tasks.suites.mining import describe, mine
 from sasgeo_bench.tasks.task_plan import check_roots
+
+ROTATIONS_DEG: Final = (0.0, 30.0, 60.0, 90.0)
+SCALES: Final = (0.85, 1.0, 1.15)
+CROP_FRACTIONS: Final = (0.70, 0.85, 1.0)
+MOST_OCCLUDED: Final = 0.24
+MOST_CHANGED: Final = 0.32
+# By how much less likely than the most volatile class each is to change; the paper gives no numbers.
+CHANGE_FACTORS: Final = {
+    "road_major": 0.25,
+    "water": 0.25,
+    "road_minor": 0.5,
+    "building": 0.75,
+    "field_boundary": 1.0,
+}
+_LONGEST: Final = 2.0  # sides of an occluding rectangle at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Transformation:
+    """Changes to the view of one trial; with the default values, none.
+
+    Parameters
+    ----------
+    rotation_deg : float
+        Heading of the view, clockwise from north.
+    scale : float
+        Metres on the ground a side of a view's cell.
+    crop_fraction : float
+        Share of the view that is retained, around its middle.
+    occlusion_share : float
+        Share of the view's cells behind one rectangle.
+    change_probability : float
+        Of a thing of the most volatile class.
+
+    Raises
+    ------
+    PerturbError
+        If a value is beyond what the paper allows.
+    """
+
+    rotation_deg: float = 0.0
+    scale: float = 1.0
+    crop_fraction: float = 1.0
+    occlusion_share: float = 0.0
+    change_probability: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what the paper does not do."""
+        check_ranges(
+            self,
+            rotation_deg=(min(ROTATIONS_DEG), max(ROTATIONS_DEG)),
+            scale=(min(SCALES), max(SCALES)),
+            crop_fraction=(min(CROP_FRACTIONS), max(CROP_FRACTIONS)),
+            occlusion_share=(0, MOST_OCCLUDED),
+            change_probability=(0, MOST_CHANGED),
+        )
+
+
+def draw_transformation(rng: np.random.Generator) -> Transformation:
+    """Draw every part on its own, each value of a set as likely as the others, shares and probabilities uniformly.
+
+    Examples
+    --------
+    >>> draw_transformation(np.random.default_rng(0)).scale in SCALES
+    True
+    """
+    return Transformation(
+        rotation_deg=float(rng.choice(ROTATIONS_DEG)),
+        scale=float(rng.choice(SCALES)),
+        crop_fraction=float(rng.choice(CROP_FRACTIONS)),
+        occlusion_share=float(rng.uniform(0, MOST_OCCLUDED)),
+        change_probability=float(rng.uniform(0, MOST_CHANGED)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crops:
+    """The candidates of one trial as numbers of windows, in the order in which they are shown, and which is true."""
+
+    windows: NDArray[np.int64]
+    true: int
+
+
+def draw_crops(windows: Windows, rng: np.random.Generator) -> Crops:
+    """Draw ten windows that are alike, and by lot which of them is the true one.
+
+    Were the others the nearest to the true one, it would lie in their middle, and whoever ranks candidates by how near
+    they are to the mean of all ten would find it in a third of the trials without a look at the query.
+    """
+    alike = windows.alike(int(rng.integers(len(windows.tile))))
+    shown = rng.permutation(alike)
+    return Crops(windows=shown, true=int(rng.integers(len(shown))))
+
+
+def rectangle(shape: tuple[int, int], share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """One rectangle at any place in a view that covers a share of it, or up to a row less; shape (rows, cols).
+
+    Examples
+    --------
+    >>> covered = rectangle((96, 96), 0.24, np.random.default_rng(0))
+    >>> bool(0.23 < covered.mean() <= 0.24)
+    True
+    """
+    stretch = _LONGEST ** float(rng.uniform(-0.5, 0.5))
+    wanted = share * shape[0] * shape[1]
+    rows = min(shape[0], max(1, round(math.sqrt(wanted) * stretch)))
+    cols = min(shape[1], int(wanted / rows))
+    top, left = rng.integers(0, (shape[0] - rows + 1, shape[1] - cols + 1)).tolist()
+    covered = np.zeros(shape, dtype=bool)
+    covered[top : top + rows, left : left + cols] = True
+    return covered
+
+
+def map_change(probability: float) -> Ageing:
+    """Change the world against the map: things vanish, and as many new ones appear.
+
+    Examples
+    --------
+    >>> rates = map_change(0.32).rates["building"]
+    >>> round(1 - math.exp(-rates.vanish_per_year), 2), round(math.expm1(rates.appear_per_year), 2)
+    (0.24, 0.24)
+    """
+    by_class = {name: factor * probability for name, factor in CHANGE_FACTORS.items()}
+    rates = {
+        name: Rates(vanish_per_year=-math.log1p(-chance), appear_per_year=math.log1p(chance))
+        for name, chance in by_class.items()
+    }
+    return Ageing(years=1.0, rates=rates, place="procedural")
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One trial: the evidence, the map at the same pose, and the world there before any is hidden.
+
+    `occlusion_share` and `retained_share` are those of the cells that the rectangle covers and the crop leaves.
+    """
+
+    evidence: Evidence
+    mapped: Evidence
+    world: Evidence
+    occlusion_share: float
+    retained_share: float
+
+
+def draw_view(state: State, center_m: tuple[float, float], done: Transformation, seeds: Seeds) -> View:
+    """See a place turned, magnified, changed, cropped and occluded, in this order.
+
+    Parameters
+    ----------
+    state : State
+        The map.
+    center_m : tuple of float
+        Easting and northing of the middle of the view.
+    done : Transformation
+        What is done to it.
+    seeds : Seeds
+        Of the trial.
+    """
+    pose = true_pose(center_m, done)
+    mapped = only_paper(state.view(pose, size_cells=WINDOW_CELLS, cell_size_m=CELL_M))
+    world = map_change(done.change_probability)(mapped, seeds.rng("change"))
+    # Beyond the tile there is nothing to be seen, so no cell of the world is unknown.
+    cropped = CentralCrop(share=1 - done.crop_fraction)(world, seeds.rng("crop"))
+    covered = rectangle(world.shape, done.occlusion_share, seeds.rng("occlusion"))
+    return View(
+        evidence=hide(cropped, covered),
+        mapped=mapped,
+        world=world,
+        occlusion_share=float(covered.mean()),
+        retained_share=1 - cropped.unknown_share,
+    )
+
+
+def true_pose(center_m: tuple[float, float], done: Transformation) -> Pose:
+    """The pose of a trial's view."""
+    return Pose(easting_m=center_m[0], northing_m=center_m[1], yaw_deg=done.rotation_deg, scale=done.scale)
+
+
+def only_paper(view: Evidence) -> Evidence:
+    """The five layers of the paper."""
+    cells = view.cells[[view.classes.index(name) for name in CLASSES]]
+    return Evidence(classes=CLASSES, cells=cells, cell_size_m=view.cell_size_m)
+
 
 SUITE: Final = PAPER_SUITE
 VERSION: Final = 1

@@ -1,15 +1,156 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`fft_vote`: three-state correlation at every place, heading and scale within the prior."""
+"""`fft_vote`: three-state correlation at every pose; and the base class of matchers that vote."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.matching.controls.dense_matcher import DenseMatcher
-from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.controls.answers import is_blind, ranked_candidates
+from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.search.chart import Chart
+from sasgeo_bench.search.plan import Mode
+from sasgeo_bench.search.view import View
+from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, ranked
 from sasgeo_bench.search.votes import VoteGains, make_template
+from sasgeo_bench.tasks.query import Query
+
+MOST_PLACES: Final = 20  # modes of one answer at most
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseCheck:
+    """A view and a map, to be compared cell by cell under single poses.
+
+    Parameters
+    ----------
+    chart : Chart
+        The map.
+    bands : ndarray of int64, shape (C,)
+        Indices of the classes of the view among those of the map.
+    seen : ndarray of uint8, shape (C, rows, cols)
+        ABSENT, PRESENT or UNKNOWN.
+    cell_size_m : float
+        Side of a view cell at scale 1.
+    """
+
+    chart: Chart
+    bands: NDArray[np.int64]
+    seen: NDArray[np.uint8]
+    cell_size_m: float
+
+    def mapped(self, pose: Pose) -> NDArray[np.uint8]:
+        """Return the map as a perfect view from a pose shows it, shape (C, rows, cols)."""
+        return self.chart.under(pose, self.seen.shape[1:], self.bands, cell_size_m=self.cell_size_m)
+
+    def agreement(self, pose: Pose) -> float:
+        """Return the mean over classes of intersection over union of view and map, where both are known, 0..1."""
+        mapped = self.mapped(pose)
+        known = (mapped != UNKNOWN) & (self.seen != UNKNOWN)
+        both, either = (
+            (how(self.seen == PRESENT, mapped == PRESENT) & known).sum(axis=(1, 2))
+            for how in (np.logical_and, np.logical_or)
+        )
+        there = either > 0
+        return float((both[there] / either[there]).mean()) if there.any() else 0.0
+
+
+class DenseMatcher(ABC):
+    """A matcher that scores every place, heading and scale; a subclass defines the map and the template."""
+
+    card: MatcherCard
+
+    def __init__(self, plan: VotePlan | None = None) -> None:
+        self.plan = plan or VotePlan()
+        self._chart: Chart | None = None
+
+    @abstractmethod
+    def read(self, region: Region) -> Chart:
+        """Return the layers of a map to match against."""
+
+    @abstractmethod
+    def template(self, evidence: Evidence) -> NDArray[np.float64]:
+        """Return the factors of the map, for all classes of the view: see `votes.make_template`."""
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Read the map."""
+        del learned
+        self._chart = self.read(region)
+        self._used = self._chart.used()
+
+    def seen(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the cells of a view as this matcher reads them."""
+        return cells
+
+    def rescored(self, modes: list[Mode], check: PoseCheck) -> list[Mode]:
+        """Return the modes of a search, in their order, with the scores that rank them."""
+        del check
+        return modes
+
+    def diagnose(self, best: Mode, check: PoseCheck) -> dict[str, float]:
+        """Return diagnostics of the best mode."""
+        return {"class_agreement": check.agreement(best.pose)}
+
+    def match(self, query: Query, *, top_k: int) -> Match:
+        """Return the best modes, or rank the candidates by the best pose near each."""
+        if self._chart is None:
+            message = f"{self.card.name}: call prepare() with a region before match()"
+            raise RuntimeError(message)
+        if is_blind(query):
+            return WITHHELD
+        chart, view = self._chart, self._read(query.evidence, self._chart)
+        search = VoteSearch(chart=chart, view=self._view(view, chart), prior=query.prior, plan=self.plan)
+        check = self._check(view, chart)
+        count = min(top_k, MOST_PLACES)
+        is_retrieval = query.track == "retrieval"
+        found = search.candidates(query.candidates) if is_retrieval else search.places(count)
+        modes = self.rescored([mode for mode in found.modes if mode is not None], check)
+        best = ranked(modes)
+        diagnostics = {"known_share": 1.0 - query.evidence.unknown_share, "null_score": found.null_score}
+        diagnostics |= _margin(best) | (self.diagnose(best[0], check) if best else {})
+        if not is_retrieval:
+            given = best[:count]
+            poses, values = [mode.pose for mode in given], [mode.score for mode in given]
+            return Match(poses=poses, scores=values, diagnostics=diagnostics)
+        left = iter(modes)
+        by_candidate = [None if mode is None else next(left) for mode in found.modes]
+        poses = [mode.pose if mode else pose for pose, mode in zip(query.candidates, by_candidate, strict=True)]
+        scores = [mode.score if mode else None for mode in by_candidate]
+        return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=diagnostics)
+
+    def _read(self, evidence: Evidence, chart: Chart) -> Evidence:
+        """Return the classes that the map has, as this matcher reads them."""
+        shared = [index for index, name in enumerate(evidence.classes) if name in chart.classes]
+        names = tuple(evidence.classes[index] for index in shared)
+        return Evidence(classes=names, cells=self.seen(evidence.cells[shared]), cell_size_m=evidence.cell_size_m)
+
+    def _view(self, seen: Evidence, chart: Chart) -> View:
+        """Make the template; classes that the map holds nowhere only count where they are seen."""
+        whole, bands = self.template(seen), _bands(seen, chart)
+        chosen = [index for index, band in enumerate(bands) if self._used[band] and whole[index].any()]
+        return View.of(seen, np.concatenate((whole[chosen], whole[-2:])), bands[chosen])
+
+    def _check(self, seen: Evidence, chart: Chart) -> PoseCheck:
+        """Prepare comparisons at single poses, in the classes that view or map hold."""
+        bands = _bands(seen, chart)
+        chosen = self._used[bands] | (seen.cells == PRESENT).any(axis=(1, 2))
+        return PoseCheck(chart=chart, bands=bands[chosen], seen=seen.cells[chosen], cell_size_m=seen.cell_size_m)
+
+
+def _bands(evidence: Evidence, chart: Chart) -> NDArray[np.int64]:
+    """Return indices of the classes of a view among those of the map, shape (C,)."""
+    return np.array([chart.classes.index(name) for name in evidence.classes], dtype=np.int64)
+
+
+def _margin(modes: list[Mode]) -> dict[str, float]:
+    """Return the number of modes and the margin of the best over the next, 0 where there is none."""
+    margin = modes[0].score - modes[1].score if len(modes) > 1 else 0.0
+    return {"margin": margin, "modes": float(len(modes))}
 
 
 class FftVote(DenseMatcher):

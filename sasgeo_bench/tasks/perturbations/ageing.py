@@ -16,9 +16,8 @@ from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
-from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated
+from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated, shifted
 from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects, thin_classes
-from sasgeo_bench.tasks.perturbations.resample import shifted
 
 _BLOCKED_BY: Final = ("building", "water", "railway", "road_major", "road_minor")
 _TRIES: Final = 12  # to find a free place for a new object

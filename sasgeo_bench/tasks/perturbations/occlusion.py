@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rectangles that hide a share of the view: smoke, signs, masts, a lost tile of the image."""
+"""Lost parts of a view: hidden rectangles, a ragged frame, a narrow field of view, false unknowns."""
 
 from functools import lru_cache
 from typing import Final
@@ -8,10 +8,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.angles import rotation
-from sasgeo_bench.regions.evidence import PRESENT, Evidence
+from sasgeo_bench.geometry.pose import rotation
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, Occlusion
-from sasgeo_bench.tasks.perturbations.fields import Field, centres, dilated, highest, smooth_noise, top_share
+from sasgeo_bench.tasks.perturbations.fields import (
+    Field,
+    NoisePool,
+    centres,
+    dilated,
+    highest,
+    highest_within,
+    smooth_noise,
+    top_share,
+)
 
 _DRAWS: Final = 256  # rectangles drawn at a time
 _SIDES: Final = (0.08, 0.35)  # smallest and largest side of a rectangle, as fractions of the view's side
@@ -207,3 +216,54 @@ def far_side(evidence: Evidence, share: float, direction_deg: float) -> Mask:
     """Return the cells that lie farthest in a direction, clockwise from the view's up."""
     along, across = centres(evidence.shape, evidence.cell_size_m).along_and_across(direction_deg)
     return top_share((along + _SPREAD * np.abs(across)).astype(np.float32), share)
+
+
+_RAGGEDNESS: Final = 0.04  # variation of the frame's width, in halves of the view's side
+
+
+class Border(Occlusion):
+    """Hide a ragged frame around the view."""
+
+    def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
+        """Return the cells nearest to the edge."""
+        nearness = -depth(evidence.shape)
+        nearness += _RAGGEDNESS * smooth_noise(evidence.shape, min(evidence.shape) / 12, rng)
+        return top_share(nearness, self.share)
+
+
+def depth(shape: tuple[int, int]) -> Field:
+    """Return the distance of each cell from the nearest edge, 0 at the edge to 1 in the middle."""
+    at = centres(shape, 2.0)
+    rows, cols = 1 - np.abs(at.up_m) / shape[0], 1 - np.abs(at.right_m) / shape[1]
+    return np.minimum(rows, cols).astype(np.float32)
+
+
+class CentralCrop(Occlusion):
+    """Hide all but a rectangle in the middle; `share` is reached to within one ring of cells.
+
+    Examples
+    --------
+    >>> view = Evidence(classes=("water",), cells=np.zeros((1, 4, 4), dtype=np.uint8), cell_size_m=1.0)
+    >>> CentralCrop(share=0.75)(view, np.random.default_rng(0)).cells[0, 1].tolist()
+    [2, 0, 0, 2]
+    """
+
+    def mask(self, evidence: Evidence, _rng: np.random.Generator) -> Mask:
+        """Return all cells but the middle."""
+        return np.asarray(depth(evidence.shape) < 1 - np.sqrt(1 - self.share))
+
+
+_FALSE_PATCH_M: Final = 12.0
+
+
+class FalseUnknown(Occlusion):
+    """Hide patches of each class separately; `share` is that of the known cells of each class."""
+
+    def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
+        """Return the patches of each class, shape (C, rows, cols)."""
+        pool, patches = NoisePool(evidence.shape), []
+        for layer in evidence.cells:
+            noise, known = pool.take(_FALSE_PATCH_M / evidence.cell_size_m, rng), layer != UNKNOWN
+            count = np.count_nonzero(known)
+            patches.append(known & (noise >= highest_within(noise, known, self.share * count, rng)))
+        return np.stack(patches)

@@ -3,7 +3,7 @@
 
 from typing import Final
 
-from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
+from sasgeo_bench.tasks.perturbations.occlusion import FalseUnknown
 from sasgeo_bench.tasks.suites.base import PlainSuite, SuiteCard, Variant, controls, ladder
 
 SUITE: Final = PlainSuite(

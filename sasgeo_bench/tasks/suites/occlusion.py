@@ -7,8 +7,14 @@ import numpy as np
 
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Occlusion
-from sasgeo_bench.tasks.perturbations.border import Border
-from sasgeo_bench.tasks.perturbations.occlusion import AdversarialMask, CanopyAndShadow, Glare, Rectangles, TiltWedge
+from sasgeo_bench.tasks.perturbations.occlusion import (
+    AdversarialMask,
+    Border,
+    CanopyAndShadow,
+    Glare,
+    Rectangles,
+    TiltWedge,
+)
 from sasgeo_bench.tasks.suites.base import PlainSuite, SuiteCard, Variant, controls, ladder
 
 SHARES: Final = (0.15, 0.3, 0.45, 0.6)

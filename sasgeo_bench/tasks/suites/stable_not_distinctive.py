@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.angles import bearing_deg, wrap_deg
+from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, SuiteCard, Variant

@@ -12,17 +12,31 @@ import shapely
 
 from sasgeo_bench.errors import ConfigError, PerturbError
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task, task
-from sasgeo_bench.experiments.paper.task import VERSION, region_name
-from sasgeo_bench.experiments.paper.tiles import CLASSES, GAP_M, TILE_M, TILES, draw_tile, mosaic_grid, tile_centre_m
-from sasgeo_bench.experiments.paper.trials import (
+from sasgeo_bench.experiments.paper.task import (
     CHANGE_FACTORS,
+    VERSION,
     Transformation,
     draw_crops,
     draw_view,
     map_change,
     rectangle,
+    region_name,
 )
-from sasgeo_bench.experiments.paper.windows import CANDIDATES, MARGIN_M, STEP_M, WINDOW_CELLS, WINDOW_M, Windows
+from sasgeo_bench.experiments.paper.tiles import (
+    CANDIDATES,
+    CLASSES,
+    GAP_M,
+    MARGIN_M,
+    STEP_M,
+    TILE_M,
+    TILES,
+    WINDOW_CELLS,
+    WINDOW_M,
+    Windows,
+    draw_tile,
+    mosaic_grid,
+    tile_centre_m,
+)
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.layers import OUTSIDE

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.tasks.perturbations.fields import resample
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, folded_share, moved, warped
-from sasgeo_bench.tasks.perturbations.resample import resample
 
 
 def dots(*places, cell_size_m=1.0, name="building", size=101):

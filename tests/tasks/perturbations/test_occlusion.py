@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import share_hidden
-from sasgeo_bench.tasks.perturbations.border import Border
-from sasgeo_bench.tasks.perturbations.crop import CentralCrop
-from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
 from sasgeo_bench.tasks.perturbations.occlusion import (
     HIDDEN,
     MASKS,
     AdversarialMask,
+    Border,
     CanopyAndShadow,
+    CentralCrop,
+    FalseUnknown,
     Glare,
     Rectangles,
     TiltWedge,

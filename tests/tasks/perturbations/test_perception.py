@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
-from sasgeo_bench.tasks.perturbations import detector
-from sasgeo_bench.tasks.perturbations.detector import ERRORS, TOLERANCE_CELLS, ClassErrors
+from sasgeo_bench.tasks.perturbations import perception
 from sasgeo_bench.tasks.perturbations.fields import dilated, eroded
 from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
-from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.perturbations.perception import ERRORS, TOLERANCE_CELLS, ClassErrors, Perception
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def test_whole_houses_are_missed_but_not_all_that_is_lost_is(views):
 
 
 def test_a_road_gets_gaps_rather_than_a_thinner_band(monkeypatch):
-    monkeypatch.setattr(detector, "SPREAD", 0.0)
+    monkeypatch.setattr(perception, "SPREAD", 0.0)
     road = scene("road_minor", lambda layer: layer[:, 60:65].fill(1))
     seen = Perception(error_factor=1.0)(road, np.random.default_rng(0))
     widths = (seen.layer("road_minor")[:, 57:68] == PRESENT).sum(axis=1)
@@ -113,8 +112,8 @@ def test_a_road_gets_gaps_rather_than_a_thinner_band(monkeypatch):
 
 
 def test_edges_are_off_by_no_more_than_two_cells_where_nothing_else_goes_wrong(monkeypatch):
-    monkeypatch.setattr(detector, "ERRORS", {"water": ClassErrors(f1=0.9, dropped=0.0, frayed=1.0, usual_share=0.0)})
-    monkeypatch.setattr(detector, "SPREAD", 0.0)
+    monkeypatch.setattr(perception, "ERRORS", {"water": ClassErrors(f1=0.9, dropped=0.0, frayed=1.0, usual_share=0.0)})
+    monkeypatch.setattr(perception, "SPREAD", 0.0)
     lake = scene("water", lambda layer: layer[30:100, 30:100].fill(1))
     seen = Perception(error_factor=0.5)(lake, np.random.default_rng(2))
     wrong = seen.layer("water") != lake.layer("water")
@@ -135,7 +134,7 @@ def test_what_one_class_loses_another_one_gains():
 
 
 def test_a_class_without_errors_in_the_table_is_seen_without_error(view, monkeypatch):
-    monkeypatch.setattr(detector, "ERRORS", {"water": ClassErrors(f1=0.5)})
+    monkeypatch.setattr(perception, "ERRORS", {"water": ClassErrors(f1=0.5)})
     seen = Perception(error_factor=1.0)(view, np.random.default_rng(0))
     for name in view.classes:
         assert (seen.layer(name) == view.layer(name)).all() == (name != "water")

@@ -10,11 +10,17 @@ from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import share_changed
-from sasgeo_bench.tasks.perturbations.border import Border
-from sasgeo_bench.tasks.perturbations.crop import CentralCrop
-from sasgeo_bench.tasks.perturbations.false_unknown import FalseUnknown
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
-from sasgeo_bench.tasks.perturbations.occlusion import AdversarialMask, CanopyAndShadow, Glare, Rectangles, TiltWedge
+from sasgeo_bench.tasks.perturbations.occlusion import (
+    AdversarialMask,
+    Border,
+    CanopyAndShadow,
+    CentralCrop,
+    FalseUnknown,
+    Glare,
+    Rectangles,
+    TiltWedge,
+)
 from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.perturbations.season import Season
 

@@ -74,6 +74,7 @@ check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m mypy
 
 bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, never a test
+	$(VENV_PYTHON) benchmarks/startup.py
 	$(VENV_PYTHON) benchmarks/perturb.py
 	$(VENV_PYTHON) benchmarks/make_queries.py
 	$(VENV_PYTHON) benchmarks/run_matcher.py

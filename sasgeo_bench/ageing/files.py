@@ -18,7 +18,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.parquet import read_frame, write_frame
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.texts import markdown, markdown_item
+from sasgeo_bench.texts import markdown, markdown_item, quoted
 
 TABLE: Final = "ageing.parquet"
 TEXT: Final = "ageing.md"
@@ -266,3 +266,50 @@ def _bounded(percent: float) -> str:
 def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [map(markdown, head), ["---"] * len(head), *(map(markdown, row) for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+_RATEBOOK_HEAD: Final = f"""\
+# Yearly rates by place and class, written by `sasgeo-bench compare-ageing --rates`; not to be edited.
+# {ATTRIBUTION}
+attribution = {quoted(ATTRIBUTION)}
+licence = {quoted(LICENCE)}
+"""
+_RATEBOOK_COUNTS: Final = ("n_from", "n_to")
+_RATEBOOK_RATES: Final = ("vanish_per_year", "appear_per_year")
+_RATEBOOK_SHARES: Final = ("redrawn_share", "shift_median_m", "shift_p90_m")
+
+
+def ratebook_text(places: Sequence[Ageing]) -> str:
+    """Format several places as TOML; raise `ConfigError` if two have one name."""
+    check_names(places)
+    parts = [_RATEBOOK_HEAD if places else f"{_RATEBOOK_HEAD}place = []\n"]
+    for place in places:
+        files = dict.fromkeys(source.rpartition(" of ")[0] for source in place.sources)
+        lines = [
+            "[[place]]",
+            f"name = {quoted(place.place)}",
+            f"area_km2 = {place.area_km2!r}",
+            f"extracts = [{', '.join(map(quoted, files))}]",
+        ]
+        pooled, whole = (place.table[place.table["span"] == span].set_index("class") for span in ("pooled", "whole"))
+        parts.append("\n".join(lines) + "\n")
+        parts += [_ratebook_class(name, pooled.loc[name], whole.loc[name]) for name in pooled.index]
+    return "\n".join(parts)
+
+
+def _ratebook_class(name: str, pooled: pd.Series, whole: pd.Series) -> str:
+    lines = [f"[place.class.{name}]", f"years = {round(float(pooled['years']), 2)!r}"]
+    lines += [f"{column} = {int(pooled[column])}" for column in _RATEBOOK_COUNTS]
+    for column in _RATEBOOK_RATES:
+        ends = {"best": pooled[column], "lo": pooled[f"{column}_lo"], "hi": pooled[f"{column}_hi"]}
+        known = [f"{end} = {float(value)!r}" for end, value in ends.items() if not pd.isna(value)]
+        if known:
+            lines.append(f"{column} = {{ {', '.join(known)} }}")
+    lines += [f"{column} = {float(whole[column])!r}" for column in _RATEBOOK_SHARES if not pd.isna(whole[column])]
+    return "\n".join(lines) + "\n"
+
+
+def write_ratebook(path: Path, places: Sequence[Ageing]) -> Path:
+    """Write `ratebook_text` into a file, replaced whole; raise `StoreError` if it cannot be written."""
+    text = ratebook_text(places)
+    return replace_file(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))

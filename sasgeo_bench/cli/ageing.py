@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.ageing.files import read_ageing, write_ageing, write_summary
+from sasgeo_bench.ageing.files import read_ageing, write_ageing, write_ratebook, write_summary
 from sasgeo_bench.ageing.measure import measure_ageing
-from sasgeo_bench.ageing.ratebook import write_ratebook
 from sasgeo_bench.cli.console import read_day, say, tell
 from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError

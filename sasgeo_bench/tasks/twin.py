@@ -3,17 +3,22 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
+import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
-import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.osm.features import check_features
 
-Change = Callable[[gpd.GeoDataFrame], gpd.GeoDataFrame]
+if TYPE_CHECKING:
+    import geopandas as gpd
+    import pandas as pd
+else:  # loaded when a table is made
+    gpd, pd = lazy_loader.load("geopandas"), lazy_loader.load("pandas")
+
+Change = Callable[["gpd.GeoDataFrame"], "gpd.GeoDataFrame"]
 
 ROADS: Final = ("road_major", "road_minor", "path_track")
 
@@ -39,7 +44,7 @@ class Paste:
     change: Change | None = None
 
 
-def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFrame:
+def paste(features: "gpd.GeoDataFrame", pastes: Sequence[Paste]) -> "gpd.GeoDataFrame":
     """Copy parts of a feature table; features that cross the rim of a disc are cut there.
 
     Sources are read from the given table, even if another copy overwrites them.
@@ -57,16 +62,16 @@ def paste(features: gpd.GeoDataFrame, pastes: Sequence[Paste]) -> gpd.GeoDataFra
     return check_features(gpd.GeoDataFrame(table, geometry="geometry", crs=features.crs).astype(dict(_types(features))))
 
 
-def _types(features: gpd.GeoDataFrame) -> Iterable[tuple[str, object]]:
+def _types(features: "gpd.GeoDataFrame") -> Iterable[tuple[str, object]]:
     return ((name, kind) for name, kind in features.dtypes.items() if name != "geometry")
 
 
-def around(features: gpd.GeoDataFrame, center_m: tuple[float, float], radius_m: float) -> gpd.GeoDataFrame:
+def around(features: "gpd.GeoDataFrame", center_m: tuple[float, float], radius_m: float) -> "gpd.GeoDataFrame":
     """Return the features within a disc, cut at its rim."""
     return _cut(features, _disc(center_m, radius_m), keep_inside=True)
 
 
-def _copy(features: gpd.GeoDataFrame, item: Paste, *, first_id: int) -> gpd.GeoDataFrame:
+def _copy(features: "gpd.GeoDataFrame", item: Paste, *, first_id: int) -> "gpd.GeoDataFrame":
     piece = around(features, item.source_m, item.radius_m)
     if item.change is not None:
         piece = item.change(piece)
@@ -80,7 +85,7 @@ def _disc(center_m: tuple[float, float], radius_m: float) -> shapely.Polygon:
     return shapely.Point(center_m).buffer(radius_m, quad_segs=_ARC_SEGMENTS)
 
 
-def _cut(features: gpd.GeoDataFrame, area: shapely.Geometry, *, keep_inside: bool) -> gpd.GeoDataFrame:
+def _cut(features: "gpd.GeoDataFrame", area: shapely.Geometry, *, keep_inside: bool) -> "gpd.GeoDataFrame":
     """Return features inside (or outside) an area, cut at its rim; drop parts of a lower dimension."""
     geometry = features.geometry.to_numpy()
     shapely.prepare(area)
@@ -108,7 +113,7 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
     return found
 
 
-def mirror(features: gpd.GeoDataFrame, classes: Sequence[str], center_m: tuple[float, float]) -> gpd.GeoDataFrame:
+def mirror(features: "gpd.GeoDataFrame", classes: Sequence[str], center_m: tuple[float, float]) -> "gpd.GeoDataFrame":
     """Mirror the features of some classes from east to west about a place, which keeps their kind and amount."""
     is_one = features["class"].isin(list(classes)).to_numpy()
     shapes = features.geometry.to_numpy().copy()
@@ -117,7 +122,7 @@ def mirror(features: gpd.GeoDataFrame, classes: Sequence[str], center_m: tuple[f
     return features.set_geometry(gpd.GeoSeries(shapes, index=features.index, crs=features.crs))
 
 
-def split_long(features: gpd.GeoDataFrame, *, piece_m: float, least_area_m2: float) -> gpd.GeoDataFrame:
+def split_long(features: "gpd.GeoDataFrame", *, piece_m: float, least_area_m2: float) -> "gpd.GeoDataFrame":
     """Cut large buildings across their long side into a row of houses; their union stays exactly the same."""
     is_large = (features["class"] == "building").to_numpy() & (features.geometry.area.to_numpy() >= least_area_m2)
     rows = [features[~is_large]]
@@ -154,8 +159,8 @@ def _row_of_houses(shape: shapely.Geometry, piece_m: float) -> list[shapely.Geom
 
 
 def open_gaps(
-    features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, gap_m: float, rng: np.random.Generator
-) -> gpd.GeoDataFrame:
+    features: "gpd.GeoDataFrame", junctions_m: NDArray[np.float64], *, gap_m: float, rng: np.random.Generator
+) -> "gpd.GeoDataFrame":
     """Shorten one random arm of each junction, so that the road stops `gap_m` before the edge of the other one.
 
     `junctions_m` has shape (N, 2), easting and northing.
@@ -178,8 +183,8 @@ def open_gaps(
 
 
 def stagger(
-    features: gpd.GeoDataFrame, junctions_m: NDArray[np.float64], *, offset_m: float, rng: np.random.Generator
-) -> gpd.GeoDataFrame:
+    features: "gpd.GeoDataFrame", junctions_m: NDArray[np.float64], *, offset_m: float, rng: np.random.Generator
+) -> "gpd.GeoDataFrame":
     """Replace each X-junction by two T-junctions: one road's far part starts `offset_m` along the other road.
 
     Road and direction are random. `junctions_m` has shape (N, 2), easting and northing; junctions where no road
@@ -249,7 +254,7 @@ def _end_moved(
     return lines[0] if len(lines) == 1 else shapely.multilinestrings(lines)
 
 
-def level_crossings(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def level_crossings(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Lower every bridge to the ground: roads that passed over each other now meet in a junction."""
     table = features[(features["class"] != "bridge").to_numpy()].copy()
     table["level"] = np.zeros(len(table), dtype=np.int16)

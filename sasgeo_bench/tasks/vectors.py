@@ -1,22 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Perceived vectors: lines and outlines in the view's frame, as a table and as features of a graph."""
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
+import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
 import shapely
-from rasterio.features import shapes as polygons_of
 
 from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions.evidence import PRESENT, Evidence, cell_offsets_m
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+else:  # loaded when a table is made
+    gpd = lazy_loader.load("geopandas")
 
 COLUMNS: Final = ("class", "level", "is_bridge", "geometry")
 _DECIMALS: Final = 1  # decimetres: finer than any detector, and far smaller on disk
 _EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere
 
 
-def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.GeoDataFrame:
+def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> "gpd.GeoDataFrame":
     """Return a table of perceived vectors, with coordinates rounded to a decimetre."""
     shapes = np.array([row[3] for row in rows], dtype=object)
     rounded = shapely.transform(shapes, lambda at: at.round(_DECIMALS) + 0.0) if len(rows) else shapes
@@ -30,8 +34,10 @@ def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> gpd.Geo
     )
 
 
-def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.GeoDataFrame:
+def instances_of_mask(evidence: Evidence, class_name: str = "building") -> "gpd.GeoDataFrame":
     """Return an instance for each connected patch of a class, which adds nothing to the mask."""
+    from rasterio.features import shapes as polygons_of  # noqa: PLC0415 - suites are listed without it
+
     mask = (evidence.layer(class_name) == PRESENT).astype(np.uint8)
     corners = cell_offsets_m(evidence.shape, evidence.cell_size_m)
     step_m = evidence.cell_size_m
@@ -41,7 +47,7 @@ def instances_of_mask(evidence: Evidence, class_name: str = "building") -> gpd.G
     return vector_table([(class_name, 0, False, shape) for shape in found])
 
 
-def as_features(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def as_features(vectors: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return perceived vectors as a feature table, from which `graph.build_graph` makes a graph."""
     count = len(vectors)
     columns: dict[str, object] = {

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from pydantic import ValidationError
 
-from sasgeo_bench.ageing.files import read_ageing
+from sasgeo_bench.ageing.files import ratebook_text, read_ageing
 from sasgeo_bench.ageing.ratebook import (
     PACKAGED,
     ClassAgeing,
@@ -17,7 +17,6 @@ from sasgeo_bench.ageing.ratebook import (
     RateBook,
     load_ratebook,
     pool_rates,
-    ratebook_text,
 )
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError

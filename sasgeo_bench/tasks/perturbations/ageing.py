@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -143,7 +143,7 @@ class Ageing:
         count = min(int(rng.poisson(mean)), _MOST_NEW)
         if not count or not len(usable):
             return
-        boxes = ndimage.find_objects(found.labels)
+        boxes = scipy.ndimage.find_objects(found.labels)
         taken = _taken(name, layers)
         for source in rng.choice(usable, size=count).tolist():
             box = boxes[source]
@@ -163,7 +163,7 @@ def _sea(layers: Mapping[str, Mask]) -> Mask | None:
     water, coast = layers.get("water"), layers.get("coastline")
     if water is None or coast is None or not coast.any():
         return None
-    bodies, count = ndimage.label(water)
+    bodies, count = scipy.ndimage.label(water)
     return np.isin(bodies, np.setdiff1d(np.unique(bodies[dilated(coast, 1.5)]), [0])) if count else None
 
 

@@ -8,9 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-import geopandas as gpd
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,9 @@ from sasgeo_bench.tasks.private_seed import Seed
 from sasgeo_bench.tasks.query import PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.twin import Paste
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
@@ -40,7 +42,7 @@ class State:
     grid: Grid
     classes: tuple[str, ...]
     bits: LayerBits
-    features: gpd.GeoDataFrame
+    features: "gpd.GeoDataFrame"
     graph: MapGraph
 
     @classmethod
@@ -215,7 +217,7 @@ class Draft:
     is_present: bool = True
     has_pose: bool = True
     pose: Pose | None = None
-    vectors: gpd.GeoDataFrame | None = None
+    vectors: "gpd.GeoDataFrame | None" = None
     is_removed: bool = False
     neighbours_m: tuple[tuple[float, float], ...] = ()
     has_twins: bool = True

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `local-warp`: the view is bent smoothly, so that cells miss the map while roads keep their order."""
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -12,6 +11,9 @@ from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, folded_share, moved, warped
 from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, SuiteCard, Variant, controls, ladder
 from sasgeo_bench.tasks.suites.vectors import round_vectors, site_vectors
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 RMS_M: Final = (5.0, 10.0, 15.0)
 _STEP_M: Final = 8.0  # between vertices before a line is bent: an eighth of the shortest wave
@@ -39,7 +41,7 @@ class LocalWarpSuite(Suite):
         )
 
 
-def bent(vectors: gpd.GeoDataFrame, field_m: NDArray[np.float64], cell_size_m: float) -> gpd.GeoDataFrame:
+def bent(vectors: "gpd.GeoDataFrame", field_m: NDArray[np.float64], cell_size_m: float) -> "gpd.GeoDataFrame":
     """Move the vectors of a view as a warp moves its cells."""
     dense = shapely.segmentize(vectors.geometry.to_numpy(), _STEP_M)
     shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))

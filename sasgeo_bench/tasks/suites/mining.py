@@ -4,16 +4,18 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
-import geopandas as gpd
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 SCORERS: Final = ("histogram", "rings", "distance", "graph")
 STRIDE_M: Final = 32.0
@@ -144,7 +146,7 @@ def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -
     return np.concatenate(found, axis=1).astype(np.float32)
 
 
-def _node_counts(nodes: gpd.GeoDataFrame, points_m: NDArray[np.float64], radius_m: float) -> Floats:
+def _node_counts(nodes: "gpd.GeoDataFrame", points_m: NDArray[np.float64], radius_m: float) -> Floats:
     """Return square roots of the counts of nodes of each kind, within half the disc's area and within all of it."""
     kinds = nodes["kind"].to_numpy()
     counts = np.zeros((len(points_m), 2 * len(_NODE_KINDS)), dtype=np.float32)

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.suites.base import Scene, Shot, Site, SuiteCard, pair
@@ -57,8 +57,9 @@ class TopologyTwins(TwinSuite):
 def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence:
     """Take each patch of differing cells from one of two views, by lot."""
     differ = (own.cells != other.cells).any(axis=0)
-    near = ndimage.binary_dilation(differ, structure=np.ones((3, 3), dtype=bool), iterations=_ONE_PATCH_CELLS // 2)
-    patch, count = ndimage.label(near, structure=np.ones((3, 3)))
+    square = np.ones((3, 3), dtype=bool)
+    near = scipy.ndimage.binary_dilation(differ, structure=square, iterations=_ONE_PATCH_CELLS // 2)
+    patch, count = scipy.ndimage.label(near, structure=square)
     is_other = np.concatenate(([False], rng.random(count) < 0.5))[patch]  # noqa: PLR2004 - half of them
     return own.replace(np.where(is_other, other.cells, own.cells))
 

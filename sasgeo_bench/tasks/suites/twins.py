@@ -3,13 +3,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
 import numpy as np
+import scipy
 import shapely
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
@@ -18,6 +17,9 @@ from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.vectors import site_vectors
 from sasgeo_bench.tasks.twin import Change, Paste
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 LATTICE_M: Final = 16.0
 OFF_M: Final = 24.0  # largest offset of a copied disc from its site, so that its rim does not show where the site is
@@ -154,7 +156,7 @@ def find_targets(
     cell_m = state.grid.cell_size_m
     step = max(1, round(LATTICE_M / cell_m))
     inside = np.pad(state.known[::step, ::step], 1)
-    deep = ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > clear_m / LATTICE_M + 1
+    deep = scipy.ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > clear_m / LATTICE_M + 1
     free = state.grid.to_centres_m(np.argwhere(deep) * step)
     for site in sites:
         free = free[np.hypot(*(free - site.en_m).T) > 2 * clear_m + cell_m]
@@ -177,13 +179,13 @@ def find_targets(
     return found
 
 
-def nodes_of(scene: Scene, kinds: Sequence[str], *, least_degree: int = 0) -> gpd.GeoDataFrame:
+def nodes_of(scene: Scene, kinds: Sequence[str], *, least_degree: int = 0) -> "gpd.GeoDataFrame":
     """Return nodes of the map's graph of some kinds."""
     nodes = scene.map.graph.nodes
     return nodes[nodes["kind"].isin(list(kinds)).to_numpy() & (nodes["degree"].to_numpy() >= least_degree)]
 
 
-def places_of(nodes: gpd.GeoDataFrame) -> NDArray[np.float64]:
+def places_of(nodes: "gpd.GeoDataFrame") -> NDArray[np.float64]:
     """Return easting and northing of nodes, shape (N, 2)."""
     return np.asarray(shapely.get_coordinates(nodes.geometry.to_numpy())).reshape(-1, 2)
 

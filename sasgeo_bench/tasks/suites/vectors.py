@@ -3,9 +3,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -14,6 +13,9 @@ from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
 from sasgeo_bench.tasks.suites.base import Shot, State
 from sasgeo_bench.tasks.vectors import vector_table
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 VECTOR_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway")
 _LEAST_M: Final = 2.0
@@ -37,7 +39,7 @@ class VectorNoise:
 
 def perceive_vectors(
     state: State, pose: Pose, *, side_m: float, noise: VectorNoise, rng: np.random.Generator
-) -> gpd.GeoDataFrame:
+) -> "gpd.GeoDataFrame":
     """Return the vectors of the visible features in a view of a state.
 
     Columns are `class`, `level`, `is_bridge` and `geometry`: (right, up) from the middle of the view, metres. `side_m`
@@ -63,7 +65,7 @@ def perceive_vectors(
     return vector_table(rows)
 
 
-def site_vectors(shot: Shot, pose: Pose | None = None) -> gpd.GeoDataFrame:
+def site_vectors(shot: Shot, pose: Pose | None = None) -> "gpd.GeoDataFrame":
     """Perceive the vectors of a shot, at its site unless another pose is given."""
     return perceive_vectors(
         shot.scene.world,
@@ -91,7 +93,7 @@ def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np
     return shifted
 
 
-def round_vectors(vectors: gpd.GeoDataFrame, shapes: NDArray[np.object_]) -> gpd.GeoDataFrame:
+def round_vectors(vectors: "gpd.GeoDataFrame", shapes: NDArray[np.object_]) -> "gpd.GeoDataFrame":
     """Return the same vectors with other shapes, rounded."""
     columns = (vectors[name].to_list() for name in ("class", "level", "is_bridge"))
     return vector_table(list(zip(*columns, shapes, strict=True)))

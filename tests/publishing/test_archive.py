@@ -72,7 +72,7 @@ def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
 def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path):
     _, plan, folder, _ = kept
     code, _, err = program("score", "--predictions", folder, "--truth", folder, "--name", "again", "--out", tmp_path)
-    assert code == 3, err  # the matcher that learns answers blind views: so says the board itself
+    assert code == 4, err  # the matcher that learns answers blind views: so says the board itself
     first, again = plan.out / "boards" / "kept", tmp_path / "boards" / "again"
     there = contents_of(first)
     assert contents_of(again) == {name: data for name, data in there.items() if name.parts[0] != "pictures"}
@@ -165,7 +165,7 @@ def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
     most = sum(path.stat().st_size for path in folder.iterdir()) - 1
     pack_board(board, request_of(plan), tmp_path / "kept", most_bytes=most)
     code, _, err = program("score", "--predictions", tmp_path / "kept", "--name", "again", "--out", tmp_path / "out")
-    assert code == 3, err
+    assert code == 4, err
     for name in TABLES:
         first = pd.read_parquet(plan.out / "boards" / "kept" / f"{name}.parquet")
         pd.testing.assert_frame_equal(first, pd.read_parquet(tmp_path / "out" / "boards" / "again" / f"{name}.parquet"))
@@ -602,7 +602,7 @@ def test_answers_of_ones_own_are_scored_beside_stored_results(kept, program, tmp
     pq.write_table(answers.filter(pc.equal(answers["matcher"], "random")), tmp_path / "mine.parquet")
     args = ("--predictions", folder, "--predictions", tmp_path / "mine.parquet", "--out", tmp_path, "--draws", 100)
     code, _, err = program("score", *args)
-    assert code == 3, err
+    assert code == 4, err
     table = pd.read_parquet(tmp_path / "boards" / "board" / "leaderboard.parquet")
     rows = table[(table["metric"] == "success_25m") & (table["stratum"] == "all")].set_index("matcher")["value"]
     assert rows["mine"] == rows["random"]

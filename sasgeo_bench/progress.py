@@ -3,9 +3,9 @@
 
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Protocol
 
-EVERY_S: Final = 10.0
+EVERY_S = 10.0  # read when progress begins to be shown, so that a test can silence it on a slow machine
 
 Tell = Callable[[str], None]
 
@@ -31,8 +31,8 @@ class Lines:
     rejectors: 4 of 16
     """
 
-    def __init__(self, tell: Tell, *, every_s: float = EVERY_S) -> None:
-        self._tell, self._every_s = tell, every_s
+    def __init__(self, tell: Tell, *, every_s: float | None = None) -> None:
+        self._tell, self._every_s = tell, EVERY_S if every_s is None else every_s
         self._begun: dict[str, tuple[float, int]] = {}
         self._done: dict[str, int] = {}
         self._last_s = time.monotonic()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every test shares: no network, reproducible hypothesis runs, and the folder of real extracts."""
 
+import math
 import os
 import shutil
 import socket
@@ -13,7 +14,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from sasgeo_bench import cli
+from sasgeo_bench import cli, progress
 from sasgeo_bench.experiments import pipeline
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.publishing import archive
@@ -37,6 +38,7 @@ settings.register_profile(
 settings.register_profile("quick", settings.get_profile("sasgeo"), max_examples=10)
 settings.register_profile("search", settings.get_profile("sasgeo"), derandomize=False, max_examples=200)
 settings.load_profile("sasgeo")
+progress.EVERY_S = math.inf  # else lines of progress come between others wherever the machine is slow
 
 BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test
 LOOPBACK = ("127.", "localhost", "::1")

@@ -6,6 +6,8 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import Rule, Taxonomy, classify, load_taxonomy
+from sasgeo_bench.regions.preview import PAINT_ORDER
+from sasgeo_bench.tasks.perturbations.perception import ERRORS
 
 WANTED = {
     *("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline"),
@@ -33,6 +35,23 @@ def area_classes(**tags):
 
 def test_every_class_that_the_benchmark_promises_is_there():
     assert set(load_taxonomy().names) >= WANTED
+
+
+def test_every_class_is_drawn_and_has_the_errors_of_a_detector():
+    names = set(load_taxonomy().names)
+    assert set(PAINT_ORDER) == names, "PAINT_ORDER in regions/preview.py: docs/howto/class.md"
+    assert set(ERRORS) == names, "ERRORS in tasks/perturbations/perception.py: docs/howto/class.md"
+
+
+def test_no_tag_makes_two_classes_of_one_geometry():
+    rules = [(item.name, rule) for item in load_taxonomy().classes for rule in item.rules]
+    tags = [
+        (rule.key, value, rule.geometry, name) for name, rule in rules for value in {*(rule.values or ()), *rule.widths}
+    ]
+    by_tag = {}
+    for *tag, name in tags:
+        by_tag.setdefault(tuple(tag), []).append(name)
+    assert {tag: names for tag, names in by_tag.items() if len(names) > 1} == {}
 
 
 @pytest.mark.parametrize(

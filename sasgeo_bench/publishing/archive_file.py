@@ -82,7 +82,7 @@ class TaskFolders:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredRun:
-    """One run: what `run.json` is to say, its answers, and the text that was learnt for it, if any."""
+    """One run: content of `run.json`, its answers, and the file that was learned for it, if any."""
 
     about: Mapping[str, Any]
     predictions: Sequence[Prediction]
@@ -109,35 +109,12 @@ def write_pack(
     lacks: str = "",
     most_bytes: int = MOST_BYTES,
 ) -> Packed:
-    """Store a board with what it was made of, whole or not at all.
+    """Store a board with what it was made of, whole or not at all; older results in `folder` are replaced.
 
-    Parameters
-    ----------
-    folder : Path
-        To write; older results there are replaced.
-    board : Path
-        Folder of the board.
-    tasks : sequence of TaskFolders
-        All that were scored, in the order they were.
-    runs : mapping of str to sequence of StoredRun
-        By contestant, in the order they were read.
-    settings : mapping
-        How it was scored.
-    lacks : str
-        What stored results it was made of had left out already.
-    most_bytes : int
-        Of all files together. What is larger is written without heading and scale of the poses beside the first.
-
-    Returns
-    -------
-    Packed
-        How large it is.
-
-    Raises
-    ------
-    StoreError
-        If it would be larger all the same, the folder holds something else, or a file cannot be read or written; what
-        was there before is as it was.
+    `tasks` are all that were scored and `runs` those of each contestant, in the order they were read. `lacks` states
+    what the stored results it was made of had left out already. If the files would exceed `most_bytes`, heading and
+    scale of all poses of an answer but the first are left out. Raise `StoreError` if the result is still too large, the
+    folder holds something else, or a file cannot be read or written; what was there before stays as it was.
     """
     check_replaced(folder)
     folder = resolve_link(folder)
@@ -180,7 +157,7 @@ def _copy_tables(board: Path, folder: Path) -> None:
 
 
 def _with(dropped: str, more: str) -> str:
-    """Return what was left out with one more item, each once."""
+    """Add an item to what was left out, each once."""
     return _AND.join(dict.fromkeys(filter(None, (*dropped.split(_AND), more))))
 
 
@@ -224,7 +201,7 @@ def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TE
 
 
 def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
-    """Tasks without what was seen, and their truths."""
+    """Write tasks without their views, and their truths."""
     said, queries, truths = [], [], []
     for number, item in enumerate(tasks):
         region = item.region / MANIFEST
@@ -253,7 +230,7 @@ def _numbered(table: pa.Table, number: int) -> pa.Table:
 
 
 def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
-    """Write what each run says, with what was learnt for it."""
+    """Write the record of each run, with what was learned for it."""
     rows = [
         {
             "contestant": name,
@@ -285,7 +262,7 @@ def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *,
 
 
 def _lean(item: Prediction) -> Prediction:
-    """An answer whose poses all have the heading and scale of the first."""
+    """Give all poses of an answer the heading and scale of the first."""
     if not item.candidates:
         return item
     first = item.candidates[0][0]
@@ -317,19 +294,9 @@ class Unpacked:
 
 
 def unpack(folder: Path, into: Path) -> Unpacked:
-    """Lay stored results out as tasks/, truth/, regions/ and runs/, as they are scored.
+    """Lay stored results out in an empty folder as tasks/, truth/, regions/ and runs/, as they are scored.
 
-    Parameters
-    ----------
-    folder : Path
-        From `write_pack`.
-    into : Path
-        An empty folder.
-
-    Raises
-    ------
-    StoreError
-        If the results are damaged.
+    Raise `StoreError` if the results are damaged.
     """
     with sound(folder):
         read_settings(folder)
@@ -343,13 +310,7 @@ def unpack(folder: Path, into: Path) -> Unpacked:
 
 
 def read_stored_predictions(folder: Path, matcher: str) -> list[Prediction]:
-    """Read the answers of one matcher from stored results.
-
-    Raises
-    ------
-    StoreError
-        If the results are damaged, or hold no answer of it.
-    """
+    """Read the answers of one matcher from stored results; raise `StoreError` if damaged or without any."""
     with sound(folder):
         table = _read_predictions(folder, _read_runs(folder))
         found = predictions_of(table.filter(pc.equal(table[MATCHER], matcher)))
@@ -360,24 +321,9 @@ def read_stored_predictions(folder: Path, matcher: str) -> list[Prediction]:
 
 
 def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
-    """Lay the tasks of stored results out, with their maps' `region.json` and truths, and no answers.
+    """Lay the tasks of stored results out in an empty folder, with `region.json` of their maps and truths; return them.
 
-    Parameters
-    ----------
-    folder : Path
-        From `write_pack`.
-    into : Path
-        An empty folder.
-
-    Returns
-    -------
-    tuple of Path
-        Task folders.
-
-    Raises
-    ------
-    StoreError
-        If the results are damaged.
+    Raise `StoreError` if the results are damaged.
     """
     with sound(folder):
         read_settings(folder)
@@ -406,7 +352,7 @@ def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
 
 
 def _parts_of(table: pa.Table) -> dict[int, pa.Table]:
-    """Rows of each task, which lie together."""
+    """Return the rows of each task, which lie together."""
     numbers, starts, counts = np.unique(table[TASK].to_numpy(), return_index=True, return_counts=True)
     plain = table.drop_columns([TASK])
     return {
@@ -422,7 +368,7 @@ def _folder_name(name: str) -> str:
 
 
 def _read_runs(folder: Path) -> pa.Table:
-    """Read what each run says, with what was learnt for it; results of the former layout keep that in files."""
+    """Read the record of each run, with what was learned for it; results of the former layout keep that in files."""
     runs = read_table(folder / RUNS, mend=_MEND)
     if (folder / PREDICTIONS).is_file():
         return runs

@@ -54,32 +54,10 @@ def publish(
 ) -> Written:
     """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
 
-    Parameters
-    ----------
-    board : Path
-        Folder of a board, or of stored results.
-    into : Path, optional
-        Folder to write; `site` in the board's own without.
-    tell : callable
-        Gets a line now and then.
-    root : Path
-        Where regions/, tasks/ and truth/ may be: stored results hold no views, and have the pictures of those here.
-    jobs : int
-        Processes that score stored results.
-    progress : Progress, optional
-        Shows how far scoring is; lines by `tell` unless given.
-
-    Returns
-    -------
-    Written
-        Where it is, and how large.
-
-    Raises
-    ------
-    StoreError
-        If there is no sound board, or the site cannot be written; an older site is then as it was.
-    ConfigError
-        If the board is of a private seed.
+    `into` is the folder to write, by default `site` in the board's own. Pictures of stored results, which hold no
+    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score, `progress` shows
+    how far they are (lines by `tell` by default). Raise `StoreError` if there is no sound board or the site cannot be
+    written, and an older site then stays as it was; `ConfigError` if the board is of a private seed.
     """
     if into is None and (board / SITE).is_symlink():
         message = f"{board / SITE} is a link: name where it leads with --into"
@@ -130,7 +108,7 @@ def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Prog
 
 @contextmanager
 def _sound(board: Path) -> Iterator[None]:
-    """Tell what is wrong with a board that anybody may have made: its tables, or values that no page can show."""
+    """Turn errors in tables or values of a board, which anybody may have made, into a `StoreError` that names it."""
     try:
         yield
     except StoreError as error:
@@ -143,7 +121,7 @@ def _sound(board: Path) -> Iterator[None]:
 
 
 def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:
-    """All that pages are made of, and the figures that are drawn for them."""
+    """Return the content of all pages, and the figures that are drawn for them."""
     about, name = files.about, _name_of(files)
     spec = _pipeline_of(about)
     spots, parts = _spots(), _parts(about)
@@ -195,7 +173,7 @@ def _name_of(files: BoardFiles) -> str:
 
 
 def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
-    """The shipped pipeline that a board was made by; None of any other, even of the same name."""
+    """Return the shipped pipeline that a board was made by; None for any other, even of the same name."""
     said = about.get("pipeline")
     if not said:
         return None
@@ -207,7 +185,7 @@ def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
 
 
 def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast, ...]:
-    """Contrasts as they were registered: as the board says, its stored settings, or its pipeline."""
+    """Return contrasts as registered: from the board, its stored settings, or its pipeline."""
     said = files.about.get("contrasts") or files.settings.get("contrasts")
     if said is None:
         said = [] if spec is None else [item.model_dump(exclude={"why"}) for item in spec.contrast]
@@ -238,7 +216,7 @@ def _spots() -> dict[str, Spot]:
 
 
 def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """By region its place, and its half or part, of a shipped split; nothing of another one."""
+    """Return, by region of a shipped split, its place and its half or part; nothing for another split."""
     try:
         spec = read_split_file(find_split_file(str(about.get("split") or "")))
     except ConfigError:

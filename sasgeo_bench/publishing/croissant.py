@@ -84,15 +84,7 @@ FEATURE_TEXTS: Final = {
 
 
 def shown(texts: dict[str, str]) -> str:
-    """Return a table of columns in Markdown.
-
-    Examples
-    --------
-    >>> print(shown({"a": "first"}))
-    | Column | What |
-    |---|---|
-    | `a` | first |
-    """
+    """Return a table of columns in Markdown."""
     return "\n".join(("| Column | What |", "|---|---|", *(f"| `{name}` | {text} |" for name, text in texts.items())))
 
 
@@ -137,15 +129,7 @@ _TYPES: Final = (
 
 
 def write_croissant(folder: Path, release: Release) -> None:
-    """Write the metadata.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the release, its data written.
-    release : Release
-        What is in it, sizes and hashes of its files included.
-    """
+    """Write the metadata of a release whose data is written, sizes and hashes of its files included."""
     import mlcroissant as mlc  # noqa: PLC0415 - an extra: only whoever writes a release needs it
 
     versions = type(mlc.Context().conforms_to)  # the package shows it nowhere else
@@ -257,7 +241,7 @@ def _record_set(table: _Table) -> "mlc.RecordSet":
 
 
 def _map_field(table: _Table) -> "mlc.Field":
-    """The map that a row is of, which its file's path alone says."""
+    """Return the column with the map of a row, which only the path of its file states."""
     import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
 
     return mlc.Field(
@@ -303,5 +287,5 @@ def _source(table: _Table, column: str, *, within: str | None = None) -> "mlc.So
 
 
 def _type(kind: pa.DataType) -> str:
-    """Croissant's type of a column."""
+    """Return Croissant's type of a column."""
     return next((name for is_it, name in _TYPES if is_it(kind)), f"{_SCHEMA_ORG}Text")

@@ -18,18 +18,7 @@ _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"),
 
 
 def card_text(release: Release) -> str:
-    """Write the card.
-
-    Parameters
-    ----------
-    release : Release
-        What is in the release.
-
-    Returns
-    -------
-    str
-        Markdown after a YAML head.
-    """
+    """Return the card: Markdown after a YAML head."""
     parts = (
         "\n".join(("---", *_head(release), "---")),
         _opening(release),
@@ -250,18 +239,7 @@ _M2_PER_KM2: Final = 1e6
 
 
 def datasheet_text(release: Release) -> str:
-    """Write the datasheet, its numbers counted from the release itself.
-
-    Parameters
-    ----------
-    release : Release
-        What is in the release.
-
-    Returns
-    -------
-    str
-        Markdown.
-    """
+    """Return the datasheet in Markdown, its numbers counted from the release itself."""
     opening = f"""\
 # Datasheet of sasgeo-bench, dataset release {release.version}
 
@@ -336,7 +314,7 @@ kept; names and ids of the accounts that edited them are not."""
 
 
 def _area_km2(release: Release) -> float:
-    """Ground of all regions, each counted once whatever the number of its maps."""
+    """Return the ground of all regions, each counted once whatever the number of its maps."""
     areas = {
         item.region: item.manifest.rows * item.manifest.cols * item.manifest.cell_size_m**2 / _M2_PER_KM2
         for item in release.maps

@@ -40,8 +40,8 @@ class ContrastSummary:
     """A registered contrast in plain words.
 
     `outcome` is one of `OUTCOMES`; the cause of a gain is open where the falsifiers of the contrast gain, too.
-    `unstressed` says how both fare where they should not differ, empty where nobody looked; `bar` spans from -`reach`
-    to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
+    `unstressed` compares both where they should not differ, empty if nothing was measured there; `bar` spans from
+    -`reach` to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
     """
 
     name: str
@@ -58,7 +58,7 @@ class ContrastSummary:
 
 
 def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
-    """Registered contrasts, what is decided first."""
+    """Return registered contrasts, decided ones first."""
     records = [{str(name): value for name, value in row.items()} for row in source.contrasts.to_dict("records")]
     ends = [abs(float(row[name])) for row in records for name in ("lo", "hi", "difference")]
     reach = max((end for end in ends if math.isfinite(end)), default=1.0) or 1.0
@@ -102,7 +102,7 @@ def _headline(row: Record, verdict: str, outcome: str) -> str:
 
 
 def _sentence(row: Record, least: float) -> str:
-    """Return the difference with its interval, in words that say which way is good."""
+    """Return the difference with its interval, in words that state which direction is good."""
     if not int(row["n"]):
         return "No query of this board counts for it."
     difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
@@ -196,17 +196,9 @@ class Group:
 
 
 def site_pages(source: SiteSource) -> dict[str, str]:
-    """All pages of a site with its style and script, by file name.
+    """Return all pages of a site with its style and script, by file name.
 
-    Parameters
-    ----------
-    source : SiteSource
-        The board and all that is shown with it.
-
-    Returns
-    -------
-    dict of str to str
-        No page names another host but as a link, and each can be read without the script.
+    Pages refer to other hosts only by links, and each can be read without the script.
     """
     templates = _environment()
     book = Book.of(source.board, source.about, source.scores)
@@ -318,15 +310,7 @@ def _counts(source: SiteSource, book: Book) -> dict[str, int]:
 
 
 def groups_of(cases: Sequence[Case]) -> tuple[Group, ...]:
-    """Failures by class, numbered through from 1.
-
-    Examples
-    --------
-    >>> said = {"query_id": "q", "matcher": "m", "file": "a.png", "alt": ""}
-    >>> cases = [Case(failure=name, **said) for name in ("other", "occluded", "aliased")]
-    >>> [(group.title, group.cases[0][0]) for group in groups_of(cases)]
-    [('aliased', 1), ('occluded', 2), ('other', 3)]
-    """
+    """Return failures by class, numbered through from 1."""
     counts = Counter(case.failure for case in cases)
     names = [name for name in FAILURES if name in counts]
     names += sorted(set(counts) - set(names))

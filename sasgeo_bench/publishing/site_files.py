@@ -48,14 +48,8 @@ _WITHIN: Final = re.compile(r"#|data:image/(png|jpeg|webp);base64,")
 def svg_fault(text: str) -> str | None:
     """Return what an SVG holds that a figure does not need: scripts, event handlers, links; None if nothing.
 
-    Raises
-    ------
-    ValueError
-        If it is no XML.
+    Raise `ValueError` if it is no XML.
 
-    Examples
-    --------
-    >>> svg_fault('<svg xmlns="http://www.w3.org/2000/svg"><path d="M 0 0"/></svg>')
     >>> svg_fault('<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)"/>')
     'an attribute onload'
     """
@@ -115,7 +109,7 @@ _HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTAL
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drawn:
-    """An SVG: its text, and what it says of its title and size in points."""
+    """An SVG: its text, its title, and its size in points."""
 
     text: str
     title: str
@@ -124,10 +118,8 @@ class Drawn:
 
     @classmethod
     def of(cls, text: str, name: str) -> "Drawn":
-        """Of the text of a figure; one without a title has its name.
+        """Read title and size of the text of a figure; one without a title gets its name.
 
-        Examples
-        --------
         >>> drawn = Drawn.of('<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>', "mine")
         >>> drawn.title, drawn.width, drawn.height
         ('A & B', 90.0, 45.0)
@@ -144,8 +136,8 @@ class BoardFiles:
     """Files of a board's folder that a site shows.
 
     `tables` are contrasts, controls, scores and protection, empty where there is none; `figures` by file name;
-    `downloads` the bytes to be offered, by file name, with what each is; `pictures` what `pictures.json` says;
-    `settings` how stored results were scored, empty of a board that is not stored.
+    `downloads` the bytes that are offered, by file name, with a description; `pictures` the content of `pictures.json`;
+    `settings` those that stored results were scored with, empty for a board that is not stored.
     """
 
     folder: Path
@@ -161,10 +153,7 @@ class BoardFiles:
 def read_board_files(folder: Path) -> BoardFiles:
     """Read a board, or stored results, for its site.
 
-    Raises
-    ------
-    StoreError
-        If there is no board, or a file of it is damaged, a link, or a figure that does more than draw.
+    Raise `StoreError` if there is no board, or a file of it is damaged, a link, or a figure that does more than draw.
     """
     with _sound(folder):
         list_files(folder, without=SITE_FOLDERS)
@@ -202,7 +191,7 @@ def _read_table(path: Path) -> pd.DataFrame:
 
 
 def _plain_or_packed(path: Path) -> bytes | None:
-    """Bytes of a file, or of its .gz unpacked; None where there is neither."""
+    """Return the bytes of a file, or of its .gz unpacked; None where there is neither."""
     packed = path.with_name(f"{path.name}.gz")
     if path.is_file():
         return path.read_bytes()
@@ -210,7 +199,7 @@ def _plain_or_packed(path: Path) -> bytes | None:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Text of a .gz, as much as anything of ours holds."""
+    """Unpack a .gz of limited size."""
     try:
         with gzip.open(path) as source:
             data = source.read(_MOST_UNPACKED + 1)
@@ -276,7 +265,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def _check_picture(folder: Path, name: str) -> None:
-    """Refuse a picture that is none, is missing, or lies elsewhere."""
+    """Refuse a file that is no picture, is missing, or lies outside the folder."""
     path = folder / name
     is_inside = path.resolve().is_relative_to(folder.resolve()) and not Path(name).is_absolute()
     if not is_inside or path.suffix.lower() not in IMAGES or not path.is_file():
@@ -297,25 +286,16 @@ class Written:
     pages: int
 
     def to_text(self) -> str:
-        """In a line.
-
-        Examples
-        --------
-        >>> Written(folder=Path("site"), site_bytes=1_200_000, picture_bytes=0, pages=12).to_text()
-        'site: 12 pages, 1.20 MB and 0.00 MB of pictures'
-        """
+        """Return folder and sizes in one line."""
         sizes = f"{self.site_bytes / 1e6:.2f} MB and {self.picture_bytes / 1e6:.2f} MB of pictures"
         return f"{self.folder}: {self.pages} pages, {sizes}"
 
 
 @contextmanager
 def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
-    """Hold a board, and the site that is made of it: nobody else writes either of them meanwhile.
+    """Lock a board and its site against other writers.
 
-    Raises
-    ------
-    StoreError
-        If there is no board, or the target holds something that is no site.
+    Raise `StoreError` if there is no board, or the target holds something that is no site.
     """
     if not (folder / BOARD).is_file():
         message = f"{folder} holds no board ({BOARD}): name the folder of one, as out/boards/demo"
@@ -330,13 +310,7 @@ def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator
 
 
 def check_target(target: Path) -> None:
-    """Refuse a folder that a site cannot take the place of.
-
-    Raises
-    ------
-    StoreError
-        If it is a file, or holds something and is no site, or one with files of somebody else.
-    """
+    """Raise `StoreError` if a site cannot replace a folder: a file, no site, or one with foreign files."""
     if target.exists() and not target.is_dir():
         message = f"{target} is a file: move it away, or name another folder"
         raise StoreError(message)
@@ -354,25 +328,11 @@ def write_site(
     drawn: Mapping[str, str],
     about: Mapping[str, Any],
 ) -> Written:
-    """Write a site, whole or not at all.
+    """Write a site, whole or not at all; an older one in the target folder is replaced.
 
-    Parameters
-    ----------
-    target : Path
-        Folder of the site; an older one there is replaced.
-    board : BoardFiles
-        Whose figures, downloads and pictures go with it.
-    pages : mapping of str to str
-        File name -> text: pages, style and script.
-    drawn : mapping of str to str
-        More figures, by file name.
-    about : mapping
-        What `site.json` says.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be written; an older site is then as it was.
+    `pages` are the texts of pages, style and script by file name, `drawn` further figures, `about` further content of
+    `site.json`; figures, downloads and pictures come from the board. Raise `StoreError` if the site cannot be written;
+    an older site then stays as it was.
     """
     check_target(target)
     named = {str(item["file"]) for listed in board.pictures.values() for item in listed}
@@ -410,7 +370,7 @@ def _put(path: Path, data: bytes) -> None:
 
 
 def draw_text(draw: Callable[[Path], None], folder: Path) -> str:
-    """Text of an SVG that a function draws into a path; the folder is scratch."""
+    """Return the text of an SVG that a function draws into a path in a scratch folder."""
     path = folder / "drawn.svg"
     draw(path)
     return path.read_text(encoding="utf-8")

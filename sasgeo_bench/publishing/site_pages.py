@@ -46,13 +46,7 @@ KINDS: Final = {  # of figures, by how their names begin, in the order they are 
 
 
 def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]]:
-    """Figures under the titles of their kinds.
-
-    Examples
-    --------
-    >>> figures_by_kind([SiteFigure(file="age-real-age.svg", title="", width=1, height=1)]).keys()
-    dict_keys(['Success against the age of the map'])
-    """
+    """Return figures under the titles of their kinds."""
     found: dict[str, list[SiteFigure]] = {}
     for kind, title in (*KINDS.items(), ("", "Other figures")):
         mine = [item for item in figures if _kind_of(item) == kind]
@@ -67,7 +61,7 @@ def _kind_of(figure: SiteFigure) -> str:
 
 
 def _groups(book: Book) -> dict[tuple[str, str], list[Key]]:
-    """Keys of the board by track and prior group."""
+    """Return keys of the board by track and prior group."""
     found: dict[tuple[str, str], list[Key]] = {}
     for key in book.matchers:
         found.setdefault(key[1:], []).append(key)
@@ -118,7 +112,7 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherPage:
-    """A contestant: what it says of itself, how it fared, what it cannot do, what it costs."""
+    """A contestant: its card, results, limits and costs."""
 
     name: str
     page: str
@@ -166,7 +160,7 @@ def _trained(said: object) -> str:
 
 
 def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the training of an entry by the runner, and the regions it was asked on so: tasks are hundreds."""
+    """Yield the training of an entry by the runner, and the regions it was then tested on: tasks are hundreds."""
     for one in entry.get("learned") or ():
         verb = "Learnt" if one["file"] else "Could not learn"
         regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
@@ -241,7 +235,7 @@ def _costs_of(book: Book, name: str) -> Iterator[tuple[str, str, str]]:
 
 
 def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
-    """Return how protection levels fared at one alert limit, a table for each prior group."""
+    """Return the results of protection levels at one alert limit, a table for each prior group."""
     if not len(protection):
         return ()
     limits = sorted(set(protection["alert_limit_m"]))
@@ -275,7 +269,7 @@ def _share_cell(row: Mapping[Any, Any], area: str) -> Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceOnMap:
-    """A place of the board: its number on the map, where it lies, and the half or part that it belongs to."""
+    """A place of the board: its number on the map, its position, and the half or part that it belongs to."""
 
     number: int
     name: str
@@ -286,10 +280,8 @@ class PlaceOnMap:
 
 
 def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
-    """Tasks of a board by region, whatever date or copy of it they search.
+    """Return the tasks of a board by region, whatever date or copy of it they search.
 
-    Examples
-    --------
     >>> list(regions_of({"tasks": [{"region": "vaduz@2015-07-27"}, {"region": "vaduz+alias"}]}))
     ['vaduz']
     """
@@ -302,7 +294,7 @@ def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
 def places_on_map(
     about: Mapping[str, Any], spots: Mapping[str, Spot], parts: Mapping[str, tuple[str, str]]
 ) -> tuple[PlaceOnMap, ...]:
-    """Places of a board that are known to lie somewhere, numbered; of several regions the middle."""
+    """Return the places of a board with known positions, numbered; the middle of several regions."""
     by_place: dict[str, list[Spot]] = {}
     for region in (name for name in regions_of(about) if name in spots):
         by_place.setdefault(parts.get(region, (region, ""))[0], []).append(spots[region])
@@ -321,7 +313,7 @@ def places_on_map(
 
 
 def region_table(source: SiteSource) -> Table:
-    """Every region of the board, where it lies and what was drawn there."""
+    """Return a table of every region of the board, its position and what was drawn there."""
     numbers = {item.name: item.number for item in places_on_map(source.about, source.spots, source.parts)}
     rows = []
     for region, tasks in regions_of(source.about).items():
@@ -353,7 +345,7 @@ def region_table(source: SiteSource) -> Table:
 
 
 def rate_table(book: RateBook) -> Table:
-    """Measured yearly rates with their intervals, a class of a place a line."""
+    """Return measured yearly rates with their intervals, a row for each class of a place."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     rows = [
         Row(

@@ -37,7 +37,7 @@ _LEFT_OUT: Final = (_VERDICT, "told_hpl_")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One query that a matcher failed on, with what is said of it by name."""
+    """One query that a matcher failed on, with facts about it by name."""
 
     query_id: str
     matcher: str
@@ -52,8 +52,6 @@ class Case:
     def lines(self) -> dict[str, str]:
         """Return the facts of a case for a page: a line for each rejector, without protection levels.
 
-        Examples
-        --------
         >>> said = {"error_m": "9", "p_false_own": "0.9", "accepted_own": "no", "told_hpl_gauss_0.01_m": "4"}
         >>> Case(query_id="q", matcher="m", failure="aged", file="a.webp", alt="", said=said).lines()
         {'error_m': '9', 'own': 'P(false) 0.9, withheld'}
@@ -93,7 +91,7 @@ class Spot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Download:
-    """A file that the site offers: name, bytes as they are to be fetched, and what is in it."""
+    """A file that the site offers: name, size as downloaded, and content."""
 
     file: str
     size_bytes: int
@@ -102,32 +100,11 @@ class Download:
 
 @dataclass(frozen=True, kw_only=True)
 class SiteSource:
-    """All that the pages of a site are made of.
+    """Content of all pages of a site; a table that the board lacks is empty.
 
-    Parameters
-    ----------
-    name, title : str
-        Of the board; the title is that of its pipeline where it is known.
-    about : mapping
-        What `board.json` says.
-    board, contrasts, falsifiers, controls, scores, protection : pandas.DataFrame
-        Its tables; empty where it has none.
-    registered : tuple of Contrast
-        As they were registered, where that is known.
-    reasons : mapping of str to str
-        Name of a contrast -> why it was registered.
-    figures, downloads : tuple
-        Files beside the pages.
-    pictures : Pictures
-        Previews, examples and failures.
-    spots : mapping of str to Spot
-        By region; of some regions nobody knows where they lie.
-    parts : mapping of str to (str, str)
-        By region: place, and half or part of the split.
-    rates : RateBook
-        Measured ageing.
-    rates_figure, map_figure : SiteFigure, optional
-        Of the rates and of the places, where they are drawn.
+    `title` is that of the board's pipeline where it is known, `about` the content of `board.json`. `reasons` states why
+    each contrast was registered. `spots` are positions of regions, as far as they are known; `parts` holds place, and
+    half or part of the split, of each region; `rates` is measured ageing.
     """
 
     name: str

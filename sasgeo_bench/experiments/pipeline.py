@@ -48,7 +48,7 @@ MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is co
 class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
-    With a private seed all is below `out`, which then is the root of private runs.
+    With a private seed, `out` is the root of private runs.
     """
 
     spec: PipelineFile
@@ -62,10 +62,7 @@ class PipelinePlan:
     def to_text(self) -> str:
         """Return which parts of each stage are up to date; every matcher is loaded to find out.
 
-        Raises
-        ------
-        MatchError, StoreError
-            As the run would.
+        Raise `MatchError` or `StoreError` as the run would.
         """
         queries, controls = _stage("queries", self.requests), _stage("controls", self.controls)
         stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
@@ -85,13 +82,13 @@ class PipelinePlan:
 
     @property
     def matchers(self) -> tuple[str, ...]:
-        """Those of the file, and those that every board has."""
+        """Return the matchers of the file, and those of every board."""
         return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Lacking:
-    """A task that is to be drawn, and why."""
+    """A task to be drawn, and why."""
 
     suite: str
     region: str
@@ -100,14 +97,14 @@ class _Lacking:
 
 @dataclass(frozen=True, kw_only=True)
 class _Stage:
-    """Tasks of one kind: folders of those that are up to date, request by request, and what is to be drawn."""
+    """Tasks of one kind: folders of those that are up to date, request by request, and tasks to be drawn."""
 
     name: str
     made: tuple[tuple[Path, ...], ...]
     lacking: tuple[_Lacking, ...]
 
     def lines(self) -> list[str]:
-        """How many are up to date, why the others are not, and the first of these by name."""
+        """Report how many are up to date, why the others are not, and the first of these by name."""
         state = f"{len(self.made)} of {counted(len(self.made) + len(self.lacking), 'task')} up to date"
         if self.lacking:
             reasons = Counter(item.why for item in self.lacking)
@@ -158,7 +155,7 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
 
 
 def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -> list[str]:
-    """By matcher what is answered and what is to be asked, and what answers lie with tasks that are drawn anew."""
+    """Report, by matcher, answered and open queries, and answers to tasks that are drawn anew."""
     asked = [(spec, list(stages)) for spec in plan.matchers]
     asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
     lines, all_done, all_left, all_behind = [], 0, 0, 0
@@ -214,13 +211,8 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
     `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
     serve regions that are not built yet, and files of one's own. `jobs` counts the processes of each matcher, `dask`
     names a cluster to run on instead. `private` draws all queries instead of the file's seed, below `out/private`.
-
-    Raises
-    ------
-    ConfigError
-        If a suite, region or split is unknown, or no region can be built here.
-    MatchError
-        If no installed package has a matcher or a rejector of a name.
+    Raise `ConfigError` if a suite, region or split is unknown, or no region can be built here; `MatchError` if no
+    installed package has a matcher or a rejector of a name.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
     out, seed = root_of(out, private), private or spec.seed
@@ -284,35 +276,12 @@ def run_pipeline(
     has_cases: bool = True,
     private: Path | None = None,
 ) -> Board:
-    """Draw what is missing, run what has no row, score all of it and write the board.
+    """Draw what is missing, run queries without a row, score all of it, and write the board to out/boards/<id>/.
 
-    Parameters
-    ----------
-    plan : PipelinePlan
-        From `plan_pipeline`.
-    tell : callable
-        Gets a line for every step.
-    progress : Progress, optional
-        Is told of every answer.
-    results : Path, optional
-        Folder to store the board in, with the answers and truths it was made of, as <id>/.
-    has_cases : bool
-        Whether the board shows queries that went wrong, with their truths.
-    private : Path, optional
-        The board of a private seed of this pipeline, which the rows are held against.
-
-    Returns
-    -------
-    Board
-        As it was written to out/boards/<id>/.
-
-    Raises
-    ------
-    ConfigError
-        If no region can carry any of the suites.
-    StoreError
-        If the board cannot be stored where it should, before anything is done; or as `archive.pack_board` does, when
-        the board itself is written.
+    `results` is a folder to store the board in, with the answers and truths it was made of, as <id>/. `has_cases` shows
+    failed queries with their truths on the board. `private` is the board of a private seed of this pipeline, which the
+    rows are compared with. Raise `ConfigError` if no region can carry any of the suites; `StoreError` if the board
+    cannot be stored in `results`, before anything is done, or as `pack_board` does after the board is written.
     """
     if results is not None:
         check_results(results / plan.spec.id, board_folder(plan))
@@ -360,20 +329,20 @@ def run_pipeline(
 
 @dataclass(frozen=True, kw_only=True)
 class _Go:
-    """One run of a matcher; one that learns has one for each half, and its name says which."""
+    """One run of a matcher; a matcher that learns has one for each half, which its name states."""
 
     name: str
     plan: RunPlan
 
     def lines(self) -> list[str]:
-        """What is learnt for it."""
+        """Report the training for it."""
         if self.name and self.plan.lesson is None:
             return ["nothing to learn from, asked untaught"]
         return self.plan.lesson_lines()
 
 
 def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) -> list[Path]:
-    """Folders of the runs of one matcher, after whatever had no row was asked."""
+    """Run one matcher on all queries without a row, and return the folders of its runs."""
     folders: list[Path] = []
     for go in goes:
         left, done = _count([go])
@@ -387,13 +356,13 @@ def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) 
 
 
 def _count(goes: Sequence[_Go]) -> tuple[int, int]:
-    """Queries to ask, and those that are answered."""
+    """Count open and answered queries."""
     parts = [part for go in goes for part in go.plan.parts]
     return sum(len(part.left) for part in parts), sum(part.done for part in parts)
 
 
 def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
-    """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other.
+    """Plan the runs of a matcher: one, or with learning one for each half after learning from the other.
 
     An oracle learns from the half itself.
     """
@@ -442,7 +411,7 @@ def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
 
 
 def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
-    """The half of a task's region, in the pipeline's split or else in that of the controls; None for the paper's."""
+    """Return the half of a task's region in the split of the pipeline or else of the controls; None for the paper."""
     region = base_of(task.name)
     for request in (*plan.requests[:1], *plan.controls[:1]):
         for place in request.split.places_in(region):
@@ -466,7 +435,7 @@ def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest
 
 
 def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
-    """Task folders of every request that a region carries; those that are up to date are left as they are."""
+    """Draw every request that a region carries, unless it is up to date, and return the task folders."""
     tasks: list[Path] = []
     lacking: list[str] = []
     for drawn in carry_out(requests, jobs=jobs):
@@ -482,7 +451,7 @@ def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
 
 
 def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
-    """Task folders of every seed of the paper's experiment; those that are up to date are left as they are."""
+    """Draw every seed of the paper's experiment, unless it is up to date, and return the task folders."""
     paper = plan.spec.paper
     if paper is None:
         return []

@@ -40,18 +40,10 @@ _LEAST_P: Final = 0.001
 def paper_markdown(
     summary: pd.DataFrame, findings: Sequence[Finding], about: Mapping[str, str], figures: Mapping[str, str]
 ) -> str:
-    """The summary as a document.
+    """Return the summary as a document in Markdown.
 
-    Parameters
-    ----------
-    summary : pandas.DataFrame
-        From `summary_frame`.
-    findings : sequence of Finding
-        Contrasts of this suite.
-    about : mapping
-        "trials" in words, "made_by" and "data".
-    figures : mapping of str to str
-        File -> caption.
+    `summary` is from `summary_frame`, `findings` are contrasts of this suite, `about` holds "trials" in words,
+    "made_by" and "data", `figures` the caption of each file.
     """
     known = [item.matcher for item in PUBLISHED if item.matcher in set(summary["matcher"])]
     others = [name for name in dict.fromkeys(summary["matcher"]) if name not in known]
@@ -90,7 +82,7 @@ def _interval_note(summary: pd.DataFrame) -> str:
 
 
 def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
-    """Return a matcher a line: each figure of the paper and ours; of Recall@1 the other interval too."""
+    """Return a row for each matcher: each figure of the paper and ours; for Recall@1 the other interval too."""
     rows = []
     for matcher in matchers:
         mine = _by_metric(summary, matcher)
@@ -109,7 +101,7 @@ def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
 
 
 def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]:
-    """Rows of one matcher."""
+    """Return the rows of one matcher by metric."""
     rows = summary[summary["matcher"] == matcher].to_dict("records")
     return {str(row["metric"]): {str(name): value for name, value in row.items()} for row in rows}
 
@@ -117,8 +109,6 @@ def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]
 def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
     """Return a figure as the paper prints it.
 
-    Examples
-    --------
     >>> shown(0.586, 0.52, 0.649), shown(1.0)
     ('0.586 [0.520, 0.649]', '1.000')
     """
@@ -152,7 +142,7 @@ def _difference(row: Mapping[str, Any]) -> str:
 
 
 def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
-    """Consecutive variants: the paper's difference in Recall@1 and ours, paired."""
+    """Compare consecutive variants: the paper's difference in Recall@1 and ours, paired."""
     rows = []
     for before, after in pairwise(PUBLISHED):
         one = next((item for item in findings if (item.first, item.second) == (after.matcher, before.matcher)), None)
@@ -181,15 +171,7 @@ CAPTIONS: Final = {
 
 
 def paper_extra(board: Board, *, root: Path) -> Extra:
-    """Table beside the paper's, all trials, and figures.
-
-    Parameters
-    ----------
-    board : Board
-        With the paper's trials among what was scored.
-    root : Path
-        Where tasks/, truth/ and regions/ are.
-    """
+    """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
     scores = {name: frame[frame["suite"] == SUITE].reset_index(drop=True) for name, frame in board.scores.items()}
     regions = [str(about["region"]) for about in board.tasks if about["suite"] == SUITE]
     truths = {region: list(task_files.read_truths(root / "truth" / SUITE / region)) for region in regions}
@@ -232,7 +214,7 @@ def _example(region: str, truths: list[Truth], root: Path) -> Panel:
 
 
 def _ablation(summary: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the ablation: over seeds where there are several, else as if trials were independent."""
+    """Return the rows of the ablation: over seeds where there are several, else as if trials were independent."""
     rows = summary[(summary["metric"] == "recall_1") & ~summary["matcher"].map(is_unranked) & summary["value"].notna()]
     if (rows["cluster"] == "tile").all():
         return rows.assign(how="Wilson's 95 % intervals, trials taken for independent")

@@ -67,17 +67,7 @@ def _wrapped(title: str) -> str:
 
 
 def draw_example(path: Path, panel: Panel, *, data: str) -> None:
-    """Draw one trial: the view, which of its cells are known, the map at the true place and at the hardest decoy.
-
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    panel : Panel
-        From `panels.panels`.
-    data : str
-        Where the data are from.
-    """
+    """Draw one trial: the view, which of its cells are known, the map at the true place and at the hardest decoy."""
     query, done = panel.query, panel.truth.measured
     rows, cols = query.evidence.shape
     note = (
@@ -110,7 +100,7 @@ def draw_example(path: Path, panel: Panel, *, data: str) -> None:
 
 
 def _mask(evidence: Evidence) -> NDArray[np.float64]:
-    """White where any class is known, else the grey of what is hidden."""
+    """Return white where any class is known, else the grey of hidden cells."""
     known = (evidence.cells != UNKNOWN).any(axis=0)[..., None]
     white, grey = (np.array(mpl.colors.to_rgb(name)) for name in (_SEEN, HIDDEN))
     return np.asarray(np.where(known, white, grey))
@@ -129,19 +119,10 @@ def _class_keys(evidence: Evidence) -> list[Patch]:
 
 
 def draw_ablation(path: Path, summary: pd.DataFrame, *, chance: float, data: str) -> None:
-    """Draw Recall@1 of each variant beside the paper's, with intervals.
+    """Draw Recall@1 of each variant next to the paper's, with intervals.
 
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    summary : pandas.DataFrame
-        Rows of the figure in the order they are drawn: title, value, lo, hi, n; paper, paper_lo, paper_hi, paper_n,
-        NaN where the paper has none; `how` says in words what the interval is.
-    chance : float
-        What guessing reaches.
-    data : str
-        Where the data are from.
+    `summary` has a row for each variant in drawing order: title, value, lo, hi, n; paper, paper_lo, paper_hi, paper_n,
+    NaN where the paper has none; `how` describes the interval in words. `chance` is the rate of guessing.
     """
     count = len(summary)
     note = f"Ours: {summary['how'].iloc[0]}. Paper's: Wilson's 95 % intervals over its 220 trials."
@@ -172,7 +153,7 @@ def draw_ablation(path: Path, summary: pd.DataFrame, *, chance: float, data: str
 
 
 def _bars(chart: Axes, at: NDArray[np.float64], table: pd.DataFrame, names: tuple[str, str, str], colour: str) -> None:
-    """Bars with whiskers, the figure written in each."""
+    """Draw bars with whiskers, the figure written in each."""
     for place, (value, lo, hi) in zip(at, table[list(names)].to_numpy(float), strict=True):
         if math.isnan(value):
             continue
@@ -187,17 +168,7 @@ def _bars(chart: Axes, at: NDArray[np.float64], table: pd.DataFrame, names: tupl
 
 
 def draw_robustness(path: Path, table: pd.DataFrame, *, data: str) -> None:
-    """Draw Recall@1 against map-change probability, a panel for each variant.
-
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    table : pandas.DataFrame
-        matcher, title, low, high, mean, n, value, lo, hi.
-    data : str
-        Where the data are from.
-    """
+    """Draw Recall@1 against map-change probability, a panel for each variant of a table from `robustness_frame`."""
     names = list(dict.fromkeys(table["matcher"]))
     across = min(len(names), 5)
     down = math.ceil(len(names) / across)
@@ -242,17 +213,7 @@ def _steps(chart: Axes, mine: pd.DataFrame, colour: str, mark: str) -> None:
 
 
 def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
-    """Draw risk against coverage of every variant, all of it and the lower part again.
-
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    table : pandas.DataFrame
-        matcher, title, coverage, risk, n, aurc; points of a matcher by growing coverage.
-    data : str
-        Where the data are from.
-    """
+    """Draw risk against coverage of every variant, all of it and the lower part again, from a table of `risk_frame`."""
     names = list(dict.fromkeys(table["matcher"]))
     note = (
         "Answers are accepted from the largest margin down; margin: score of the first candidate less that of the "

@@ -19,14 +19,13 @@ from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, PipelineFile
 from sasgeo_bench.matching.plugins import YARDSTICK, check_names
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import pack_board
+from sasgeo_bench.publishing.archive import contrast_of, pack_board
 from sasgeo_bench.publishing.archive_folder import check_results
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed
@@ -302,7 +301,7 @@ def run_pipeline(
     if not folders and failures.first is not None:
         raise failures.first
     split = plan.requests[0].split if plan.requests else None
-    contrasts = _contrasts(plan.spec)
+    contrasts = tuple(contrast_of(item.model_dump(exclude={"why"})) for item in plan.spec.contrast)
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
     pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
     request = ScoreRequest(
@@ -458,12 +457,3 @@ def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
     asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
     made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
     return [made(seed=seed) or draw(seed=seed) for seed in paper.seeds]
-
-
-def _contrasts(spec: PipelineFile) -> tuple[Contrast, ...]:
-    return tuple(
-        Contrast(
-            **item.model_dump(exclude={"why", "suites", "kinds"}), suites=tuple(item.suites), kinds=tuple(item.kinds)
-        )
-        for item in spec.contrast
-    )

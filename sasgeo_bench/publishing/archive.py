@@ -46,12 +46,12 @@ class Stored:
 
     def to_text(self) -> str:
         """Return one line with the size, the bytes of a prediction, and what was left out."""
-        mine = self.packed
-        each = mine.prediction_bytes / max(mine.predictions, 1)
-        left_out = f"; left out: {mine.dropped}" if mine.dropped else ""
+        size = self.packed
+        each = size.prediction_bytes / max(size.predictions, 1)
+        left_out = f"; left out: {size.dropped}" if size.dropped else ""
         return (
-            f"{self.folder}: {mine.total_bytes / 1e6:.2f} MB, of these {mine.prediction_bytes / 1e6:.2f} MB for "
-            f"{counted(mine.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
+            f"{self.folder}: {size.total_bytes / 1e6:.2f} MB, of these {size.prediction_bytes / 1e6:.2f} MB for "
+            f"{counted(size.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
         )
 
 
@@ -95,14 +95,14 @@ def pack_board(
 
 
 def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
-    mine = board.predictions[entry.name]
+    answers = board.predictions[entry.name]
     for source, about in zip(entry.sources, entry.runs, strict=True):
-        said = TrainingRecord.of(about)
-        named = ids[about["suite"], about["region"]]
+        training = TrainingRecord.of(about)
+        asked = ids[about["suite"], about["region"]]
         yield StoredRun(
             about=about,
-            predictions=[mine[name] for name in named if name in mine],
-            learned=None if said is None or said.file is None else source.parents[1] / said.file,
+            predictions=[answers[name] for name in asked if name in answers],
+            learned=None if training is None or training.file is None else source.parents[1] / training.file,
         )
 
 
@@ -140,18 +140,14 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
         raise ConfigError(message)
     if not stored:
         return Settings()
-    said = read_settings(stored[0])
-    return Settings(
-        split=said["split"],
-        rejectors=said["rejectors"],
-        contrasts=tuple(
-            Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])})
-            for item in said["contrasts"]
-        ),
-        draws=said["draws"],
-        by_region=said["by_region"],
-        pipeline=said["pipeline"],
-    )
+    record = read_settings(stored[0])
+    names = ("split", "rejectors", "draws", "by_region", "pipeline")
+    return Settings(**{name: record[name] for name in names}, contrasts=tuple(map(contrast_of, record["contrasts"])))
+
+
+def contrast_of(record: Mapping[str, Any]) -> Contrast:
+    """Return a registered contrast from its record in a file."""
+    return Contrast(**{**record, "suites": tuple(record["suites"]), "kinds": tuple(record["kinds"])})
 
 
 def request_of(
@@ -173,10 +169,13 @@ def request_of(
     >>> request_of([Path("nowhere")], board=Path("board"), root=Path("out")).split.spec.id
     'crossfit'
     """
-    settings = stored_settings(predictions)
+    settings, stored = stored_settings(predictions), stored_among(predictions)
     if not rejectors:
-        check_registered(settings.rejectors, source=str(stored_among(predictions)))
-    name = split or settings.split or (None if stored_among(predictions) else "crossfit")
+        check_registered(settings.rejectors, source=str(stored))
+    name = split or settings.split or (None if stored else "crossfit")
+    failed = {}  # contrasts may name entries that failed when results were stored, and hold no answer
+    if stored is not None and (stored / BOARD).is_file():
+        failed = dict(read_board(stored)[0].get("failed", {}))
     return ScoreRequest(
         predictions=predictions,
         root=root,
@@ -187,13 +186,8 @@ def request_of(
         draws=settings.draws,
         by_region=settings.by_region,
         pipeline=settings.pipeline,
-        failed=_failed_before(stored_among(predictions)),
+        failed=failed,
     )
-
-
-def _failed_before(stored: Path | None) -> dict[str, str]:
-    """Return entries that failed when results were stored: contrasts may name them, and they hold no answer."""
-    return dict(read_board(stored)[0].get("failed", {})) if stored is not None and (stored / BOARD).is_file() else {}
 
 
 def score_all(
@@ -219,8 +213,8 @@ def score_all(
         pictures = partial(
             pictures_extra, tell=tell, root=request.root, contrasts=request.contrasts, has_cases=has_cases
         )
-        said = {} if kept is None else read_board(kept)[0]
-        board = make_board(replace(laid, extras=(figures, pictures), kept=said), tell=tell, progress=progress)
+        record = {} if kept is None else read_board(kept)[0]
+        board = make_board(replace(laid, extras=(figures, pictures), kept=record), tell=tell, progress=progress)
         if results is not None:
             lacks = "" if kept is None else str(read_settings(kept)["dropped"])
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())
@@ -263,7 +257,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
         found = unpack(stored, Path(folder))
         others = [path for path in request.predictions if path != stored]
-        with _told_of(stored, found.root):
+        with _attributed(stored, found.root):
             yield replace(
                 request,
                 predictions=[*found.runs, *others],
@@ -274,7 +268,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
 
 
 @contextmanager
-def _told_of(stored: Path, root: Path) -> Iterator[None]:
+def _attributed(stored: Path, root: Path) -> Iterator[None]:
     """Attribute errors in a temporary folder to the stored results that were laid out there."""
     try:
         yield
@@ -296,7 +290,7 @@ def laid_tasks(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
         tasks: list[Path] = []
         for number, path in enumerate(paths):
             tasks += unpack_tasks(path, Path(folder) / str(number)) if is_pack(path) else [path]
-        with _told_of(next(filter(is_pack, paths), Path()), Path(folder)):
+        with _attributed(next(filter(is_pack, paths), Path()), Path(folder)):
             yield tuple(tasks)
 
 

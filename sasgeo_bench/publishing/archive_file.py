@@ -9,7 +9,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +23,6 @@ from sasgeo_bench.files.file_manifest import SITE_FOLDERS, hashes_of, list_files
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import MOST_VALUES, read_table, write_table
-from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
@@ -126,7 +125,7 @@ def write_pack(
             for dropped in dict.fromkeys((lacks, _with(lacks, _NO_HEADINGS))):
                 found = _write_predictions(scratch, runs, is_lean=dropped != lacks)
                 _write_settings(scratch, {**settings, "contestants": list(runs)}, dropped)
-                total = _bytes_of(scratch)
+                total = sum(path.stat().st_size for path in scratch.rglob("*") if path.is_file())
                 if total <= most_bytes:
                     break
             _check_size(folder, total, found, most_bytes)
@@ -180,10 +179,6 @@ def _check_size(folder: Path, total: int, predictions: int, most: int) -> None:
             "at most: store a pipeline of fewer matchers or sites, or of a smaller top_k; nothing was written"
         )
         raise StoreError(message)
-
-
-def _bytes_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TEXTS, split: Sequence[str] = ()) -> None:
@@ -266,19 +261,8 @@ def _lean(item: Prediction) -> Prediction:
     if not item.candidates:
         return item
     first = item.candidates[0][0]
-    poses = tuple(
-        (Pose(easting_m=pose.easting_m, northing_m=pose.northing_m, yaw_deg=first.yaw_deg, scale=first.scale), score)
-        for pose, score in item.candidates
-    )
-    return Prediction(
-        query_id=item.query_id,
-        candidates=poses,
-        confidence=item.confidence,
-        diagnostics=item.diagnostics,
-        status=item.status,
-        message=item.message,
-        latency_s=item.latency_s,
-    )
+    poses = ((replace(pose, yaw_deg=first.yaw_deg, scale=first.scale), score) for pose, score in item.candidates)
+    return replace(item, candidates=tuple(poses))
 
 
 # --- back to folders --------------------------------------------------------------------------------------------------
@@ -299,9 +283,7 @@ def unpack(folder: Path, into: Path) -> Unpacked:
     Raise `StoreError` if the results are damaged.
     """
     with sound(folder):
-        read_settings(folder)
-        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
-        tables["runs"] = _read_runs(folder)
+        tables = _read_tables(folder) | {"runs": _read_runs(folder)}
         check_tables(tables)
         tasks = tuple(_lay_tasks(tables, into))
         asked = dict(zip(*(tables["queries"][name].to_pylist() for name in ("query_id", ASKED)), strict=True))
@@ -326,10 +308,14 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
     Raise `StoreError` if the results are damaged.
     """
     with sound(folder):
-        read_settings(folder)
-        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
+        tables = _read_tables(folder)
         check_tables(tables)
         return tuple(_lay_tasks(tables, into))
+
+
+def _read_tables(folder: Path) -> dict[str, pa.Table]:
+    read_settings(folder)  # checks every file against its hash
+    return {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
 
 
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:

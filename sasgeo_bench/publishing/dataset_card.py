@@ -2,7 +2,7 @@
 """`README.md` and `datasheet.md` of a release: dataset card, and the questions of Gebru et al. answered."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from sasgeo_bench.errors import counted
@@ -19,16 +19,9 @@ _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"),
 
 def card_text(release: Release) -> str:
     """Return the card: Markdown after a YAML head."""
-    parts = (
-        "\n".join(("---", *_head(release), "---")),
-        _opening(release),
-        _suites(release),
-        _regions(release),
-        _loading(release),
-        _meaning(release),
-        _ending(release),
-    )
-    return "\n\n".join(parts) + "\n"
+    sections = (_opening, _suites, _regions, _loading, _meaning, _ending)
+    head = "\n".join(("---", *_head(release), "---"))
+    return "\n\n".join((head, *(section(release) for section in sections))) + "\n"
 
 
 def _head(release: Release) -> Iterator[str]:
@@ -272,7 +265,8 @@ a right fix from a false one.
 
 def _composition(release: Release) -> str:
     area_km2, dates = _area_km2(release), sorted(item.manifest.extract.date for item in release.maps)
-    objects, parts = _objects(release), _parts(release)
+    objects = _sum(item.manifest.counts for item in release.maps)
+    parts = _sum(task.parts for task in release.tasks)
     made_up = [name for name in release.regions if name.startswith("town-")]
     towns = f", {len(made_up)} of them made up by a program" if made_up else ""
     queries = ", ".join(f"{part} {count}" for part, count in parts.items())
@@ -322,27 +316,17 @@ def _area_km2(release: Release) -> float:
     return sum(areas.values())
 
 
-def _objects(release: Release) -> Counter[str]:
+def _sum(counts: Iterable[Mapping[str, int]]) -> Counter[str]:
+    """Add counts by name, names that count 0 included."""
     found: Counter[str] = Counter()
-    for item in release.maps:
-        found.update(item.manifest.counts)
-    return found
-
-
-def _parts(release: Release) -> Counter[str]:
-    found: Counter[str] = Counter()
-    for task in release.tasks:
-        found.update(task.parts)
+    for one in counts:
+        found.update(one)
     return found
 
 
 def _class_table(objects: Counter[str]) -> str:
-    lines = [
-        "| Class | Objects in all maps |",
-        "|---|---|",
-        *(f"| {markdown_code(name)} | {count:,} |" for name, count in objects.items()),
-    ]
-    return "\n".join(lines)
+    lines = (f"| {markdown_code(name)} | {count:,} |" for name, count in objects.items())
+    return "\n".join(("| Class | Objects in all maps |", "|---|---|", *lines))
 
 
 def _mapped_line(release: Release) -> str:

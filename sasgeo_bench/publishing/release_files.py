@@ -19,7 +19,7 @@ from sasgeo_bench.files.parquet import open_table, read_table, table_writer
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import TASK_VERSION
+from sasgeo_bench.tasks.query import TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Place, SplitFile
 from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA
 from sasgeo_bench.texts import json_text
@@ -70,7 +70,7 @@ class ReleaseMap:
     @property
     def region(self) -> str:
         """Return the region, whatever the date of the map and whether a suite has edited it."""
-        return self.name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+        return base_of(self.name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,8 +290,7 @@ def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBat
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    said = {**content, "licence": LICENCE, "attribution": ATTRIBUTION}
-    path.write_text(json_text(said), encoding="utf-8")
+    path.write_text(json_text({**content, "licence": LICENCE, "attribution": ATTRIBUTION}), encoding="utf-8")
 
 
 def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:

@@ -204,17 +204,19 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     book = Book.of(source.board, source.about, source.scores)
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
-    there = set(_NAMES)
-    there -= set() if rejection or protection else {"rejection.html"}
-    there -= set() if source.figures else {"figures.html"}
-    there -= set() if source.pictures.cases else {"failures.html"}
+    optional = {
+        "rejection.html": rejection or protection,
+        "figures.html": source.figures,
+        "failures.html": source.pictures.cases,
+    }
+    there = [name for name in _NAMES if optional.get(name, True)]
     suites, matchers, sections = suites_of(source, book), matchers_of(source, book), sections_of(book)
     kinds = figures_by_kind(source.figures)
     common: dict[str, Any] = {
         "source": source,
         "about": source.about,
         "book": book,
-        "navigation": [(page, title) for page, title in _NAMES.items() if page in there],
+        "navigation": [(name, _NAMES[name]) for name in there],
         "note": NOTE.format(draws=source.about.get("draws", "?")),
     }
     controls = _verdicts(source)
@@ -245,7 +247,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
             "meanings": MEANINGS | MARKS,
         },
     }
-    pages = {name: _render(templates, name, name, common | special[name]) for name in _NAMES if name in there}
+    pages = {name: _render(templates, name, name, common | special[name]) for name in there}
     for suite in suites:
         pages[suite.page] = _render(templates, "suite.html", suite.page, common | {"suite": suite})
     for matcher in matchers:
@@ -299,13 +301,11 @@ def _controls_state(verdicts: Sequence[Verdict]) -> str:
 def _counts(source: SiteSource, book: Book) -> dict[str, int]:
     """Count matchers, suites, queries, blocks and places of the board."""
     board, scores = source.board, source.scores
-    queries = scores["query_id"].nunique() if "query_id" in scores else 0
     return {
         "matchers": len(book.matcher_pages),
         "suites": len(book.suite_pages),
-        "queries": int(queries),
-        "blocks": int(board["blocks"].max()) if len(board) else 0,
-        "places": int(board["places"].max()) if len(board) else 0,
+        "queries": int(scores["query_id"].nunique()) if "query_id" in scores else 0,
+        **{name: int(board[name].max()) if len(board) else 0 for name in ("blocks", "places")},
     }
 
 

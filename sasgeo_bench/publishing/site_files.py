@@ -2,10 +2,9 @@
 """A board's folder read for its site, and the folder of the site; written whole or not at all."""
 
 import gzip
-import html
 import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import json_text
 
@@ -101,51 +101,22 @@ _OFFERED: Final = {  # what is offered for download, and what it is
 _LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
 _LEFT_OUT_BYTES: Final = 1_500_000  # what is more, packed, stays with the board
 _MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz: what holds more is no text of ours
-_MOST_POINTS: Final = 100_000.0  # of a figure, either way
-_TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
-_SIZE: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
-_HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Drawn:
-    """An SVG: its text, its title, and its size in points."""
-
-    text: str
-    title: str
-    width: float
-    height: float
-
-    @classmethod
-    def of(cls, text: str, name: str) -> "Drawn":
-        """Read title and size of the text of a figure; one without a title gets its name.
-
-        >>> drawn = Drawn.of('<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>', "mine")
-        >>> drawn.title, drawn.width, drawn.height
-        ('A & B', 90.0, 45.0)
-        """
-        title, *sizes = (pattern.search(text) for pattern in (_TITLE, _SIZE, _HEIGHT))
-        said = (float(found[1]) if found else 0.0 for found in sizes)
-        width, height = (size if 0 < size < _MOST_POINTS else 480.0 for size in said)
-        shown = html.unescape(title[1]).strip() if title else name
-        return cls(text=text, title=" ".join(shown.split()), width=width, height=height)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardFiles:
     """Files of a board's folder that a site shows.
 
-    `tables` are contrasts, controls, scores and protection, empty where there is none; `figures` by file name;
-    `downloads` the bytes that are offered, by file name, with a description; `pictures` the content of `pictures.json`;
-    `settings` those that stored results were scored with, empty for a board that is not stored.
+    `tables` are contrasts, controls, scores and protection, empty where there is none; `pictures` is the content of
+    `pictures.json`; `settings` those that stored results were scored with, empty for a board that is not stored.
     """
 
     folder: Path
     about: Mapping[str, Any]
     board: pd.DataFrame
     tables: Mapping[str, pd.DataFrame]
-    figures: Mapping[str, Drawn]
-    downloads: Mapping[str, tuple[bytes, str]]
+    figures: tuple[SiteFigure, ...]
+    downloads: tuple[Download, ...]
     pictures: Mapping[str, Sequence[Mapping[str, Any]]]
     settings: Mapping[str, Any]
 
@@ -164,8 +135,8 @@ def read_board_files(folder: Path) -> BoardFiles:
             about=about,
             board=board,
             tables={name: _read_table(folder / f"{name}.parquet") for name in _TABLES},
-            figures=_read_figures(folder / FIGURES),
-            downloads=dict(_read_downloads(folder)),
+            figures=tuple(_read_figures(folder / FIGURES)),
+            downloads=tuple(_read_downloads(folder)),
             pictures=_read_pictures(folder / PICTURES),
             settings=read_settings(folder) if is_pack(folder) else {},
         )
@@ -212,27 +183,25 @@ def _unpacked(path: Path) -> bytes:
     return data
 
 
-def _read_figures(folder: Path) -> dict[str, Drawn]:
-    names = sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")})
-    found = {name: _plain_or_packed(folder / name) for name in names if name.endswith(".svg")}
-    return {name: _figure_of(folder / name, data) for name, data in found.items() if data}
+def _read_figures(folder: Path) -> Iterator[SiteFigure]:
+    """Read figures, refusing an SVG that does more than draw: pages link to it."""
+    for name in sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")}):
+        data = _plain_or_packed(folder / name) if name.endswith(".svg") else None
+        if not data:
+            continue
+        try:
+            text = data.decode()
+            fault = svg_fault(text)
+        except ValueError as error:
+            message = f"{name}: {error}"
+            raise ValueError(message) from error
+        if fault is not None:
+            message = f"{folder / name} holds {fault}, as no figure of a board does: score it again, or remove the file"
+            raise StoreError(message)
+        yield SiteFigure.of(name, text)
 
 
-def _figure_of(path: Path, data: bytes) -> Drawn:
-    """Return a figure whose SVG only draws; pages link to it."""
-    try:
-        text = data.decode()
-        fault = svg_fault(text)
-    except ValueError as error:
-        message = f"{path.name}: {error}"
-        raise ValueError(message) from error
-    if fault is not None:
-        message = f"{path} holds {fault}, as no figure of a board does: score it again, or remove the file"
-        raise StoreError(message)
-    return Drawn.of(text, path.stem)
-
-
-def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
+def _read_downloads(folder: Path) -> Iterator[Download]:
     for name, what in _OFFERED.items():
         data = _plain_or_packed(folder / name)
         if data is None:
@@ -240,7 +209,7 @@ def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
         is_packed = len(data) > _LARGE_BYTES and not name.endswith(".parquet")
         data = gzip.compress(data, mtime=0) if is_packed else data
         if len(data) <= _LEFT_OUT_BYTES:
-            yield f"{name}.gz" if is_packed else name, (data, what)
+            yield Download(file=f"{name}.gz" if is_packed else name, data=data, what=what)
 
 
 def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
@@ -325,21 +294,19 @@ def write_site(
     board: BoardFiles,
     *,
     pages: Mapping[str, str],
-    drawn: Mapping[str, str],
+    figures: Iterable[SiteFigure],
     about: Mapping[str, Any],
 ) -> Written:
     """Write a site, whole or not at all; an older one in the target folder is replaced.
 
-    `pages` are the texts of pages, style and script by file name, `drawn` further figures, `about` further content of
-    `site.json`; figures, downloads and pictures come from the board. Raise `StoreError` if the site cannot be written;
-    an older site then stays as it was.
+    `pages` are the texts of pages, style and script by file name, `about` further content of `site.json`; downloads and
+    pictures come from the board. Raise `StoreError` if the site cannot be written; an older site then stays as it was.
     """
     check_target(target)
     named = {str(item["file"]) for listed in board.pictures.values() for item in listed}
-    figures = {name: item.text for name, item in board.figures.items()} | dict(drawn)
     files: dict[str, bytes] = {name: text.encode() for name, text in pages.items()}
-    files |= {f"{FIGURES}/{name}": text.encode() for name, text in figures.items()}
-    files |= {f"{FILES}/{name}": data for name, (data, _) in board.downloads.items()}
+    files |= {f"{FIGURES}/{item.file}": item.text.encode() for item in figures}
+    files |= {f"{FILES}/{item.file}": item.data for item in board.downloads}
     pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
     content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION, "files": sorted({*files, *pictures})}
     files[MANIFEST] = json_text(content).encode()

@@ -1,24 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a site is made of, as values: a board's tables and pictures, and what ships with the package."""
 
+import html
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import RateBook
 from sasgeo_bench.scoring.contrasts import Contrast
 
+_MOST_POINTS: Final = 100_000.0  # of a figure, either way
+_TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
+_WIDTH: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
+_HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SiteFigure:
-    """A figure of the board: name of its file, title, and width and height in points."""
+    """A figure: name of its file, text of the SVG, title, and width and height in points."""
 
     file: str
+    text: str
     title: str
     width: float
     height: float
+
+    @classmethod
+    def of(cls, file: str, text: str) -> Self:
+        """Read title and size of an SVG; one without a title has the name of its file.
+
+        >>> figure = SiteFigure.of("own.svg", '<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>')
+        >>> figure.title, figure.width, figure.height
+        ('A & B', 90.0, 45.0)
+        """
+        title, *sizes = (pattern.search(text) for pattern in (_TITLE, _WIDTH, _HEIGHT))
+        found = (float(size[1]) if size else 0.0 for size in sizes)
+        width, height = (size if 0 < size < _MOST_POINTS else 480.0 for size in found)
+        shown = html.unescape(title[1]).strip() if title else Path(file).stem
+        return cls(file=file, text=text, title=" ".join(shown.split()), width=width, height=height)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,10 +114,10 @@ class Spot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Download:
-    """A file that the site offers: name, size as downloaded, and content."""
+    """A file that the site offers: name, bytes as downloaded, and a description."""
 
     file: str
-    size_bytes: int
+    data: bytes
     what: str
 
 

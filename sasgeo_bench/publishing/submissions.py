@@ -25,7 +25,7 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import list_submissions, read_card, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION
+from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split, find_split
 
 FOLDER: Final = Path("submissions")  # where they lie, unless said otherwise
@@ -157,8 +157,7 @@ def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> 
     """Check that the card states the runner's training, for the half it was asked about."""
     said = about.get("learned")
     taught = said.get("trained_on", ()) if isinstance(said, dict) else ()
-    region = str(about["region"]).split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
-    places = () if split is None else split.places_in(region)
+    places = () if split is None else split.places_in(base_of(str(about["region"])))
     half = split.half_of.get(places[0]) if split is not None and places else None
     lost = sorted(set(taught) - set(card.taught(half)))
     if lost:

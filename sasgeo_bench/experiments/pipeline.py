@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pipeline file -> queries, runs and a board; what is up to date is not done again."""
+"""A pipeline file -> queries, runs and a board; steps that are up to date are skipped."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -107,8 +107,8 @@ class _Stage:
         state = f"{len(self.made)} of {counted(len(self.made) + len(self.lacking), 'task')} up to date"
         if self.lacking:
             reasons = Counter(item.why for item in self.lacking)
-            told = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
-            state = f"{state}, {len(self.lacking)} to be drawn ({told})"
+            causes = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
+            state = f"{state}, {len(self.lacking)} to be drawn ({causes})"
         lines = [f"  {self.name}: {state}"]
         lines += [f"    to be drawn: {item.suite} on {item.region}" for item in self.lacking[:MOST_LINES]]
         more = len(self.lacking) - MOST_LINES
@@ -116,7 +116,7 @@ class _Stage:
 
 
 def _stage(name: str, requests: Sequence[Request]) -> _Stage:
-    """Return which of some requests are up to date."""
+    """Sort requests into those that are up to date and those to be drawn."""
     found = [(request, made_tasks(request)) for request in requests]
     return _Stage(
         name=name,
@@ -158,21 +158,21 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
     asked = [(spec, list(stages)) for spec in plan.matchers]
     asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
     lines, all_done, all_left, all_behind = [], 0, 0, 0
-    for spec, mine in asked:
+    for spec, own_stages in asked:
         try:
-            goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
+            runs = _plan_runs(plan, spec, [task for stage in own_stages for made in stage.made for task in made])
         except (MatchError, StoreError) as error:
             lines.append(f"    {spec}: cannot be asked ({error})")
             continue
-        left, done = _count(goes)
-        planned = goes[0].plan
-        lacking = [item for stage in mine for item in stage.lacking if _is_asked(plan, spec, item.suite)]
+        left, done = _count(runs)
+        planned = runs[0].plan
+        lacking = [item for stage in own_stages for item in stage.lacking if _is_asked(plan, spec, item.suite)]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
         more = f", and what is drawn; {behind} answered there before" if lacking else ""
-        where = " (controls alone)" if mine == [controls] and len(stages) > 1 else ""
+        where = " (controls alone)" if own_stages == [controls] and len(stages) > 1 else ""
         lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
-        lines += [f"      {go.name}: {line}" for go in goes for line in go.lines()]
+        lines += [f"      {one.name}: {line}" for one in runs for line in one.lines()]
         all_done, all_left, all_behind = all_done + done, all_left + left, all_behind + behind
     lines.insert(0, f"  run: {counted(len(asked), 'matcher')}, {all_done} answered, {all_left} to ask")
     if all_behind:
@@ -217,7 +217,7 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
     out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
-        wanted = Wanted(
+        asked = Wanted(
             suites=tuple(task.suites),
             regions=tuple(spec.regions),
             split=str(spec.split),  # a file with tasks names one
@@ -231,7 +231,7 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
             choice=Choice(views_cells=tuple(task.views_cells), kinds=tuple(task.kinds), tracks=tuple(task.tracks)),
         )
         try:
-            requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
+            requests += plan_requests(asked, tell=tell if number == 0 else _silent)
         except ConfigError as error:
             message = f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}"
             raise ConfigError(message) from error
@@ -262,7 +262,7 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
 
 
 def _silent(line: str) -> None:
-    """Say once what is left out, not for every group of suites."""
+    """Report nothing: what is left out is reported once, not for every group of suites."""
     del line
 
 
@@ -290,12 +290,12 @@ def run_pipeline(
         raise ConfigError(message)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
-    goes: dict[str, list[_Go]] = {}
+    runs: dict[str, list[_Run]] = {}
     for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
         with failures.of(spec, but=(ConfigError,)):
-            goes[spec] = _plan_goes(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
+            runs[spec] = _plan_runs(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
     folders: list[Path] = []
-    for spec, found in goes.items():
+    for spec, found in runs.items():
         with failures.of(spec, but=(ConfigError,)):
             folders += _run(spec, found, tell, progress)
     if not folders and failures.first is not None:
@@ -327,7 +327,7 @@ def run_pipeline(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Go:
+class _Run:
     """One run of a matcher; a matcher that learns has one for each half, which its name states."""
 
     name: str
@@ -340,33 +340,33 @@ class _Go:
         return self.plan.lesson_lines()
 
 
-def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) -> list[Path]:
+def _run(spec: str, runs: Sequence[_Run], tell: Tell, progress: Progress | None) -> list[Path]:
     """Run one matcher on all queries without a row, and return the folders of its runs."""
     folders: list[Path] = []
-    for go in goes:
-        left, done = _count([go])
-        label = f"{spec}, {go.name}" if go.name else spec
+    for one in runs:
+        left, done = _count([one])
+        label = f"{spec}, {one.name}" if one.name else spec
         tell(f"{label}: {left} queries to ask, {done} answered before")
-        for line in () if go.plan.lesson is not None else go.lines():
+        for line in () if one.plan.lesson is not None else one.lines():
             tell(f"{label}: {line}")
-        run(go.plan, tell=tell if left else _silent, progress=progress)
-        folders += [part.folder for part in go.plan.parts]
+        run(one.plan, tell=tell if left else _silent, progress=progress)
+        folders += [part.folder for part in one.plan.parts]
     return folders
 
 
-def _count(goes: Sequence[_Go]) -> tuple[int, int]:
+def _count(runs: Sequence[_Run]) -> tuple[int, int]:
     """Count open and answered queries."""
-    parts = [part for go in goes for part in go.plan.parts]
+    parts = [part for one in runs for part in one.plan.parts]
     return sum(len(part.left) for part in parts), sum(part.done for part in parts)
 
 
-def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
+def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Run]:
     """Plan the runs of a matcher: one, or with learning one for each half after learning from the other.
 
     An oracle learns from the half itself.
     """
-    mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
-    whole = plan_run(_run_request(plan, spec, mine))
+    own = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
+    whole = plan_run(_run_request(plan, spec, own))
     learning = plan.spec.learning
     is_oracle = _is_oracle(plan, spec)
     if is_oracle and not is_unranked(whole.card.name):
@@ -375,12 +375,12 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
             f"oracles begin with {YARDSTICK}, so that no board ranks them"
         )
         raise ConfigError(message)
-    if learning is None or not whole.learns or not mine:
-        return [_Go(name="", plan=whole)]
+    if learning is None or not whole.learns or not own:
+        return [_Run(name="", plan=whole)]
     halves = {task: _half_of(plan, task) for task in tasks}
-    goes = []
+    runs = []
     for half in (*HALVES, None):
-        asked = [task for task in mine if halves[task] == half]
+        asked = [task for task in own if halves[task] == half]
         train = [
             task
             for task in tasks
@@ -396,8 +396,8 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
             split=plan.requests[0].split,
         )
         if asked:
-            goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
-    return goes
+            runs.append(_Run(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
+    return runs
 
 
 def _is_oracle(plan: PipelinePlan, spec: str) -> bool:

@@ -160,10 +160,10 @@ def _with(dropped: str, more: str) -> str:
     return _AND.join(dict.fromkeys(filter(None, (*dropped.split(_AND), more))))
 
 
-def _write_settings(folder: Path, said: Mapping[str, Any], dropped: str) -> None:
+def _write_settings(folder: Path, settings: Mapping[str, Any], dropped: str) -> None:
     content = {
         "schema_version": SCHEMA_VERSION,
-        **said,
+        **settings,
         "dropped": dropped,
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
@@ -197,10 +197,10 @@ def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TE
 
 def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
     """Write tasks without their views, and their truths."""
-    said, queries, truths = [], [], []
+    rows, queries, truths = [], [], []
     for number, item in enumerate(tasks):
         region = item.region / MANIFEST
-        said.append(
+        rows.append(
             {
                 "task_json": (item.task / task_files.TASK).read_text(encoding="utf-8"),
                 "truth_json": (item.truth / task_files.TRUTH_OF).read_text(encoding="utf-8"),
@@ -213,9 +213,9 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
         heads = heads.append_column(ASKED, pa.array([asked[name] for name in names], pa.string()))
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
-        told = read_table(item.truth / task_files.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
-        truths.append(_numbered(told, number))
-    _write_table(pa.Table.from_pylist(said, schema=TASK_SCHEMA), folder / "tasks.parquet")
+        truth = read_table(item.truth / task_files.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
+        truths.append(_numbered(truth, number))
+    _write_table(pa.Table.from_pylist(rows, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
     _write_table(pa.concat_tables(truths), folder / "truths.parquet")
 
@@ -363,13 +363,13 @@ def _read_runs(folder: Path) -> pa.Table:
 
 
 def _former_learned(folder: Path, about: Mapping[str, Any]) -> str | None:
-    said = TrainingRecord.of(about)
-    path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(said)
+    training = TrainingRecord.of(about)
+    path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(training)
     return path.read_text("utf-8") if path.is_file() else None
 
 
-def _learned_name(said: TrainingRecord | None) -> str:
-    return "" if said is None or said.file is None else _folder_name(Path(said.file).name)
+def _learned_name(training: TrainingRecord | None) -> str:
+    return "" if training is None or training.file is None else _folder_name(Path(training.file).name)
 
 
 def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
@@ -397,12 +397,13 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
         run = into / "runs" / _folder_name(_file_of(about))
         place = run / _folder_name(about["suite"]) / _folder_name(about["region"])
         prediction_files.write_run(place, about)
-        said = TrainingRecord.of(about)
+        training = TrainingRecord.of(about)
         if row[LEARNED] is not None:
             (run / learned_file.FOLDER).mkdir(exist_ok=True)
-            (run / learned_file.FOLDER / _learned_name(said)).write_text(row[LEARNED], encoding="utf-8")
+            (run / learned_file.FOLDER / _learned_name(training)).write_text(row[LEARNED], encoding="utf-8")
         part = answers.slice(start, count)
-        ties = [asked_under(asked[name], None if said is None else said.key) for name in part["query_id"].to_pylist()]
+        key = None if training is None else training.key
+        ties = [asked_under(asked[name], key) for name in part["query_id"].to_pylist()]
         write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
         start += count
         yield place

@@ -62,19 +62,19 @@ def read_settings(folder: Path) -> dict[str, Any]:
         if found not in _READ:
             message = f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
             raise StoreError(message)
-        said = parse_record(data, ArchiveRecord)
-        if said.files is None and found != _WITHOUT_HASHES:
+        record = parse_record(data, ArchiveRecord)
+        if record.files is None and found != _WITHOUT_HASHES:
             message = f"{PACK} lists no files"
             raise ValueError(message)
-        if said.files is None:
+        if record.files is None:
             list_files(folder, without=SITE_FOLDERS)
-            return said.model_dump()
-        files = {**said.files, PACK: sha256_of(folder / PACK)}
+            return record.model_dump()
+        files = {**record.files, PACK: sha256_of(folder / PACK)}
         fault = first_difference(folder, files, without=SITE_FOLDERS)
         if fault is not None:
             message = f"{folder} differs from what {PACK} says ({one_line(fault)}): fetch the results again"
             raise StoreError(message)
-        return said.model_dump()
+        return record.model_dump()
 
 
 @contextmanager
@@ -100,10 +100,10 @@ def check_results(folder: Path, board: Path) -> None:
     folder would lie in the other.
     """
     check_replaced(folder)
-    mine, other = resolve_link(folder).absolute(), resolve_link(board).absolute()
-    mine, other = mine.parent.resolve() / mine.name, other.parent.resolve() / other.name
-    around = next((one for one in mine.parents if one == other or (one / BOARD).is_file()), None)
-    if around is not None or mine == other or mine in other.parents:
+    target, other = resolve_link(folder).absolute(), resolve_link(board).absolute()
+    target, other = target.parent.resolve() / target.name, other.parent.resolve() / other.name
+    around = next((one for one in target.parents if one == other or (one / BOARD).is_file()), None)
+    if around is not None or target == other or target in other.parents:
         message = (
             f"{folder} would lie in the board {around}: name another folder"
             if around is not None

@@ -263,10 +263,10 @@ def _field(table: _Table, column: pa.Field) -> "mlc.Field":
     is_list = pa.types.is_list(column.type)
     inner = column.type.value_type if is_list else column.type
     name = f"{table.name}/{column.name}"
-    said = {"id": name, "name": column.name, "description": table.texts.get(column.name)}
+    common = {"id": name, "name": column.name, "description": table.texts.get(column.name)}
     if not pa.types.is_struct(inner):
         is_array = True if is_list else None
-        return mlc.Field(**said, data_types=[_type(inner)], is_array=is_array, source=_source(table, column.name))
+        return mlc.Field(**common, data_types=[_type(inner)], is_array=is_array, source=_source(table, column.name))
     parts = [
         mlc.Field(
             id=f"{name}/{part.name}",
@@ -276,7 +276,7 @@ def _field(table: _Table, column: pa.Field) -> "mlc.Field":
         )
         for part in inner
     ]
-    return mlc.Field(**said, is_array=True, sub_fields=parts)
+    return mlc.Field(**common, is_array=True, sub_fields=parts)
 
 
 def _source(table: _Table, column: str, *, within: str | None = None) -> "mlc.Source":

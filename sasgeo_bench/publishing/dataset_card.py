@@ -79,10 +79,10 @@ Everything is made from dated OpenStreetMap extracts by {release.made_by}; publi
 def _truth_line(release: Release) -> str:
     if release.with_truth:
         return "all are in this release"
-    told = sorted({part for task in release.tasks for part in task.told})
+    released = sorted({part for task in release.tasks for part in task.released})
     if release.split.kind == "crossfit":
         return "none here; in a cross-fit every place is a test place once, so all of them are kept back"
-    return f"those of {' and '.join(told)} are here, those of test are kept back" if told else "kept back"
+    return f"those of {' and '.join(released)} are here, those of test are kept back" if released else "kept back"
 
 
 def _suites(release: Release) -> str:
@@ -96,10 +96,10 @@ def _suites(release: Release) -> str:
         tasks = release.tasks_of(suite)
         for part in release.tables_of(suite):
             own = [task for task in tasks if part in task.parts]
-            told = f"`{suite}-{TRUTHS}`" if any(part in task.told for task in own) else "kept back"
+            released = f"`{suite}-{TRUTHS}`" if any(part in task.released for task in own) else "kept back"
             count = sum(task.parts[part] for task in own)
             title = markdown(tasks[0].about["title"])
-            lines.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {told} |")
+            lines.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {released} |")
     return "\n".join(lines)
 
 
@@ -194,7 +194,7 @@ as the program's own."""
 
 def _meaning(release: Release) -> str:
     truths = ""
-    if any(task.told for task in release.tasks):
+    if any(task.released for task in release.tasks):
         truths = (
             f"\n\n## Columns of the truths\n\nA row for each query, to be joined by `query_id`.\n\n{shown(TRUTH_TEXTS)}"
         )
@@ -340,8 +340,8 @@ def _mapped_line(release: Release) -> str:
 def _left_out_line(release: Release) -> str:
     hidden = sum(sum(item.manifest.hidden.values()) for item in release.maps)
     dropped = sum(sum(item.manifest.drops.values()) for item in release.maps)
-    said = f"{hidden:,} objects in and around the maps are not visible, {dropped:,} were dropped"
-    return f"{said}, with reasons in `region.json`"
+    counts = f"{hidden:,} objects in and around the maps are not visible, {dropped:,} were dropped"
+    return f"{counts}, with reasons in `region.json`"
 
 
 def _collection(release: Release) -> str:

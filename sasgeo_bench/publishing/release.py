@@ -188,9 +188,9 @@ def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
     if odd is not None:
         message = f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
         raise StoreError(message)
-    told = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
+    released = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
     truth = request.out / "truth" / str(about["suite"]) / str(about["region"])
-    return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, told=told)
+    return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, released=released)
 
 
 def _map(folder: Path) -> ReleaseMap:
@@ -227,13 +227,13 @@ def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None
     if has_images(task.folder):
         message = f"{task.folder} holds images, whose licence is not that of the map: leave the suite out"
         raise StoreError(message)
-    if task.told:
+    if task.released:
         task_files.check_truths(task.folder, task.truth)
 
 
 def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
     """Report withheld truths that could be drawn again by trying a few seeds."""
-    hiding = [task for task in tasks if set(task.parts) - task.told]
+    hiding = [task for task in tasks if set(task.parts) - task.released]
     seeds: list[Any] = [task_files.read_hidden(task.truth).get("seed") for task in hiding]
     guessable = sum(isinstance(seed, int) and abs(seed) < 2**LEAST_BITS for seed in seeds)
     if guessable:

@@ -77,14 +77,14 @@ class ReleaseMap:
 class ReleaseTask:
     """One task of a release: folders of the task and of its truths, and the content of `task.json` (`about`).
 
-    `parts` counts the queries of each part; `told` are the parts whose truths are released.
+    `parts` counts the queries of each part; `released` are the parts whose truths are released.
     """
 
     folder: Path
     truth: Path
     about: Mapping[str, Any]
     parts: Mapping[str, int]
-    told: frozenset[str] = frozenset()
+    released: frozenset[str] = frozenset()
 
     @property
     def suite(self) -> str:
@@ -154,7 +154,7 @@ class Release:
         """Return the files of a suite's queries or truths by part, without parts that have none."""
         found: dict[str, list[str]] = {}
         for task in self.tasks_of(suite):
-            for part in task.parts if kind == "queries" else sorted(task.told):
+            for part in task.parts if kind == "queries" else sorted(task.released):
                 found.setdefault(part, []).append(task.file_of(part, kind=kind))
         return {part: found[part] for part in sorted(found)}
 
@@ -238,7 +238,7 @@ def copy_data(folder: Path, release: Release) -> None:
             _copy(item.folder / name, target / name)
     for task in release.tasks:
         _copy_queries(folder, task)
-        if task.told:
+        if task.released:
             _copy_truths(folder, task)
 
 
@@ -267,7 +267,7 @@ def _copy_truths(folder: Path, task: ReleaseTask) -> None:
     target = folder / "truth" / task.suite / task.map_name
     target.mkdir(parents=True)
     heads = read_table(task.folder / task_files.QUERIES, mend="make the queries again", columns=["query_id", "part"])
-    for part in sorted(task.told):
+    for part in sorted(task.released):
         ids = heads.filter(pc.equal(heads["part"], part))["query_id"].combine_chunks()
         rows = task_files.read_batches(task.truth / task_files.TRUTH, TRUTH_SCHEMA.names)
         plain = (_plain(batch.filter(pc.is_in(batch["query_id"], ids))) for batch in rows)
@@ -331,8 +331,8 @@ def write_index(folder: Path, release: Release) -> None:
         "regions": list(release.regions),
         "split": {"id": split.id, "title": split.title, "kind": split.kind, "buffer_m": split.buffer_m},
         "places": [place.model_dump(mode="json", exclude_defaults=True) for place in places_of(release)],
-        "maps": [_map_said(item) for item in release.maps],
-        "tasks": [_task_said(task) for task in release.tasks],
+        "maps": [_map_record(item) for item in release.maps],
+        "tasks": [_task_record(task) for task in release.tasks],
         "truths": "of all queries" if release.with_truth else "of the test part left out",
         "licence_url": LICENCE_URL,
     }
@@ -350,7 +350,7 @@ def places_of(release: Release) -> list[Place]:
     return found
 
 
-def _map_said(item: ReleaseMap) -> dict[str, Any]:
+def _map_record(item: ReleaseMap) -> dict[str, Any]:
     about = item.manifest
     return {
         "map": item.name,
@@ -364,13 +364,13 @@ def _map_said(item: ReleaseMap) -> dict[str, Any]:
     }
 
 
-def _task_said(task: ReleaseTask) -> dict[str, Any]:
+def _task_record(task: ReleaseTask) -> dict[str, Any]:
     return {
         "suite": task.suite,
         "suite_version": task.about["suite_version"],
         "map": task.map_name,
         "queries": dict(task.parts),
-        "truths": sorted(task.told),
+        "truths": sorted(task.released),
         "files": {part: task.file_of(part) for part in task.parts},
     }
 

@@ -113,8 +113,8 @@ def _sentence(row: Record, least: float) -> str:
 
 def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
     """Return how both sides fare without the stress, all suites together: the first row of a contrast."""
-    mine = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
-    return None if mine.empty else {str(name): value for name, value in mine.iloc[0].items()}
+    own = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
+    return None if own.empty else {str(name): value for name, value in own.iloc[0].items()}
 
 
 def _outcome(row: Record, falsifier: Record | None) -> str:
@@ -316,8 +316,8 @@ def groups_of(cases: Sequence[Case]) -> tuple[Group, ...]:
     names += sorted(set(counts) - set(names))
     groups, number = [], 0
     for at, name in enumerate(names):
-        mine = [case for case in cases if case.failure == name]
-        listed = tuple((number + more, case) for more, case in enumerate(mine, start=1))
+        own = [case for case in cases if case.failure == name]
+        listed = tuple((number + more, case) for more, case in enumerate(own, start=1))
         groups.append(Group(title=name, stem=f"{file_stem('class', name)}-{at}", cases=listed))
-        number += len(mine)
+        number += len(own)
     return tuple(groups)

@@ -36,7 +36,7 @@ _TAGS: Final = frozenset(  # of SVG: what shapes and texts are made of
     }
 )
 _SVG: Final = "{http://www.w3.org/2000/svg}"
-_INERT: Final = f"{_SVG}metadata"  # says whose data it is, in words of other vocabularies; nobody follows its links
+_INERT: Final = f"{_SVG}metadata"  # attribution in other vocabularies; its links are not followed
 _ENTITY: Final = re.compile(
     r"<!(ENTITY|ATTLIST|ELEMENT)|<!DOCTYPE[^>]*\[|<\?xml-stylesheet|<\?xml[^>]*encoding\s*=\s*(?![\"']utf-8[\"'])",
     re.IGNORECASE,
@@ -61,7 +61,7 @@ def svg_fault(text: str) -> str | None:
     except ET.ParseError as error:
         message = f"it is no XML: {error}"
         raise ValueError(message) from error
-    inert = {id(item) for told in root.iter(_INERT) for item in told.iter()}
+    inert = {id(item) for metadata in root.iter(_INERT) for item in metadata.iter()}
     drawn = (item for item in root.iter() if id(item) not in inert or item.tag == _INERT)
     return next((fault for item in drawn if (fault := _fault_of(item))), None)
 
@@ -82,9 +82,9 @@ def _fault_of(item: ET.Element) -> str | None:
 
 PICTURES: Final = "pictures"
 FILES: Final = "files"
-MOST_BYTES: Final = 5_000_000  # of a site, pictures of regions and cases apart; more is said
+MOST_BYTES: Final = 5_000_000  # of a site without pictures of regions and cases; a larger one is reported
 _TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, PROTECTION)
-_OFFERED: Final = {  # what is offered for download, and what it is
+_OFFERED: Final = {  # files for download, with descriptions
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
     f"{LEADERBOARD}.csv": "the same for a spreadsheet",
     f"{LEADERBOARD}.tex": "tables for a paper",
@@ -99,8 +99,8 @@ _OFFERED: Final = {  # what is offered for download, and what it is
     BOARD: "versions, hashes and cards",
 }
 _LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
-_LEFT_OUT_BYTES: Final = 1_500_000  # what is more, packed, stays with the board
-_MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz: what holds more is no text of ours
+_LEFT_OUT_BYTES: Final = 1_500_000  # larger files, packed, stay with the board
+_MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz; none of our texts is larger
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,11 +214,11 @@ def _read_downloads(folder: Path) -> Iterator[Download]:
 
 def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Read regions, suites and cases of `pictures.json`, and check each file against the folder."""
-    said = folder / f"{PICTURES}.json"
-    if not said.is_file():
+    path = folder / f"{PICTURES}.json"
+    if not path.is_file():
         return {}
     try:
-        data = said.read_bytes()
+        data = path.read_bytes()
         parse_record(data, PicturesRecord)
         content = parse_json(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
@@ -228,7 +228,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         text = one_line(str(error))
-        message = f"{said} is damaged ({text}): make the pictures again, or move the folder away"
+        message = f"{path} is damaged ({text}): make the pictures again, or move the folder away"
         raise StoreError(message) from error
     return found
 
@@ -271,7 +271,7 @@ def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator
         raise StoreError(message)
     check_target(target)
     if target.parent.resolve() == folder.resolve():
-        with locked(folder, tell=tell):  # a lock beside the site would be a strange file in the board's folder
+        with locked(folder, tell=tell):  # a lock next to the site would be a foreign file in the board's folder
             yield
         return
     with locked(folder, tell=tell), locked(target, tell=tell):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the other pages of a site show: suites, matchers, rejection, costs, places and measured ageing."""
+"""Content of the other pages of a site: suites, matchers, rejection, costs, places and measured ageing."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -49,9 +49,9 @@ def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]
     """Return figures under the titles of their kinds."""
     found: dict[str, list[SiteFigure]] = {}
     for kind, title in (*KINDS.items(), ("", "Other figures")):
-        mine = [item for item in figures if _kind_of(item) == kind]
-        if mine:
-            found[title] = mine
+        of_kind = [item for item in figures if _kind_of(item) == kind]
+        if of_kind:
+            found[title] = of_kind
     return found
 
 
@@ -120,7 +120,7 @@ class MatcherPage:
     cell: Cell
     card: Mapping[str, Any]
     trained: str
-    taught: tuple[str, ...]
+    training: tuple[str, ...]
     cannot: tuple[str, ...]
     results: tuple[Table, ...]
     rejection: Table | None
@@ -143,7 +143,7 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
         cell=book.name_cell(name),
         card=card,
         trained=_trained(card.get("trained_on")),
-        taught=tuple(_taught(entry)),
+        training=tuple(_training(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
         rejection=rejection_of(board, name),
@@ -159,7 +159,7 @@ def _trained(said: object) -> str:
     return ", ".join(places) or "no place that its card names"
 
 
-def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
+def _training(entry: Mapping[str, Any]) -> Iterator[str]:
     """Yield the training of an entry by the runner, and the regions it was then tested on: tasks are hundreds."""
     for one in entry.get("learned") or ():
         verb = "Learnt" if one["file"] else "Could not learn"

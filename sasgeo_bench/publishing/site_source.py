@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a site is made of, as values: a board's tables and pictures, and what ships with the package."""
+"""Content of a site as values: a board's tables and pictures, and what ships with the package."""
 
 import html
 import re

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers of others: a submission made of predictions and a card, held against a board, and scored with it."""
+"""Answers of others: a submission of predictions and a card, checked against a board and scored with it."""
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split, find_split
 
-FOLDER: Final = Path("submissions")  # where they lie, unless said otherwise
+FOLDER: Final = Path("submissions")  # the default folder of submissions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
         _check_runs(card, request.predictions, split, tasks)
         _check_rows(request.predictions, folders)
         rows = _rows_of(request.predictions, tasks)
-    said = Submission(
+    submission = Submission(
         schema_version=SCHEMA_VERSION,
         card=card,
         board=board_of([request.board]),
@@ -78,8 +78,8 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     )
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     folder = request.into or FOLDER / card.name
-    write_submission(folder, said, list(rows.values()), asked)
-    for line in _remarks(said):
+    write_submission(folder, submission, list(rows.values()), asked)
+    for line in _remarks(submission):
         tell(line)
     return folder
 
@@ -132,8 +132,8 @@ def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Seque
     """Refuse a card that disagrees with the runs on the matcher or its training places."""
     named = {(task.about["suite"], task.about["region"]) for task in tasks}
     for about in _runs_in(predictions):
-        said = about.get("matcher")
-        found = {name: said.get(name) for name in ("name", "version")} if isinstance(said, dict) else {}
+        matcher = about.get("matcher")
+        found = {name: matcher.get(name) for name in ("name", "version")} if isinstance(matcher, dict) else {}
         if found != {"name": card.name, "version": card.version}:
             message = (
                 f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {found.get('name')!r} "
@@ -155,11 +155,11 @@ def _runs_in(predictions: Path) -> Iterator[Mapping[str, Any]]:
 
 def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> None:
     """Check that the card states the runner's training, for the half it was asked about."""
-    said = about.get("learned")
-    taught = said.get("trained_on", ()) if isinstance(said, dict) else ()
+    training = about.get("learned")
+    places_trained = training.get("trained_on", ()) if isinstance(training, dict) else ()
     places = () if split is None else split.places_in(base_of(str(about["region"])))
     half = split.half_of.get(places[0]) if split is not None and places else None
-    lost = sorted(set(taught) - set(card.taught(half)))
+    lost = sorted(set(places_trained) - set(card.taught(half)))
     if lost:
         message = (
             f"the runs on {about['suite']}/{about['region']} learnt from {lost[0]}, which trained_on of the card does "
@@ -206,13 +206,14 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
     ]
 
 
-def _remarks(said: Submission) -> Iterator[str]:
+def _remarks(submission: Submission) -> Iterator[str]:
     """Yield remarks for the author on misses and controls."""
-    queries, answered = (sum(getattr(task, name) for task in said.tasks) for name in ("queries", "answered"))
-    yield f"{said.card.name}: {answered} of {counted(queries, 'query', 'queries')} of the board {said.board} have a row"
+    queries, answered = (sum(getattr(task, name) for task in submission.tasks) for name in ("queries", "answered"))
+    asked = counted(queries, "query", "queries")
+    yield f"{submission.card.name}: {answered} of {asked} of the board {submission.board} have a row"
     if answered < queries:
         yield f"  {queries - answered} have none and count as misses"
-    if CONTROLS not in {task.suite for task in said.tasks}:
+    if CONTROLS not in {task.suite for task in submission.tasks}:
         yield f"  the suite {CONTROLS!r} is not answered: nothing vouches for these answers but their author"
 
 
@@ -222,14 +223,14 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
     Return its record and all faults, queries without a row among them. Raise `StoreError` if its files differ from its
     record or something cannot be read, and `ConfigError` if the record is wrong in itself.
     """
-    said = read_submission(folder)
-    split = None if said.split is None else find_split(said.split)
+    submission = read_submission(folder)
+    split = None if submission.split is None else find_split(submission.split)
     places = () if split is None else tuple(split.blocks)
     if not tasks:
-        return said, tuple(submission_faults(folder, said, None, places=places))
+        return submission, tuple(submission_faults(folder, submission, None, places=places))
     with laid_tasks(tasks) as folders:
-        faults = submission_faults(folder, said, folders, board=board_of(tasks), places=places)
-        return said, tuple(faults)
+        faults = submission_faults(folder, submission, folders, board=board_of(tasks), places=places)
+        return submission, tuple(faults)
 
 
 def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:
@@ -241,7 +242,7 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
         message = "submissions are scored beside the stored results of a board: name them with --predictions"
         raise ConfigError(message)
     found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
-    boards = {folder: _board_said(folder, board) for folder in found.values()}
+    boards = {folder: _board_named(folder, board) for folder in found.values()}
     others = sorted({name for name in boards.values() if name != board})
     if others:
         count = sum(name != board for name in boards.values())
@@ -249,7 +250,7 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
     return tuple(folder for folder, name in boards.items() if name == board)
 
 
-def _board_said(folder: Path, board: str) -> str:
+def _board_named(folder: Path, board: str) -> str:
     """Return the board that a submission names; an unreadable one fails on this board, which reports it."""
     try:
         return read_submission(folder).board

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a board holds of the paper's experiment besides its own files: the order of the steps."""
+"""Files of a board for the paper's experiment besides its own: the order of the steps."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -85,10 +85,10 @@ def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
     """Return a row for each matcher: each figure of the paper and ours; for Recall@1 the other interval too."""
     rows = []
     for matcher in matchers:
-        mine = _by_metric(summary, matcher)
-        row = {"method": mine["recall_1"]["title"]}
+        by_metric = _by_metric(summary, matcher)
+        row = {"method": by_metric["recall_1"]["title"]}
         for metric, title in METRICS.items():
-            one = mine[metric]
+            one = by_metric[metric]
             if not math.isnan(one["paper"]):
                 row[f"{title}, paper"] = shown(one["paper"], one["paper_lo"], one["paper_hi"])
             row[f"{title}, ours"] = shown(one["value"], *used_interval(one))
@@ -96,7 +96,7 @@ def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
                 is_tile = one["cluster"] == "tile"
                 other = (one["cluster_lo"], one["cluster_hi"]) if is_tile else (one["lo"], one["hi"])
                 row["by tiles" if is_tile else "Wilson"] = shown(one["value"], *other).partition(" ")[2] or "-"
-        rows.append(row | {"n": str(mine["recall_1"]["n"])})
+        rows.append(row | {"n": str(by_metric["recall_1"]["n"])})
     return pd.DataFrame(rows).fillna("-")
 
 
@@ -120,25 +120,25 @@ def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
 def difference_lines(summary: pd.DataFrame) -> Iterator[str]:
     """Yield a line for each of the paper's variants: the distance of each figure from the paper's."""
     for item in PUBLISHED:
-        mine = _by_metric(summary, item.matcher)
-        if mine:
-            told = [f"{title} {_difference(mine[metric])}" for metric, title in METRICS.items()]
-            yield f"**{item.title}**: {'; '.join(told)}."
+        by_metric = _by_metric(summary, item.matcher)
+        if by_metric:
+            parts = [f"{title} {_difference(by_metric[metric])}" for metric, title in METRICS.items()]
+            yield f"**{item.title}**: {'; '.join(parts)}."
 
 
 def _difference(row: Mapping[str, Any]) -> str:
     ours, paper = shown(row["value"]), shown(row["paper"])
     if ours == paper:
         return f"{ours}, as in the paper"
-    apart = float(ours) - float(paper)  # of the figures as they are printed
-    said = f"{ours} is {abs(apart):.3f} {'above' if apart > 0 else 'below'} the paper's {paper}, which lies "
+    gap = float(ours) - float(paper)  # of the figures as they are printed
+    start = f"{ours} is {abs(gap):.3f} {'above' if gap > 0 else 'below'} the paper's {paper}, which lies "
     if row["is_within"]:
-        return f"{said}inside our interval"
+        return f"{start}inside our interval"
     if math.isnan(row["paper_lo"]):
-        return f"{said}outside our interval"
+        return f"{start}outside our interval"
     lo, hi = used_interval(row)
     meet = lo <= row["paper_hi"] and row["paper_lo"] <= hi
-    return f"{said}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
+    return f"{start}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
 
 
 def _steps(findings: Sequence[Finding]) -> pd.DataFrame:

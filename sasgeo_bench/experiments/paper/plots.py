@@ -21,7 +21,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.sheet import HIDDEN, Panel, paint
 
-# Okabe and Ito's colours, told apart by all kinds of sight; marks and dashes differ too.
+# Okabe and Ito's colours, distinct for colour-blind readers; marks and dashes differ too.
 _COLOURS: Final = ("#e69f00", "#0072b2", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#000000", "#f0e442")
 _MARKS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DASHES: Final = ("-", "-", "--", "-.", ":", "-", "--", "-.")
@@ -53,8 +53,8 @@ def _page(path: Path, width: float, height: float, title: str, note: str, data: 
         figure.text(0.15 / width, 0.09 / height, f"Data: {data}", fontsize=7.5, color=_GREY, va="bottom")
         yield figure
         kind = path.suffix.removeprefix(".")
-        said = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
-        figure.savefig(path, format=kind, metadata={"Title": title, "Source": data, **said})
+        plain = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
+        figure.savefig(path, format=kind, metadata={"Title": title, "Source": data, **plain})
 
 
 def _wrapped(title: str) -> str:
@@ -186,23 +186,23 @@ def draw_robustness(path: Path, table: pd.DataFrame, *, data: str) -> None:
             if number >= len(names):
                 chart.set_visible(False)
                 continue
-            mine = table[table["matcher"] == names[number]]
-            _steps(chart, mine, _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)])
-            chart.set_title(_wrapped(mine["title"].iloc[0]), fontsize=9, pad=5)
+            rows = table[table["matcher"] == names[number]]
+            _steps(chart, rows, _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)])
+            chart.set_title(_wrapped(rows["title"].iloc[0]), fontsize=9, pad=5)
         for chart in charts[:, 0]:
             chart.set_ylabel("Recall@1")
         figure.text(0.53, 0.73 / height, "map-change probability", ha="center", fontsize=9)
 
 
-def _steps(chart: Axes, mine: pd.DataFrame, colour: str, mark: str) -> None:
-    value, lo, hi = (mine[name].to_numpy(float) for name in ("value", "lo", "hi"))
+def _steps(chart: Axes, rows: pd.DataFrame, colour: str, mark: str) -> None:
+    value, lo, hi = (rows[name].to_numpy(float) for name in ("value", "lo", "hi"))
     chart.errorbar(
-        mine["mean"], value, yerr=[value - lo, hi - value], color=colour, marker=mark, ms=5, lw=1.3, capsize=3
+        rows["mean"], value, yerr=[value - lo, hi - value], color=colour, marker=mark, ms=5, lw=1.3, capsize=3
     )
-    edges = sorted({*mine["low"], *mine["high"]})
+    edges = sorted({*rows["low"], *rows["high"]})
     for edge in edges:
         chart.axvline(edge, color="#eeeeee", lw=0.7, zorder=0)
-    for middle, count in zip((mine["low"] + mine["high"]) / 2, mine["n"], strict=True):
+    for middle, count in zip((rows["low"] + rows["high"]) / 2, rows["n"], strict=True):
         chart.text(middle, 0.02, f"n {count}", fontsize=6, ha="center", color=_GREY)
     chart.set_xticks(edges, [f"{edge:g}" for edge in edges], fontsize=7.5)
     chart.set_ylim(0, 1.03)
@@ -226,12 +226,12 @@ def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
         charts = figure.subplots(1, 2)
         figure.subplots_adjust(left=0.07, right=0.985, top=0.9, bottom=0.35, wspace=0.17)
         for number, name in enumerate(names):
-            mine = table[table["matcher"] == name]
-            first = mine.iloc[0]
+            rows = table[table["matcher"] == name]
+            first = rows.iloc[0]
             for chart in charts:
                 chart.plot(
-                    [0, *mine["coverage"]],
-                    [first["risk"], *mine["risk"]],
+                    [0, *rows["coverage"]],
+                    [first["risk"], *rows["risk"]],
                     color=_COLOURS[number % len(_COLOURS)],
                     ls=_DASHES[number % len(_DASHES)],
                     lw=1.6,

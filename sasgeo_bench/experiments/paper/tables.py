@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's experiment as tables: every trial, our figures beside its Table II, and what its figures show."""
+"""The paper's experiment as tables: every trial, our figures next to its Table II, and data of its figures."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -141,23 +141,23 @@ def summary_frame(trials: pd.DataFrame, board: pd.DataFrame) -> pd.DataFrame:
     whole = board[(board["stratum"] == ALL) & (board["rejector"] == "")].set_index(["matcher", "metric"])
     rows = []
     for matcher in in_order(list(dict.fromkeys(trials["matcher"]))):
-        mine = trials[trials["matcher"] == matcher]
-        is_asked = bool((mine["status"] != NOT_APPLICABLE).any())
+        own = trials[trials["matcher"] == matcher]
+        is_asked = bool((own["status"] != NOT_APPLICABLE).any())
         paper = next((item for item in PUBLISHED if item.matcher == matcher), None)
         for metric in METRICS:
-            found = wilson_mean(mine[metric].to_numpy(float)) if is_asked else _NOTHING
+            found = wilson_mean(own[metric].to_numpy(float)) if is_asked else _NOTHING
             over = _over_clusters(whole, matcher, metric)
             row: dict[str, Any] = {
                 "matcher": matcher,
                 "title": title_of(matcher),
                 "metric": metric,
-                **_said(paper, metric),
+                **_published(paper, metric),
                 "value": found.value,
                 "lo": found.lo,
                 "hi": found.hi,
-                "n": len(mine),
+                "n": len(own),
                 "cluster": "tile" if seeds == 1 else "seed",
-                "clusters": int(mine["block"].nunique()),
+                "clusters": int(own["block"].nunique()),
                 "cluster_lo": over.lo,
                 "cluster_hi": over.hi,
             }
@@ -166,7 +166,7 @@ def summary_frame(trials: pd.DataFrame, board: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _said(paper: Published | None, metric: str) -> dict[str, float]:
+def _published(paper: Published | None, metric: str) -> dict[str, float]:
     """Return the paper's figure; it gives an interval of Recall@1 alone."""
     if paper is None:
         return {"paper": math.nan, "paper_lo": math.nan, "paper_hi": math.nan, "paper_n": 0}
@@ -195,15 +195,15 @@ def robustness_frame(trials: pd.DataFrame) -> pd.DataFrame:
     Controls are left out.
     """
     rows = []
-    for matcher, mine in _contestants(trials):
-        at = np.clip(np.digitize(mine["change_probability"], CHANGE_EDGES[1:-1]), 0, len(CHANGE_EDGES) - 2)
+    for matcher, own in _contestants(trials):
+        at = np.clip(np.digitize(own["change_probability"], CHANGE_EDGES[1:-1]), 0, len(CHANGE_EDGES) - 2)
         for index, (low, high) in enumerate(pairwise(CHANGE_EDGES)):
-            part = mine[at == index]
+            part = own[at == index]
             if len(part):
                 found = wilson_mean(part["recall_1"].to_numpy(float))
                 mean = float(part["change_probability"].mean())
-                said = {"matcher": matcher, "title": title_of(matcher), "low": low, "high": high, "mean": mean}
-                rows.append(said | {"n": len(part), "value": found.value, "lo": found.lo, "hi": found.hi})
+                head = {"matcher": matcher, "title": title_of(matcher), "low": low, "high": high, "mean": mean}
+                rows.append(head | {"n": len(part), "value": found.value, "lo": found.lo, "hi": found.hi})
     return pd.DataFrame(rows)
 
 
@@ -214,17 +214,17 @@ def risk_frame(trials: pd.DataFrame) -> pd.DataFrame:
     Controls are left out.
     """
     frames = []
-    for matcher, mine in _contestants(trials):
+    for matcher, own in _contestants(trials):
         some = Answers(
-            confidence=mine["margin"].to_numpy(float),
-            is_answered=mine["is_answered"].to_numpy(bool),
-            is_right=mine["is_right"].to_numpy(bool),
-            is_present=np.ones(len(mine), dtype=bool),
+            confidence=own["margin"].to_numpy(float),
+            is_answered=own["is_answered"].to_numpy(bool),
+            is_right=own["is_right"].to_numpy(bool),
+            is_present=np.ones(len(own), dtype=bool),
         )
         curve = risk_coverage(some)
-        said = {"matcher": matcher, "title": title_of(matcher)}
+        head = {"matcher": matcher, "title": title_of(matcher)}
         points = {"margin": curve.threshold, "coverage": curve.coverage, "risk": curve.risk}
-        frames.append(pd.DataFrame(said | points | {"n": len(mine), "aurc": aurc(some)}))
+        frames.append(pd.DataFrame(head | points | {"n": len(own), "aurc": aurc(some)}))
     return pd.concat(frames, ignore_index=True)
 
 

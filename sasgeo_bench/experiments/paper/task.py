@@ -134,9 +134,9 @@ def rectangle(shape: tuple[int, int], share: float, rng: np.random.Generator) ->
     True
     """
     stretch = _LONGEST ** float(rng.uniform(-0.5, 0.5))
-    wanted = share * shape[0] * shape[1]
-    rows = min(shape[0], max(1, round(math.sqrt(wanted) * stretch)))
-    cols = min(shape[1], int(wanted / rows))
+    area_cells = share * shape[0] * shape[1]
+    rows = min(shape[0], max(1, round(math.sqrt(area_cells) * stretch)))
+    cols = min(shape[1], int(area_cells / rows))
     top, left = rng.integers(0, (shape[0] - rows + 1, shape[1] - cols + 1)).tolist()
     covered = np.zeros(shape, dtype=bool)
     covered[top : top + rows, left : left + cols] = True
@@ -206,7 +206,7 @@ TRIALS: Final = 220
 GROUP: Final = PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15)
 DATE: Final = dt.date(2026, 1, 1)
 STRENGTH_UNIT: Final = "map-change probability"
-DATA: Final = "procedural regions, no OSM data in them"  # what pictures and tables say of where they come from
+DATA: Final = "procedural regions, no OSM data in them"  # source stated by pictures and tables
 
 
 def make_paper_task(
@@ -245,8 +245,8 @@ def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS, private: Priv
     Task, truths and region are as they were written, and nothing that decides their content has changed since.
     """
     folder = out / "tasks" / SUITE / region_name(seed)
-    said = task_files.read_hidden(out / "truth" / SUITE / region_name(seed))
-    if said.get("request_sha256") != _request_sha256(seed, trials, private):
+    record = task_files.read_hidden(out / "truth" / SUITE / region_name(seed))
+    if record.get("request_sha256") != _request_sha256(seed, trials, private):
         return None
     try:
         faults = [*check_task(folder, out=out), *region_files.differing_files(out / "regions" / region_name(seed))]
@@ -257,7 +257,7 @@ def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS, private: Priv
 
 def _request_sha256(seed: int, trials: int, private: PrivateSeed | None) -> str:
     """Hash all that decides which trials a seed gives; the recipe itself is in it by its version."""
-    said = {
+    record = {
         "suite": [SUITE, VERSION, TASK_VERSION],
         "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().model_dump(mode="json")],
         "seed": seed,
@@ -265,8 +265,8 @@ def _request_sha256(seed: int, trials: int, private: PrivateSeed | None) -> str:
         "made_by": version("sasgeo-bench"),
     }
     if private is not None:
-        said["private_seed"] = private.commitment
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        record["private_seed"] = private.commitment
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def region_name(seed: int) -> str:

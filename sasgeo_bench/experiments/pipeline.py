@@ -290,16 +290,7 @@ def run_pipeline(
         raise ConfigError(message)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
-    runs: dict[str, list[_Run]] = {}
-    for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
-        with failures.of(spec, but=(ConfigError,)):
-            runs[spec] = _plan_runs(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
-    folders: list[Path] = []
-    for spec, found in runs.items():
-        with failures.of(spec, but=(ConfigError,)):
-            folders += _run(spec, found, tell, progress)
-    if not folders and failures.first is not None:
-        raise failures.first
+    folders = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
     split = plan.requests[0].split if plan.requests else None
     contrasts = tuple(contrast_of(item.model_dump(exclude={"why"})) for item in plan.spec.contrast)
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
@@ -324,6 +315,29 @@ def run_pipeline(
     if results is not None:
         tell(pack_board(board, request, results / plan.spec.id).to_text())
     return board
+
+
+def _run_all(
+    plan: PipelinePlan,
+    tasks: list[Path],
+    controls: list[Path],
+    failures: Failures,
+    *,
+    tell: Tell,
+    progress: Progress | None,
+) -> list[Path]:
+    """Run every matcher, and return the folders of all runs; raise the first failure if all fail."""
+    runs: dict[str, list[_Run]] = {}
+    for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
+        with failures.of(spec, but=(ConfigError,)):
+            runs[spec] = _plan_runs(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
+    folders: list[Path] = []
+    for spec, found in runs.items():
+        with failures.of(spec, but=(ConfigError,)):
+            folders += _run(spec, found, tell, progress)
+    if not folders and failures.first is not None:
+        raise failures.first
+    return folders
 
 
 @dataclass(frozen=True, kw_only=True)

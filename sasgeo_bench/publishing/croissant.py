@@ -83,11 +83,6 @@ FEATURE_TEXTS: Final = {
 }
 
 
-def shown(texts: dict[str, str]) -> str:
-    """Return a table of columns in Markdown."""
-    return "\n".join(("| Column | What |", "|---|---|", *(f"| `{name}` | {text} |" for name, text in texts.items())))
-
-
 if TYPE_CHECKING:
     import mlcroissant as mlc
 

@@ -6,8 +6,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.publishing.croissant import QUERY_TEXTS, TRUTH_TEXTS, cite_as, shown
-from sasgeo_bench.publishing.release_files import COPYRIGHT_URL, LICENCE_URL, TRUTHS, Release, ReleaseTask, places_of
+from sasgeo_bench.publishing.croissant import QUERY_TEXTS, TRUTH_TEXTS, cite_as
+from sasgeo_bench.publishing.release_files import (
+    COPYRIGHT_URL,
+    LICENCE_URL,
+    TRUTHS,
+    Release,
+    ReleaseMap,
+    ReleaseTask,
+    places_of,
+)
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.texts import markdown, markdown_code, quoted
 
@@ -85,13 +93,13 @@ def _truth_line(release: Release) -> str:
     return f"those of {' and '.join(released)} are here, those of test are kept back" if released else "kept back"
 
 
+def _table(head: str, rows: Iterable[str]) -> str:
+    """Join the lines of a Markdown table."""
+    return "\n".join((head, "|" + "---|" * (head.count("|") - 1), *rows))
+
+
 def _suites(release: Release) -> str:
-    lines = [
-        "## Suites",
-        "",
-        "| Configuration | What is asked | Split | Queries | Maps | Truths |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for suite in release.suites:
         tasks = release.tasks_of(suite)
         for part in release.tables_of(suite):
@@ -99,41 +107,39 @@ def _suites(release: Release) -> str:
             released = f"`{suite}-{TRUTHS}`" if any(part in task.released for task in own) else "kept back"
             count = sum(task.parts[part] for task in own)
             title = markdown(tasks[0].about["title"])
-            lines.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {released} |")
-    return "\n".join(lines)
+            rows.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {released} |")
+    return "## Suites\n\n" + _table("| Configuration | What is asked | Split | Queries | Maps | Truths |", rows)
 
 
 def _regions(release: Release) -> str:
     split = release.split
-    lines = [
+    places = (
+        f"| {place.name} | {place.part or f'half {place.half}'} | {', '.join((*place.regions, *place.blocks))} |"
+        for place in places_of(release)
+    )
+    crossfit = (
+        "Each place is tested once. What is learnt for a place comes from the other half; the rest of its own half "
+        "calibrates."
+    )
+    buffer = (
+        f"Split `{split.id}` ({markdown(split.title)}): places that are used for different purposes keep at least "
+        f"{split.buffer_m:g} m apart."
+    )
+    parts = (
         "## Maps and places",
-        "",
-        (
-            f"Split `{split.id}` ({markdown(split.title)}): places that are used for different purposes keep at least "
-            f"{split.buffer_m:g} m apart."
-        ),
-        "",
-        "| Place | Part or half | Regions |",
-        "|---|---|---|",
-    ]
-    for place in places_of(release):
-        regions = ", ".join((*place.regions, *place.blocks))
-        lines.append(f"| {place.name} | {place.part or f'half {place.half}'} | {regions} |")
-    if split.kind == "crossfit":
-        lines += [
-            "",
-            (
-                "Each place is tested once. What is learnt for a place comes from the other half; the rest of its own "
-                "half calibrates."
-            ),
-        ]
-    lines += ["", "| Map | What | Date | Size | CRS |", "|---|---|---|---|---|"]
-    for item in release.maps:
-        about = item.manifest
-        size = f"{about.cols} x {about.rows} cells of {about.cell_size_m:g} m"
-        lines.append(f"| `{item.name}` | {markdown(about.title)} | {about.extract.date} | {size} | EPSG:{about.epsg} |")
-    lines += ["", "`name@date` is an older map of a place, `name+suite` one that a suite has edited."]
-    return "\n".join(lines)
+        buffer,
+        _table("| Place | Part or half | Regions |", places),
+        *((crossfit,) if split.kind == "crossfit" else ()),
+        _table("| Map | What | Date | Size | CRS |", map(_map_row, release.maps)),
+        "`name@date` is an older map of a place, `name+suite` one that a suite has edited.",
+    )
+    return "\n\n".join(parts)
+
+
+def _map_row(item: ReleaseMap) -> str:
+    about = item.manifest
+    size = f"{about.cols} x {about.rows} cells of {about.cell_size_m:g} m"
+    return f"| `{item.name}` | {markdown(about.title)} | {about.extract.date} | {size} | EPSG:{about.epsg} |"
 
 
 def _loading(release: Release) -> str:
@@ -192,16 +198,19 @@ With sasgeo-bench itself, `sasgeo-bench run --tasks tasks/{suite}/{name}` runs a
 as the program's own."""
 
 
+def _columns(texts: Mapping[str, str]) -> str:
+    return _table("| Column | What |", (f"| `{name}` | {text} |" for name, text in texts.items()))
+
+
 def _meaning(release: Release) -> str:
     truths = ""
     if any(task.released for task in release.tasks):
-        truths = (
-            f"\n\n## Columns of the truths\n\nA row for each query, to be joined by `query_id`.\n\n{shown(TRUTH_TEXTS)}"
-        )
+        head = "\n\n## Columns of the truths\n\nA row for each query, to be joined by `query_id`.\n\n"
+        truths = head + _columns(TRUTH_TEXTS)
     return f"""\
 ## Columns of the queries
 
-{shown(QUERY_TEXTS)}
+{_columns(QUERY_TEXTS)}
 
 Easting and northing are metres in the CRS of the map (`epsg` in its `region.json`); a yaw is a heading, clockwise
 from grid north. Outside the mapped area nothing is known, which is not the same as absent.
@@ -326,7 +335,7 @@ def _sum(counts: Iterable[Mapping[str, int]]) -> Counter[str]:
 
 def _class_table(objects: Counter[str]) -> str:
     lines = (f"| {markdown_code(name)} | {count:,} |" for name, count in objects.items())
-    return "\n".join(("| Class | Objects in all maps |", "|---|---|", *lines))
+    return _table("| Class | Objects in all maps |", lines)
 
 
 def _mapped_line(release: Release) -> str:
@@ -346,8 +355,8 @@ def _left_out_line(release: Release) -> str:
 
 def _collection(release: Release) -> str:
     files = {item.manifest.extract.file: item.manifest.extract.sha256 for item in release.maps}
-    lines = [f"| {markdown_code(name)} | {markdown_code(files[name])} |" for name in sorted(files)]
-    table = "\n".join(("| Extract | SHA-256 |", "|---|---|", *lines))
+    lines = (f"| {markdown_code(name)} | {markdown_code(files[name])} |" for name in sorted(files))
+    table = _table("| Extract | SHA-256 |", lines)
     return f"""\
 ## Collection
 

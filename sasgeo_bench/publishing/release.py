@@ -128,25 +128,17 @@ def check_installed() -> None:
 
 
 def _check_folder(into: Path, out: Path) -> None:
-    inside = next(
-        (
-            name
-            for name in ("regions", "tasks", "truth", "runs", "boards")
-            if into.resolve().is_relative_to((out / name).resolve())
-        ),
-        None,
-    )
+    others = (out / name for name in ("regions", "tasks", "truth", "runs", "boards"))
+    inside = next((folder for folder in others if into.resolve().is_relative_to(folder.resolve())), None)
     if inside is not None:
-        message = f"{into} lies inside {out / inside}, which others read: name another folder with --into"
+        message = f"{into} lies inside {inside}, which others read: name another folder with --into"
         raise ConfigError(message)
     check_target(into)
 
 
 def _check_region(name: str, split: SplitFile, out: Path) -> None:
     if not is_of_region(name, name):
-        message = (
-            f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries are searched in come by themselves"
-        )
+        message = f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries need are added automatically"
         raise ConfigError(message)
     if not (out / "regions" / name / region_files.MANIFEST).is_file():
         find_region_file(name)  # an unknown one is named with the nearest there is

@@ -4,7 +4,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -276,18 +276,14 @@ def _render(templates: Environment, template: str, page: str, values: Mapping[st
 
 
 def _verdicts(source: SiteSource) -> list[Verdict]:
-    return [
-        Verdict(
-            control=str(row["control"]),
-            matcher=str(row["matcher"]),
-            n=int(row["n"]),
-            found=float(row["found"]),
-            expected=float(row["expected"]),
-            p=float(row["p"]),
-            holds=bool(row["holds"]),
-        )
-        for row in source.controls.to_dict("records")
-    ]
+    kinds: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(("control", "matcher"), str),
+        "n": int,
+        **dict.fromkeys(("found", "expected", "p"), float),
+        "holds": bool,
+    }
+    records = source.controls.to_dict("records")
+    return [Verdict(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in records]
 
 
 def _controls_state(verdicts: Sequence[Verdict]) -> str:

@@ -47,17 +47,10 @@ KINDS: Final = {  # of figures, by how their names begin, in the order they are 
 
 def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]]:
     """Return figures under the titles of their kinds."""
-    found: dict[str, list[SiteFigure]] = {}
-    for kind, title in (*KINDS.items(), ("", "Other figures")):
-        of_kind = [item for item in figures if _kind_of(item) == kind]
-        if of_kind:
-            found[title] = of_kind
-    return found
-
-
-def _kind_of(figure: SiteFigure) -> str:
-    kind = figure.file.partition("-")[0]
-    return kind if kind in KINDS else ""
+    found: dict[str, list[SiteFigure]] = {title: [] for title in (*KINDS.values(), "Other figures")}
+    for item in figures:
+        found[KINDS.get(item.file.partition("-")[0], "Other figures")].append(item)
+    return {title: items for title, items in found.items() if items}
 
 
 def _groups(book: Book) -> dict[tuple[str, str], list[Key]]:
@@ -151,21 +144,21 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
     )
 
 
-def _trained(said: object) -> str:
+def _trained(stated: object) -> str:
     """Return the training places that a card names: "none", some, or some for each half."""
-    if isinstance(said, Mapping):
-        return "; ".join(f"half {half}: {_trained(places)}" for half, places in said.items())
-    places = [] if isinstance(said, str) or not isinstance(said, Sequence) else list(map(str, said))
+    if isinstance(stated, Mapping):
+        return "; ".join(f"half {half}: {_trained(places)}" for half, places in stated.items())
+    places = [] if isinstance(stated, str) or not isinstance(stated, Sequence) else list(map(str, stated))
     return ", ".join(places) or "no place that its card names"
 
 
 def _training(entry: Mapping[str, Any]) -> Iterator[str]:
     """Yield the training of an entry by the runner, and the regions it was then tested on: tasks are hundreds."""
     for one in entry.get("learned") or ():
-        verb = "Learnt" if one["file"] else "Could not learn"
+        verb = "Trained on" if one["file"] else "Could not be trained on"
         regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
         yield (
-            f"{verb} from {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; asked so in "
+            f"{verb} {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; then tested in "
             f"{counted(len(one['asked']), 'task')} on {', '.join(regions)}."
         )
 

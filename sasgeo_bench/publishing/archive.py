@@ -173,7 +173,7 @@ def request_of(
     if not rejectors:
         check_registered(settings.rejectors, source=str(stored))
     name = split or settings.split or (None if stored else "crossfit")
-    failed = {}  # contrasts may name entries that failed when results were stored, and hold no answer
+    failed: dict[str, str] = {}  # contrasts may name entries that failed when results were stored
     if stored is not None and (stored / BOARD).is_file():
         failed = dict(read_board(stored)[0].get("failed", {}))
     return ScoreRequest(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pipeline file -> queries, runs and a board; what is up to date is not done again."""
+"""A pipeline file -> queries, runs and a board; steps that are up to date are skipped."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,14 +19,13 @@ from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, PipelineFile
 from sasgeo_bench.matching.plugins import YARDSTICK, check_names
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import pack_board
+from sasgeo_bench.publishing.archive import contrast_of, pack_board
 from sasgeo_bench.publishing.archive_folder import check_results
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed
@@ -48,7 +47,7 @@ MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is co
 class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
-    With a private seed all is below `out`, which then is the root of private runs.
+    With a private seed, `out` is the root of private runs.
     """
 
     spec: PipelineFile
@@ -62,10 +61,7 @@ class PipelinePlan:
     def to_text(self) -> str:
         """Return which parts of each stage are up to date; every matcher is loaded to find out.
 
-        Raises
-        ------
-        MatchError, StoreError
-            As the run would.
+        Raise `MatchError` or `StoreError` as the run would.
         """
         queries, controls = _stage("queries", self.requests), _stage("controls", self.controls)
         stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
@@ -85,13 +81,13 @@ class PipelinePlan:
 
     @property
     def matchers(self) -> tuple[str, ...]:
-        """Those of the file, and those that every board has."""
+        """Return the matchers of the file, and those of every board."""
         return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Lacking:
-    """A task that is to be drawn, and why."""
+    """A task to be drawn, and why."""
 
     suite: str
     region: str
@@ -100,19 +96,19 @@ class _Lacking:
 
 @dataclass(frozen=True, kw_only=True)
 class _Stage:
-    """Tasks of one kind: folders of those that are up to date, request by request, and what is to be drawn."""
+    """Tasks of one kind: folders of those that are up to date, request by request, and tasks to be drawn."""
 
     name: str
     made: tuple[tuple[Path, ...], ...]
     lacking: tuple[_Lacking, ...]
 
     def lines(self) -> list[str]:
-        """How many are up to date, why the others are not, and the first of these by name."""
+        """Report how many are up to date, why the others are not, and the first of these by name."""
         state = f"{len(self.made)} of {counted(len(self.made) + len(self.lacking), 'task')} up to date"
         if self.lacking:
             reasons = Counter(item.why for item in self.lacking)
-            told = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
-            state = f"{state}, {len(self.lacking)} to be drawn ({told})"
+            causes = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
+            state = f"{state}, {len(self.lacking)} to be drawn ({causes})"
         lines = [f"  {self.name}: {state}"]
         lines += [f"    to be drawn: {item.suite} on {item.region}" for item in self.lacking[:MOST_LINES]]
         more = len(self.lacking) - MOST_LINES
@@ -120,7 +116,7 @@ class _Stage:
 
 
 def _stage(name: str, requests: Sequence[Request]) -> _Stage:
-    """Return which of some requests are up to date."""
+    """Sort requests into those that are up to date and those to be drawn."""
     found = [(request, made_tasks(request)) for request in requests]
     return _Stage(
         name=name,
@@ -158,25 +154,25 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
 
 
 def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -> list[str]:
-    """By matcher what is answered and what is to be asked, and what answers lie with tasks that are drawn anew."""
+    """Report, by matcher, answered and open queries, and answers to tasks that are drawn anew."""
     asked = [(spec, list(stages)) for spec in plan.matchers]
     asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
     lines, all_done, all_left, all_behind = [], 0, 0, 0
-    for spec, mine in asked:
+    for spec, own_stages in asked:
         try:
-            goes = _plan_goes(plan, spec, [task for stage in mine for made in stage.made for task in made])
+            runs = _plan_runs(plan, spec, [task for stage in own_stages for made in stage.made for task in made])
         except (MatchError, StoreError) as error:
             lines.append(f"    {spec}: cannot be asked ({error})")
             continue
-        left, done = _count(goes)
-        planned = goes[0].plan
-        lacking = [item for stage in mine for item in stage.lacking if _is_asked(plan, spec, item.suite)]
+        left, done = _count(runs)
+        planned = runs[0].plan
+        lacking = [item for stage in own_stages for item in stage.lacking if _is_asked(plan, spec, item.suite)]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
         more = f", and what is drawn; {behind} answered there before" if lacking else ""
-        where = " (controls alone)" if mine == [controls] and len(stages) > 1 else ""
+        where = " (controls alone)" if own_stages == [controls] and len(stages) > 1 else ""
         lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
-        lines += [f"      {go.name}: {line}" for go in goes for line in go.lines()]
+        lines += [f"      {one.name}: {line}" for one in runs for line in one.lines()]
         all_done, all_left, all_behind = all_done + done, all_left + left, all_behind + behind
     lines.insert(0, f"  run: {counted(len(asked), 'matcher')}, {all_done} answered, {all_left} to ask")
     if all_behind:
@@ -214,19 +210,14 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
     `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
     serve regions that are not built yet, and files of one's own. `jobs` counts the processes of each matcher, `dask`
     names a cluster to run on instead. `private` draws all queries instead of the file's seed, below `out/private`.
-
-    Raises
-    ------
-    ConfigError
-        If a suite, region or split is unknown, or no region can be built here.
-    MatchError
-        If no installed package has a matcher or a rejector of a name.
+    Raise `ConfigError` if a suite, region or split is unknown, or no region can be built here; `MatchError` if no
+    installed package has a matcher or a rejector of a name.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
     out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
-        wanted = Wanted(
+        asked = Wanted(
             suites=tuple(task.suites),
             regions=tuple(spec.regions),
             split=str(spec.split),  # a file with tasks names one
@@ -240,7 +231,7 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
             choice=Choice(views_cells=tuple(task.views_cells), kinds=tuple(task.kinds), tracks=tuple(task.tracks)),
         )
         try:
-            requests += plan_requests(wanted, tell=tell if number == 0 else _silent)
+            requests += plan_requests(asked, tell=tell if number == 0 else _silent)
         except ConfigError as error:
             message = f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}"
             raise ConfigError(message) from error
@@ -271,7 +262,7 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
 
 
 def _silent(line: str) -> None:
-    """Say once what is left out, not for every group of suites."""
+    """Report nothing: what is left out is reported once, not for every group of suites."""
     del line
 
 
@@ -284,35 +275,12 @@ def run_pipeline(
     has_cases: bool = True,
     private: Path | None = None,
 ) -> Board:
-    """Draw what is missing, run what has no row, score all of it and write the board.
+    """Draw what is missing, run queries without a row, score all of it, and write the board to out/boards/<id>/.
 
-    Parameters
-    ----------
-    plan : PipelinePlan
-        From `plan_pipeline`.
-    tell : callable
-        Gets a line for every step.
-    progress : Progress, optional
-        Is told of every answer.
-    results : Path, optional
-        Folder to store the board in, with the answers and truths it was made of, as <id>/.
-    has_cases : bool
-        Whether the board shows queries that went wrong, with their truths.
-    private : Path, optional
-        The board of a private seed of this pipeline, which the rows are held against.
-
-    Returns
-    -------
-    Board
-        As it was written to out/boards/<id>/.
-
-    Raises
-    ------
-    ConfigError
-        If no region can carry any of the suites.
-    StoreError
-        If the board cannot be stored where it should, before anything is done; or as `archive.pack_board` does, when
-        the board itself is written.
+    `results` is a folder to store the board in, with the answers and truths it was made of, as <id>/. `has_cases` shows
+    failed queries with their truths on the board. `private` is the board of a private seed of this pipeline, which the
+    rows are compared with. Raise `ConfigError` if no region can carry any of the suites; `StoreError` if the board
+    cannot be stored in `results`, before anything is done, or as `pack_board` does after the board is written.
     """
     if results is not None:
         check_results(results / plan.spec.id, board_folder(plan))
@@ -322,18 +290,9 @@ def run_pipeline(
         raise ConfigError(message)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
-    goes: dict[str, list[_Go]] = {}
-    for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
-        with failures.of(spec, but=(ConfigError,)):
-            goes[spec] = _plan_goes(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
-    folders: list[Path] = []
-    for spec, found in goes.items():
-        with failures.of(spec, but=(ConfigError,)):
-            folders += _run(spec, found, tell, progress)
-    if not folders and failures.first is not None:
-        raise failures.first
+    folders = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
     split = plan.requests[0].split if plan.requests else None
-    contrasts = _contrasts(plan.spec)
+    contrasts = tuple(contrast_of(item.model_dump(exclude={"why"})) for item in plan.spec.contrast)
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
     pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
     request = ScoreRequest(
@@ -358,47 +317,70 @@ def run_pipeline(
     return board
 
 
+def _run_all(
+    plan: PipelinePlan,
+    tasks: list[Path],
+    controls: list[Path],
+    failures: Failures,
+    *,
+    tell: Tell,
+    progress: Progress | None,
+) -> list[Path]:
+    """Run every matcher, and return the folders of all runs; raise the first failure if all fail."""
+    runs: dict[str, list[_Run]] = {}
+    for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
+        with failures.of(spec, but=(ConfigError,)):
+            runs[spec] = _plan_runs(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
+    folders: list[Path] = []
+    for spec, found in runs.items():
+        with failures.of(spec, but=(ConfigError,)):
+            folders += _run(spec, found, tell, progress)
+    if not folders and failures.first is not None:
+        raise failures.first
+    return folders
+
+
 @dataclass(frozen=True, kw_only=True)
-class _Go:
-    """One run of a matcher; one that learns has one for each half, and its name says which."""
+class _Run:
+    """One run of a matcher; a matcher that learns has one for each half, which its name states."""
 
     name: str
     plan: RunPlan
 
     def lines(self) -> list[str]:
-        """What is learnt for it."""
+        """Report the training for it."""
         if self.name and self.plan.lesson is None:
             return ["nothing to learn from, asked untaught"]
         return self.plan.lesson_lines()
 
 
-def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) -> list[Path]:
-    """Folders of the runs of one matcher, after whatever had no row was asked."""
+def _run(spec: str, runs: Sequence[_Run], tell: Tell, progress: Progress | None) -> list[Path]:
+    """Run one matcher on all queries without a row, and return the folders of its runs."""
     folders: list[Path] = []
-    for go in goes:
-        left, done = _count([go])
-        label = f"{spec}, {go.name}" if go.name else spec
+    for one in runs:
+        left, done = _count([one])
+        label = f"{spec}, {one.name}" if one.name else spec
         tell(f"{label}: {left} queries to ask, {done} answered before")
-        for line in () if go.plan.lesson is not None else go.lines():
+        for line in () if one.plan.lesson is not None else one.lines():
             tell(f"{label}: {line}")
-        run(go.plan, tell=tell if left else _silent, progress=progress)
-        folders += [part.folder for part in go.plan.parts]
+        run(one.plan, tell=tell if left else _silent, progress=progress)
+        folders += [part.folder for part in one.plan.parts]
     return folders
 
 
-def _count(goes: Sequence[_Go]) -> tuple[int, int]:
-    """Queries to ask, and those that are answered."""
-    parts = [part for go in goes for part in go.plan.parts]
+def _count(runs: Sequence[_Run]) -> tuple[int, int]:
+    """Count open and answered queries."""
+    parts = [part for one in runs for part in one.plan.parts]
     return sum(len(part.left) for part in parts), sum(part.done for part in parts)
 
 
-def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go]:
-    """The runs of a matcher over some tasks: one, or with learning one for each half after learning from the other.
+def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Run]:
+    """Plan the runs of a matcher: one, or with learning one for each half after learning from the other.
 
     An oracle learns from the half itself.
     """
-    mine = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
-    whole = plan_run(_run_request(plan, spec, mine))
+    own = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
+    whole = plan_run(_run_request(plan, spec, own))
     learning = plan.spec.learning
     is_oracle = _is_oracle(plan, spec)
     if is_oracle and not is_unranked(whole.card.name):
@@ -407,12 +389,12 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
             f"oracles begin with {YARDSTICK}, so that no board ranks them"
         )
         raise ConfigError(message)
-    if learning is None or not whole.learns or not mine:
-        return [_Go(name="", plan=whole)]
+    if learning is None or not whole.learns or not own:
+        return [_Run(name="", plan=whole)]
     halves = {task: _half_of(plan, task) for task in tasks}
-    goes = []
+    runs = []
     for half in (*HALVES, None):
-        asked = [task for task in mine if halves[task] == half]
+        asked = [task for task in own if halves[task] == half]
         train = [
             task
             for task in tasks
@@ -428,8 +410,8 @@ def _plan_goes(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Go
             split=plan.requests[0].split,
         )
         if asked:
-            goes.append(_Go(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
-    return goes
+            runs.append(_Run(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
+    return runs
 
 
 def _is_oracle(plan: PipelinePlan, spec: str) -> bool:
@@ -442,7 +424,7 @@ def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
 
 
 def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
-    """The half of a task's region, in the pipeline's split or else in that of the controls; None for the paper's."""
+    """Return the half of a task's region in the split of the pipeline or else of the controls; None for the paper."""
     region = base_of(task.name)
     for request in (*plan.requests[:1], *plan.controls[:1]):
         for place in request.split.places_in(region):
@@ -466,7 +448,7 @@ def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest
 
 
 def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
-    """Task folders of every request that a region carries; those that are up to date are left as they are."""
+    """Draw every request that a region carries, unless it is up to date, and return the task folders."""
     tasks: list[Path] = []
     lacking: list[str] = []
     for drawn in carry_out(requests, jobs=jobs):
@@ -482,19 +464,10 @@ def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
 
 
 def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
-    """Task folders of every seed of the paper's experiment; those that are up to date are left as they are."""
+    """Draw every seed of the paper's experiment, unless it is up to date, and return the task folders."""
     paper = plan.spec.paper
     if paper is None:
         return []
     asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
     made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
     return [made(seed=seed) or draw(seed=seed) for seed in paper.seeds]
-
-
-def _contrasts(spec: PipelineFile) -> tuple[Contrast, ...]:
-    return tuple(
-        Contrast(
-            **item.model_dump(exclude={"why", "suites", "kinds"}), suites=tuple(item.suites), kinds=tuple(item.kinds)
-        )
-        for item in spec.contrast
-    )

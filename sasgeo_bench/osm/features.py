@@ -48,10 +48,10 @@ def make_features(columns: dict[str, object], *, epsg: int) -> "gpd.GeoDataFrame
 
 def check_features(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return a feature table unchanged; raise `ShapeError` if columns, types or CRS (projected, metres) are wrong."""
-    wanted = [*DTYPES, "geometry"]
-    if list(features.columns) != wanted:
+    expected = [*DTYPES, "geometry"]
+    if list(features.columns) != expected:
         message = (
-            f"a feature table has the columns {wanted!r}, got {list(features.columns)!r}: build it with make_features"
+            f"a feature table has the columns {expected!r}, got {list(features.columns)!r}: build it with make_features"
         )
         raise ShapeError(message)
     wrong = {name: str(features[name].dtype) for name, kind in DTYPES.items() if str(features[name].dtype) != kind}

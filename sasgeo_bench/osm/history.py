@@ -93,11 +93,11 @@ def read_lifecycle(path: Path, *, epsg: int) -> Lifecycle:
     return Lifecycle(gone=_places(gone, epsg), rising=_places(rising, epsg), started=started)
 
 
-def _tagged(path: Path, wanted: osmium.BaseFilter) -> Iterator[tuple[Any, bool, int]]:
+def _tagged(path: Path, keyed: osmium.BaseFilter) -> Iterator[tuple[Any, bool, int]]:
     """Yield open ways and areas that pass a filter, which runs in C++; a closed way comes as its area alone."""
-    processor = osmium.FileProcessor(str(path)).with_locations().with_areas(wanted)
+    processor = osmium.FileProcessor(str(path)).with_locations().with_areas(keyed)
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
-    for item in elements(processor.with_filter(kinds).with_filter(wanted)):
+    for item in elements(processor.with_filter(kinds).with_filter(keyed)):
         if item.is_area():
             yield item, not item.from_way(), item.orig_id()
         elif not item.is_closed():

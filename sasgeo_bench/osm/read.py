@@ -106,14 +106,14 @@ def _cuts(scan: Scan) -> dict[str, int]:
     return {what: count for what, count in found.items() if count}
 
 
-def _check_covered(path: Path, wanted: Box, coverage: shapely.Geometry, mapped: Mapped) -> None:
+def _check_covered(path: Path, grid_lonlat: Box, coverage: shapely.Geometry, mapped: Mapped) -> None:
     if coverage.is_empty:
         message = f"{path.name} holds no element of any class: is it an extract of map data?"
         raise CoverageError(message)
     if mapped.coverage.is_empty and not mapped.unknown_m2:
         covered = box_text(shapely.bounds(coverage))
         message = (
-            f"bounds {box_text(wanted)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
+            f"bounds {box_text(grid_lonlat)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
         )
         raise CoverageError(message)
 

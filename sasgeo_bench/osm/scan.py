@@ -295,12 +295,12 @@ def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally
     """List the objects that should become areas: the main pass sees only those that did."""
     line_keys = taxonomy.keys_of("line")
     area_keys = tuple(key for key in taxonomy.keys_of("area") if key not in line_keys)
-    wanted, typed = osmium.filter.KeyFilter(*area_keys), osmium.filter.KeyFilter("type")
-    wanted.enable_for(osmium.osm.WAY)
+    keyed, typed = osmium.filter.KeyFilter(*area_keys), osmium.filter.KeyFilter("type")
+    keyed.enable_for(osmium.osm.WAY)
     typed.enable_for(osmium.osm.RELATION)
     expected = _Expected()
     source = osmium.FileProcessor(str(path), osmium.osm.WAY | osmium.osm.RELATION)
-    for item in elements(source.with_filter(wanted).with_filter(typed)):
+    for item in elements(source.with_filter(keyed).with_filter(typed)):
         if item.is_relation():
             relation = _area_relation(item, classifier)
             if relation is not None:

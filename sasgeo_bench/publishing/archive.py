@@ -45,38 +45,25 @@ class Stored:
     packed: Packed
 
     def to_text(self) -> str:
-        """In a line: how large it is, what a prediction takes, and what was left out."""
-        mine = self.packed
-        each = mine.prediction_bytes / max(mine.predictions, 1)
-        left_out = f"; left out: {mine.dropped}" if mine.dropped else ""
+        """Return one line with the size, the bytes of a prediction, and what was left out."""
+        size = self.packed
+        each = size.prediction_bytes / max(size.predictions, 1)
+        left_out = f"; left out: {size.dropped}" if size.dropped else ""
         return (
-            f"{self.folder}: {mine.total_bytes / 1e6:.2f} MB, of these {mine.prediction_bytes / 1e6:.2f} MB for "
-            f"{counted(mine.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
+            f"{self.folder}: {size.total_bytes / 1e6:.2f} MB, of these {size.prediction_bytes / 1e6:.2f} MB for "
+            f"{counted(size.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
         )
 
 
 def pack_board(
     board: Board, request: ScoreRequest, folder: Path, *, lacks: str = "", most_bytes: int = MOST_BYTES
 ) -> Stored:
-    """Store a board that was just written.
+    """Store a board that was just written in a folder, replacing older results there.
 
-    Parameters
-    ----------
-    board, request : Board, ScoreRequest
-        What came of what was asked for.
-    folder : Path
-        To write; older results there are replaced.
-    lacks : str
-        What the stored results that were scored had left out already.
-    most_bytes : int
-        Of all files together.
-
-    Raises
-    ------
-    ConfigError
-        If a contestant is a file of predictions: nobody can say who answered; or the board is of a private seed.
-    StoreError
-        If it would be too large, or cannot be written; what was there is as it was.
+    `lacks` states what the stored results that were scored had left out already; `most_bytes` limits all files
+    together. Raise `ConfigError` if a contestant is a file of predictions, whose author is unknown, or if the board is
+    of a private seed; `StoreError` if it would be too large or cannot be written, and older results then stay as they
+    were.
     """
     submitted = next((entry.name for entry in board.everyone if not entry.runs), None)
     if submitted is not None:
@@ -108,14 +95,14 @@ def pack_board(
 
 
 def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
-    mine = board.predictions[entry.name]
+    answers = board.predictions[entry.name]
     for source, about in zip(entry.sources, entry.runs, strict=True):
-        said = TrainingRecord.of(about)
-        named = ids[about["suite"], about["region"]]
+        training = TrainingRecord.of(about)
+        asked = ids[about["suite"], about["region"]]
         yield StoredRun(
             about=about,
-            predictions=[mine[name] for name in named if name in mine],
-            learned=None if said is None or said.file is None else source.parents[1] / said.file,
+            predictions=[answers[name] for name in asked if name in answers],
+            learned=None if training is None or training.file is None else source.parents[1] / training.file,
         )
 
 
@@ -143,19 +130,9 @@ class Settings:
 
 
 def stored_settings(predictions: Sequence[Path]) -> Settings:
-    """Read the settings of the stored results among some predictions.
+    """Read the settings of the stored results among some predictions, defaults if there are none.
 
-    Raises
-    ------
-    ConfigError
-        If there are two: their tasks may differ.
-    StoreError
-        If they are damaged.
-
-    Examples
-    --------
-    >>> stored_settings([Path("nowhere")]).draws
-    10000
+    Raise `ConfigError` if there are two stored results, whose tasks may differ, and `StoreError` if they are damaged.
     """
     stored = [path for path in predictions if is_pack(path)]
     if len(stored) > 1:
@@ -163,18 +140,14 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
         raise ConfigError(message)
     if not stored:
         return Settings()
-    said = read_settings(stored[0])
-    return Settings(
-        split=said["split"],
-        rejectors=said["rejectors"],
-        contrasts=tuple(
-            Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])})
-            for item in said["contrasts"]
-        ),
-        draws=said["draws"],
-        by_region=said["by_region"],
-        pipeline=said["pipeline"],
-    )
+    record = read_settings(stored[0])
+    names = ("split", "rejectors", "draws", "by_region", "pipeline")
+    return Settings(**{name: record[name] for name in names}, contrasts=tuple(map(contrast_of, record["contrasts"])))
+
+
+def contrast_of(record: Mapping[str, Any]) -> Contrast:
+    """Return a registered contrast from its record in a file."""
+    return Contrast(**{**record, "suites": tuple(record["suites"]), "kinds": tuple(record["kinds"])})
 
 
 def request_of(
@@ -188,37 +161,21 @@ def request_of(
 ) -> ScoreRequest:
     """Return the request for a board, with the settings of stored results among its predictions, if any.
 
-    Parameters
-    ----------
-    predictions : sequence of Path
-        Runs, files of predictions, and at most one folder of stored results.
-    board : Path
-        Folder to write.
-    root : Path
-        Where tasks/ and truth/ are.
-    split : str, optional
-        Instead of that of the stored results, or of "crossfit" where none are.
-    folders : sequence of Path
-        With region files of one's own.
-    rejectors : sequence of str
-        Instead of those of the stored results, which may name registered ones only.
+    `predictions` are runs, files of predictions, and at most one folder of stored results; `folders` hold region files
+    of one's own. `split` replaces that of the stored results ("crossfit" if there are none), `rejectors` replace
+    theirs, which must be registered. Raise as `stored_settings` does, `ConfigError` if there is no such split, and
+    `MatchError` if no installed package registers a stored rejector.
 
-    Raises
-    ------
-    ConfigError, StoreError
-        As `stored_settings` does, or if there is no such split.
-    MatchError
-        If the stored results name a rejector that no installed package registers.
-
-    Examples
-    --------
     >>> request_of([Path("nowhere")], board=Path("board"), root=Path("out")).split.spec.id
     'crossfit'
     """
-    settings = stored_settings(predictions)
+    settings, stored = stored_settings(predictions), stored_among(predictions)
     if not rejectors:
-        check_registered(settings.rejectors, source=str(stored_among(predictions)))
-    name = split or settings.split or (None if stored_among(predictions) else "crossfit")
+        check_registered(settings.rejectors, source=str(stored))
+    name = split or settings.split or (None if stored else "crossfit")
+    failed: dict[str, str] = {}  # contrasts may name entries that failed when results were stored
+    if stored is not None and (stored / BOARD).is_file():
+        failed = dict(read_board(stored)[0].get("failed", {}))
     return ScoreRequest(
         predictions=predictions,
         root=root,
@@ -229,13 +186,8 @@ def request_of(
         draws=settings.draws,
         by_region=settings.by_region,
         pipeline=settings.pipeline,
-        failed=_failed_before(stored_among(predictions)),
+        failed=failed,
     )
-
-
-def _failed_before(stored: Path | None) -> dict[str, str]:
-    """Return entries that failed when results were stored: contrasts may name them, and they hold no answer."""
-    return dict(read_board(stored)[0].get("failed", {})) if stored is not None and (stored / BOARD).is_file() else {}
 
 
 def score_all(
@@ -246,25 +198,11 @@ def score_all(
     has_cases: bool = True,
     results: Path | None = None,
 ) -> Board:
-    """Score what is asked for, stored results laid out, and write the board with its figures and pictures.
+    """Score a request without extras, stored results laid out, and write the board with its figures and pictures.
 
-    Parameters
-    ----------
-    request : ScoreRequest
-        Without extras.
-    tell : callable
-        Gets a line now and then.
-    progress : Progress, optional
-        As of `make_board`.
-    has_cases : bool
-        Whether queries that went wrong are shown, with their truths.
-    results : Path, optional
-        Folder to store the board in, with all it was made of: under its name.
-
-    Raises
-    ------
-    ConfigError, StoreError
-        As `laid_out`, `make_board` and `pack_board` do, or if the board to be stored is of a part of the queries.
+    `has_cases` shows failed queries with their truths. With `results`, store the board under its name in that folder,
+    with all it was made of. Raise `ConfigError` or `StoreError` as `laid_out`, `make_board` and `pack_board` do, or if
+    the board to be stored is of a part of the queries.
     """
     if results is not None:
         _check_whole(request)
@@ -275,8 +213,8 @@ def score_all(
         pictures = partial(
             pictures_extra, tell=tell, root=request.root, contrasts=request.contrasts, has_cases=has_cases
         )
-        said = {} if kept is None else read_board(kept)[0]
-        board = make_board(replace(laid, extras=(figures, pictures), kept=said), tell=tell, progress=progress)
+        record = {} if kept is None else read_board(kept)[0]
+        board = make_board(replace(laid, extras=(figures, pictures), kept=record), tell=tell, progress=progress)
         if results is not None:
             lacks = "" if kept is None else str(read_settings(kept)["dropped"])
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())
@@ -284,7 +222,7 @@ def score_all(
 
 
 def _check_whole(request: ScoreRequest) -> None:
-    """Stored results hold every query that was asked, and answers of runs alone: said before an hour is lost."""
+    """Refuse, before scoring, a request whose board cannot be stored: of some queries, or not of runs alone."""
     if request.without:
         message = "a board without some regions is not stored: leave --without or --results away"
         raise ConfigError(message)
@@ -298,28 +236,16 @@ def _check_whole(request: ScoreRequest) -> None:
 
 
 def stored_among(predictions: Sequence[Path]) -> Path | None:
-    """The stored results among some predictions.
-
-    Examples
-    --------
-    >>> stored_among([Path("nowhere")]) is None
-    True
-    """
+    """Return the stored results among some predictions, or None."""
     return next((path for path in predictions if is_pack(path)), None)
 
 
 @contextmanager
 def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
-    """Yield the request with stored results among its predictions laid out as runs, tasks and truths.
+    """Yield the request with its stored results laid out as runs, tasks and truths until the block ends.
 
-    They lie in a folder of the system's that goes when the block ends.
-
-    Raises
-    ------
-    ConfigError
-        If tasks are named beside stored results, which hold their own.
-    StoreError
-        If the results are damaged.
+    Raise `ConfigError` if tasks are named together with stored results, which hold their own; `StoreError` if the
+    results are damaged.
     """
     stored = stored_among(request.predictions)
     if stored is None:
@@ -331,7 +257,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
         found = unpack(stored, Path(folder))
         others = [path for path in request.predictions if path != stored]
-        with _told_of(stored, found.root):
+        with _attributed(stored, found.root):
             yield replace(
                 request,
                 predictions=[*found.runs, *others],
@@ -342,8 +268,8 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
 
 
 @contextmanager
-def _told_of(stored: Path, root: Path) -> Iterator[None]:
-    """Tell what is wrong with a folder that will be gone of the stored results that were laid out there."""
+def _attributed(stored: Path, root: Path) -> Iterator[None]:
+    """Attribute errors in a temporary folder to the stored results that were laid out there."""
     try:
         yield
     except SasgeoError as error:
@@ -356,45 +282,21 @@ def _told_of(stored: Path, root: Path) -> Iterator[None]:
 
 @contextmanager
 def laid_tasks(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
-    """Yield task folders: those that are named, and the tasks of stored results, laid out until the block ends.
+    """Yield task folders: those named, and the tasks of stored results, laid out until the block ends.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Task folders and stored results.
-
-    Raises
-    ------
-    StoreError
-        If results are damaged.
-
-    Examples
-    --------
-    >>> with laid_tasks([Path("out/tasks/clean/town-grid")]) as tasks:
-    ...     tasks[0].name
-    'town-grid'
+    Raise `StoreError` if results are damaged.
     """
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
         tasks: list[Path] = []
         for number, path in enumerate(paths):
             tasks += unpack_tasks(path, Path(folder) / str(number)) if is_pack(path) else [path]
-        with _told_of(next(filter(is_pack, paths), Path()), Path(folder)):
+        with _attributed(next(filter(is_pack, paths), Path()), Path(folder)):
             yield tuple(tasks)
 
 
 def board_of(paths: Sequence[Path]) -> str:
-    """Id of the board whose stored results are among some paths; empty where none are, or they are of no pipeline.
+    """Return the id of the board of stored results among some paths; empty if there are none, or of no pipeline.
 
-    Raises
-    ------
-    ConfigError
-        If there are two.
-    StoreError
-        If they are damaged.
-
-    Examples
-    --------
-    >>> board_of([Path("nowhere")])
-    ''
+    Raise as `stored_settings` does.
     """
     return str(stored_settings(paths).pipeline.get("id", ""))

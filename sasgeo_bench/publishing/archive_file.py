@@ -9,7 +9,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +23,6 @@ from sasgeo_bench.files.file_manifest import SITE_FOLDERS, hashes_of, list_files
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import MOST_VALUES, read_table, write_table
-from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
@@ -82,7 +81,7 @@ class TaskFolders:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredRun:
-    """One run: what `run.json` is to say, its answers, and the text that was learnt for it, if any."""
+    """One run: content of `run.json`, its answers, and the file that was learned for it, if any."""
 
     about: Mapping[str, Any]
     predictions: Sequence[Prediction]
@@ -109,35 +108,12 @@ def write_pack(
     lacks: str = "",
     most_bytes: int = MOST_BYTES,
 ) -> Packed:
-    """Store a board with what it was made of, whole or not at all.
+    """Store a board with what it was made of, whole or not at all; older results in `folder` are replaced.
 
-    Parameters
-    ----------
-    folder : Path
-        To write; older results there are replaced.
-    board : Path
-        Folder of the board.
-    tasks : sequence of TaskFolders
-        All that were scored, in the order they were.
-    runs : mapping of str to sequence of StoredRun
-        By contestant, in the order they were read.
-    settings : mapping
-        How it was scored.
-    lacks : str
-        What stored results it was made of had left out already.
-    most_bytes : int
-        Of all files together. What is larger is written without heading and scale of the poses beside the first.
-
-    Returns
-    -------
-    Packed
-        How large it is.
-
-    Raises
-    ------
-    StoreError
-        If it would be larger all the same, the folder holds something else, or a file cannot be read or written; what
-        was there before is as it was.
+    `tasks` are all that were scored and `runs` those of each contestant, in the order they were read. `lacks` states
+    what the stored results it was made of had left out already. If the files would exceed `most_bytes`, heading and
+    scale of all poses of an answer but the first are left out. Raise `StoreError` if the result is still too large, the
+    folder holds something else, or a file cannot be read or written; what was there before stays as it was.
     """
     check_replaced(folder)
     folder = resolve_link(folder)
@@ -149,7 +125,7 @@ def write_pack(
             for dropped in dict.fromkeys((lacks, _with(lacks, _NO_HEADINGS))):
                 found = _write_predictions(scratch, runs, is_lean=dropped != lacks)
                 _write_settings(scratch, {**settings, "contestants": list(runs)}, dropped)
-                total = _bytes_of(scratch)
+                total = sum(path.stat().st_size for path in scratch.rglob("*") if path.is_file())
                 if total <= most_bytes:
                     break
             _check_size(folder, total, found, most_bytes)
@@ -180,14 +156,14 @@ def _copy_tables(board: Path, folder: Path) -> None:
 
 
 def _with(dropped: str, more: str) -> str:
-    """Return what was left out with one more item, each once."""
+    """Add an item to what was left out, each once."""
     return _AND.join(dict.fromkeys(filter(None, (*dropped.split(_AND), more))))
 
 
-def _write_settings(folder: Path, said: Mapping[str, Any], dropped: str) -> None:
+def _write_settings(folder: Path, settings: Mapping[str, Any], dropped: str) -> None:
     content = {
         "schema_version": SCHEMA_VERSION,
-        **said,
+        **settings,
         "dropped": dropped,
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
@@ -205,10 +181,6 @@ def _check_size(folder: Path, total: int, predictions: int, most: int) -> None:
         raise StoreError(message)
 
 
-def _bytes_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
 def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TEXTS, split: Sequence[str] = ()) -> None:
     """Write a table as small as it gets without loss."""
     write_table(
@@ -224,11 +196,11 @@ def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TE
 
 
 def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
-    """Tasks without what was seen, and their truths."""
-    said, queries, truths = [], [], []
+    """Write tasks without their views, and their truths."""
+    rows, queries, truths = [], [], []
     for number, item in enumerate(tasks):
         region = item.region / MANIFEST
-        said.append(
+        rows.append(
             {
                 "task_json": (item.task / task_files.TASK).read_text(encoding="utf-8"),
                 "truth_json": (item.truth / task_files.TRUTH_OF).read_text(encoding="utf-8"),
@@ -241,9 +213,9 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
         heads = heads.append_column(ASKED, pa.array([asked[name] for name in names], pa.string()))
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
-        told = read_table(item.truth / task_files.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
-        truths.append(_numbered(told, number))
-    _write_table(pa.Table.from_pylist(said, schema=TASK_SCHEMA), folder / "tasks.parquet")
+        truth = read_table(item.truth / task_files.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
+        truths.append(_numbered(truth, number))
+    _write_table(pa.Table.from_pylist(rows, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
     _write_table(pa.concat_tables(truths), folder / "truths.parquet")
 
@@ -253,7 +225,7 @@ def _numbered(table: pa.Table, number: int) -> pa.Table:
 
 
 def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
-    """Write what each run says, with what was learnt for it."""
+    """Write the record of each run, with what was learned for it."""
     rows = [
         {
             "contestant": name,
@@ -285,23 +257,12 @@ def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *,
 
 
 def _lean(item: Prediction) -> Prediction:
-    """An answer whose poses all have the heading and scale of the first."""
+    """Give all poses of an answer the heading and scale of the first."""
     if not item.candidates:
         return item
     first = item.candidates[0][0]
-    poses = tuple(
-        (Pose(easting_m=pose.easting_m, northing_m=pose.northing_m, yaw_deg=first.yaw_deg, scale=first.scale), score)
-        for pose, score in item.candidates
-    )
-    return Prediction(
-        query_id=item.query_id,
-        candidates=poses,
-        confidence=item.confidence,
-        diagnostics=item.diagnostics,
-        status=item.status,
-        message=item.message,
-        latency_s=item.latency_s,
-    )
+    poses = ((replace(pose, yaw_deg=first.yaw_deg, scale=first.scale), score) for pose, score in item.candidates)
+    return replace(item, candidates=tuple(poses))
 
 
 # --- back to folders --------------------------------------------------------------------------------------------------
@@ -317,24 +278,12 @@ class Unpacked:
 
 
 def unpack(folder: Path, into: Path) -> Unpacked:
-    """Lay stored results out as tasks/, truth/, regions/ and runs/, as they are scored.
+    """Lay stored results out in an empty folder as tasks/, truth/, regions/ and runs/, as they are scored.
 
-    Parameters
-    ----------
-    folder : Path
-        From `write_pack`.
-    into : Path
-        An empty folder.
-
-    Raises
-    ------
-    StoreError
-        If the results are damaged.
+    Raise `StoreError` if the results are damaged.
     """
     with sound(folder):
-        read_settings(folder)
-        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
-        tables["runs"] = _read_runs(folder)
+        tables = _read_tables(folder) | {"runs": _read_runs(folder)}
         check_tables(tables)
         tasks = tuple(_lay_tasks(tables, into))
         asked = dict(zip(*(tables["queries"][name].to_pylist() for name in ("query_id", ASKED)), strict=True))
@@ -343,13 +292,7 @@ def unpack(folder: Path, into: Path) -> Unpacked:
 
 
 def read_stored_predictions(folder: Path, matcher: str) -> list[Prediction]:
-    """Read the answers of one matcher from stored results.
-
-    Raises
-    ------
-    StoreError
-        If the results are damaged, or hold no answer of it.
-    """
+    """Read the answers of one matcher from stored results; raise `StoreError` if damaged or without any."""
     with sound(folder):
         table = _read_predictions(folder, _read_runs(folder))
         found = predictions_of(table.filter(pc.equal(table[MATCHER], matcher)))
@@ -360,30 +303,19 @@ def read_stored_predictions(folder: Path, matcher: str) -> list[Prediction]:
 
 
 def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
-    """Lay the tasks of stored results out, with their maps' `region.json` and truths, and no answers.
+    """Lay the tasks of stored results out in an empty folder, with `region.json` of their maps and truths; return them.
 
-    Parameters
-    ----------
-    folder : Path
-        From `write_pack`.
-    into : Path
-        An empty folder.
-
-    Returns
-    -------
-    tuple of Path
-        Task folders.
-
-    Raises
-    ------
-    StoreError
-        If the results are damaged.
+    Raise `StoreError` if the results are damaged.
     """
     with sound(folder):
-        read_settings(folder)
-        tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
+        tables = _read_tables(folder)
         check_tables(tables)
         return tuple(_lay_tasks(tables, into))
+
+
+def _read_tables(folder: Path) -> dict[str, pa.Table]:
+    read_settings(folder)  # checks every file against its hash
+    return {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
 
 
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
@@ -406,7 +338,7 @@ def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
 
 
 def _parts_of(table: pa.Table) -> dict[int, pa.Table]:
-    """Rows of each task, which lie together."""
+    """Return the rows of each task, which lie together."""
     numbers, starts, counts = np.unique(table[TASK].to_numpy(), return_index=True, return_counts=True)
     plain = table.drop_columns([TASK])
     return {
@@ -422,7 +354,7 @@ def _folder_name(name: str) -> str:
 
 
 def _read_runs(folder: Path) -> pa.Table:
-    """Read what each run says, with what was learnt for it; results of the former layout keep that in files."""
+    """Read the record of each run, with what was learned for it; results of the former layout keep that in files."""
     runs = read_table(folder / RUNS, mend=_MEND)
     if (folder / PREDICTIONS).is_file():
         return runs
@@ -431,13 +363,13 @@ def _read_runs(folder: Path) -> pa.Table:
 
 
 def _former_learned(folder: Path, about: Mapping[str, Any]) -> str | None:
-    said = TrainingRecord.of(about)
-    path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(said)
+    training = TrainingRecord.of(about)
+    path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(training)
     return path.read_text("utf-8") if path.is_file() else None
 
 
-def _learned_name(said: TrainingRecord | None) -> str:
-    return "" if said is None or said.file is None else _folder_name(Path(said.file).name)
+def _learned_name(training: TrainingRecord | None) -> str:
+    return "" if training is None or training.file is None else _folder_name(Path(training.file).name)
 
 
 def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
@@ -465,12 +397,13 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
         run = into / "runs" / _folder_name(_file_of(about))
         place = run / _folder_name(about["suite"]) / _folder_name(about["region"])
         prediction_files.write_run(place, about)
-        said = TrainingRecord.of(about)
+        training = TrainingRecord.of(about)
         if row[LEARNED] is not None:
             (run / learned_file.FOLDER).mkdir(exist_ok=True)
-            (run / learned_file.FOLDER / _learned_name(said)).write_text(row[LEARNED], encoding="utf-8")
+            (run / learned_file.FOLDER / _learned_name(training)).write_text(row[LEARNED], encoding="utf-8")
         part = answers.slice(start, count)
-        ties = [asked_under(asked[name], None if said is None else said.key) for name in part["query_id"].to_pylist()]
+        key = None if training is None else training.key
+        ties = [asked_under(asked[name], key) for name in part["query_id"].to_pylist()]
         write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
         start += count
         yield place

@@ -47,23 +47,14 @@ _OLD_FILES: Final = (  # of results that list none
 
 
 def is_pack(folder: Path) -> bool:
-    """Return whether a folder holds stored results.
-
-    Examples
-    --------
-    >>> is_pack(Path("nowhere"))
-    False
-    """
+    """Return whether a folder holds stored results."""
     return (folder / PACK).is_file()
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Read the settings that stored results were scored with.
+    """Read the settings that stored results were scored with, after checking the folder against its hashes.
 
-    Raises
-    ------
-    StoreError
-        If there are none, or they are damaged or of another schema.
+    Raise `StoreError` if there are none, or they are damaged or of another schema.
     """
     with sound(folder):
         data = (folder / PACK).read_bytes()
@@ -71,24 +62,24 @@ def read_settings(folder: Path) -> dict[str, Any]:
         if found not in _READ:
             message = f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
             raise StoreError(message)
-        said = parse_record(data, ArchiveRecord)
-        if said.files is None and found != _WITHOUT_HASHES:
+        record = parse_record(data, ArchiveRecord)
+        if record.files is None and found != _WITHOUT_HASHES:
             message = f"{PACK} lists no files"
             raise ValueError(message)
-        if said.files is None:
+        if record.files is None:
             list_files(folder, without=SITE_FOLDERS)
-            return said.model_dump()
-        files = {**said.files, PACK: sha256_of(folder / PACK)}
+            return record.model_dump()
+        files = {**record.files, PACK: sha256_of(folder / PACK)}
         fault = first_difference(folder, files, without=SITE_FOLDERS)
         if fault is not None:
             message = f"{folder} differs from what {PACK} says ({one_line(fault)}): fetch the results again"
             raise StoreError(message)
-        return said.model_dump()
+        return record.model_dump()
 
 
 @contextmanager
 def sound(folder: Path) -> Iterator[None]:
-    """Tell whatever is wrong with stored results in one line that names their folder."""
+    """Turn any error of reading stored results into a `StoreError` of one line that names their folder."""
     try:
         yield
     except StoreError:
@@ -103,25 +94,16 @@ def sound(folder: Path) -> Iterator[None]:
 
 
 def check_results(folder: Path, board: Path) -> None:
-    """Refuse a folder that a board cannot be stored in, before the board is made.
+    """Refuse, before a board is made, a folder that it cannot be stored in.
 
-    Parameters
-    ----------
-    folder : Path
-        To write.
-    board : Path
-        Folder of the board.
-
-    Raises
-    ------
-    StoreError
-        If it holds something else, is a file or cannot be written, or one of the two would lie in the other.
+    Raise `StoreError` if the folder holds something else, is a file or cannot be written, or if it or the board's
+    folder would lie in the other.
     """
     check_replaced(folder)
-    mine, other = resolve_link(folder).absolute(), resolve_link(board).absolute()
-    mine, other = mine.parent.resolve() / mine.name, other.parent.resolve() / other.name
-    around = next((one for one in mine.parents if one == other or (one / BOARD).is_file()), None)
-    if around is not None or mine == other or mine in other.parents:
+    target, other = resolve_link(folder).absolute(), resolve_link(board).absolute()
+    target, other = target.parent.resolve() / target.name, other.parent.resolve() / other.name
+    around = next((one for one in target.parents if one == other or (one / BOARD).is_file()), None)
+    if around is not None or target == other or target in other.parents:
         message = (
             f"{folder} would lie in the board {around}: name another folder"
             if around is not None
@@ -132,13 +114,7 @@ def check_results(folder: Path, board: Path) -> None:
 
 
 def check_replaced(folder: Path) -> None:
-    """Refuse to replace anything but stored results without a file of somebody else.
-
-    Raises
-    ------
-    StoreError
-        Naming what would be lost.
-    """
+    """Raise `StoreError` if a folder holds anything but stored results, naming the file that would be lost."""
     if folder.exists() and not is_pack(folder) and (not folder.is_dir() or any(folder.iterdir())):
         message = f"{folder} holds something else than stored results, which would be lost: name another folder"
         raise StoreError(message)
@@ -177,17 +153,9 @@ _KINDS: Final = (
 
 
 def check_tables(tables: Mapping[str, pa.Table]) -> None:
-    """Refuse tables of stored results that no board can be made of.
+    """Raise `ValueError`, naming table and column, if no board can be made of the tables of stored results.
 
-    Parameters
-    ----------
-    tables : mapping of str to pyarrow.Table
-        "tasks", "queries" and "truths", and "runs" where they are read.
-
-    Raises
-    ------
-    ValueError
-        Naming the table and the column.
+    `tables` are "tasks", "queries" and "truths", and "runs" where they are read.
     """
     for name, table in tables.items():
         _check_columns(name, table)
@@ -263,13 +231,7 @@ def _check_truths(truths: pa.Table, queries: pa.Table) -> None:
 
 
 def check_predictions(table: pa.Table) -> None:
-    """Refuse answers that no runner has written.
-
-    Raises
-    ------
-    ValueError
-        Naming the column.
-    """
+    """Raise `ValueError`, naming the column, if no runner has written such answers."""
     for column, found, expected in differing_columns(table):
         message = f"predictions.parquet: {column}: found {found}, expected {expected}"
         raise ValueError(message)
@@ -280,12 +242,12 @@ def check_predictions(table: pa.Table) -> None:
 
 
 def _listed(column: pa.ChunkedArray) -> pa.Table:
-    """All items of a column of lists of structs."""
+    """Return all items of a column of lists of structs."""
     return pa.Table.from_struct_array(pc.list_flatten(column))
 
 
 def _check_poses(name: str, poses: pa.Table) -> None:
-    """Refuse poses with a number that is none, or a scale that shrinks to nothing."""
+    """Refuse poses with a value that is not finite, or a scale that is not positive."""
     for column in POSE_FIELDS:
         _refuse(name, column, ~np.isfinite(_numbers(poses[column]).astype(float)))
     _refuse(name, "scale", ~_is_positive(_numbers(poses["scale"]).astype(float)))

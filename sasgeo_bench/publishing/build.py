@@ -18,13 +18,12 @@ from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOA
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import request_of, score_all
+from sasgeo_bench.publishing.archive import contrast_of, request_of, score_all
 from sasgeo_bench.publishing.archive_folder import is_pack
 from sasgeo_bench.publishing.site import site_pages
 from sasgeo_bench.publishing.site_files import (
     MOST_BYTES,
     BoardFiles,
-    Drawn,
     Written,
     draw_text,
     held,
@@ -33,7 +32,7 @@ from sasgeo_bench.publishing.site_files import (
 )
 from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
-from sasgeo_bench.publishing.site_source import Case, Download, Picture, Pictures, SiteFigure, SiteSource, Spot
+from sasgeo_bench.publishing.site_source import Case, Picture, Pictures, SiteFigure, SiteSource, Spot
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
@@ -54,32 +53,10 @@ def publish(
 ) -> Written:
     """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
 
-    Parameters
-    ----------
-    board : Path
-        Folder of a board, or of stored results.
-    into : Path, optional
-        Folder to write; `site` in the board's own without.
-    tell : callable
-        Gets a line now and then.
-    root : Path
-        Where regions/, tasks/ and truth/ may be: stored results hold no views, and have the pictures of those here.
-    jobs : int
-        Processes that score stored results.
-    progress : Progress, optional
-        Shows how far scoring is; lines by `tell` unless given.
-
-    Returns
-    -------
-    Written
-        Where it is, and how large.
-
-    Raises
-    ------
-    StoreError
-        If there is no sound board, or the site cannot be written; an older site is then as it was.
-    ConfigError
-        If the board is of a private seed.
+    `into` is the folder to write, by default `site` in the board's own. Pictures of stored results, which hold no
+    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score, `progress` shows
+    how far they are (lines by `tell` by default). Raise `StoreError` if there is no sound board or the site cannot be
+    written, and an older site then stays as it was; `ConfigError` if the board is of a private seed.
     """
     if into is None and (board / SITE).is_symlink():
         message = f"{board / SITE} is a link: name where it leads with --into"
@@ -95,13 +72,13 @@ def publish(
         with _sound(board):
             for name, table in {LEADERBOARD: files.board, **files.tables}.items():
                 check_shape(name, table)
-            source, drawn = _source(files, tell)
+            source = _source(files, tell)
             pages = site_pages(source)
         written = write_site(
             target,
             files,
             pages=pages,
-            drawn=drawn,
+            figures=filter(None, (*source.figures, source.rates_figure, source.map_figure)),
             about={"board": source.name, "made_by": files.about.get("made_by")},
         )
     if written.site_bytes > MOST_BYTES:
@@ -130,7 +107,7 @@ def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Prog
 
 @contextmanager
 def _sound(board: Path) -> Iterator[None]:
-    """Tell what is wrong with a board that anybody may have made: its tables, or values that no page can show."""
+    """Turn errors in tables or values of a board, which anybody may have made, into a `StoreError` that names it."""
     try:
         yield
     except StoreError as error:
@@ -142,8 +119,8 @@ def _sound(board: Path) -> Iterator[None]:
         raise StoreError(message) from error
 
 
-def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:
-    """All that pages are made of, and the figures that are drawn for them."""
+def _source(files: BoardFiles, tell: Tell) -> SiteSource:
+    """Return the content of all pages, with figures of places and rates drawn for them."""
     about, name = files.about, _name_of(files)
     spec = _pipeline_of(about)
     spots, parts = _spots(), _parts(about)
@@ -156,10 +133,9 @@ def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:
     if places:
         drawing[_MAP] = partial(draw_places, places=places)
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
-        drawn = {file: draw_text(draw, Path(folder)) for file, draw in drawing.items()}
-    more = {file: _figure(file, Drawn.of(text, file)) for file, text in drawn.items()}
+        drawn = {file: SiteFigure.of(file, draw_text(draw, Path(folder))) for file, draw in drawing.items()}
     tables = files.tables
-    source = SiteSource(
+    return SiteSource(
         name=name,
         title=name if spec is None else spec.title,
         about=about,
@@ -172,21 +148,14 @@ def _source(files: BoardFiles, tell: Tell) -> tuple[SiteSource, dict[str, str]]:
         protection=tables["protection"],
         registered=_registered(files, spec),
         reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
-        figures=tuple(_figure(file, item) for file, item in files.figures.items()),
-        downloads=tuple(
-            Download(file=file, size_bytes=len(data), what=what) for file, (data, what) in files.downloads.items()
-        ),
+        figures=files.figures,
+        downloads=files.downloads,
         pictures=_pictures(files.pictures),
         spots=spots,
         parts=parts,
-        rates_figure=more[_RATES],
-        map_figure=more.get(_MAP),
+        rates_figure=drawn[_RATES],
+        map_figure=drawn.get(_MAP),
     )
-    return source, drawn
-
-
-def _figure(file: str, drawn: Drawn) -> SiteFigure:
-    return SiteFigure(file=file, title=drawn.title, width=drawn.width, height=drawn.height)
 
 
 def _name_of(files: BoardFiles) -> str:
@@ -195,28 +164,26 @@ def _name_of(files: BoardFiles) -> str:
 
 
 def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
-    """The shipped pipeline that a board was made by; None of any other, even of the same name."""
-    said = about.get("pipeline")
-    if not said:
+    """Return the shipped pipeline that a board was made by; None for any other, even of the same name."""
+    pipeline = about.get("pipeline")
+    if not pipeline:
         return None
     try:
-        spec = read_pipeline_file(find_pipeline_file(str(said["id"])))
+        spec = read_pipeline_file(find_pipeline_file(str(pipeline["id"])))
     except ConfigError:
         return None
-    return spec if spec.sha256 == said["sha256"] else None
+    return spec if spec.sha256 == pipeline["sha256"] else None
 
 
 def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast, ...]:
-    """Contrasts as they were registered: as the board says, its stored settings, or its pipeline."""
-    said = files.about.get("contrasts") or files.settings.get("contrasts")
-    if said is None:
-        said = [] if spec is None else [item.model_dump(exclude={"why"}) for item in spec.contrast]
+    """Return contrasts as registered: from the board, its stored settings, or its pipeline."""
+    records = files.about.get("contrasts") or files.settings.get("contrasts")
+    if records is None:
+        records = [] if spec is None else [item.model_dump(exclude={"why"}) for item in spec.contrast]
     try:
-        return tuple(
-            Contrast(**{**item, "suites": tuple(item["suites"]), "kinds": tuple(item["kinds"])}) for item in said
-        )
+        return tuple(map(contrast_of, records))
     except (KeyError, TypeError) as error:
-        message = f"{files.folder} does not say which contrasts were registered ({error!r}): score again"
+        message = f"{files.folder} does not state which contrasts were registered ({error!r}): score again"
         raise StoreError(message) from error
 
 
@@ -238,7 +205,7 @@ def _spots() -> dict[str, Spot]:
 
 
 def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """By region its place, and its half or part, of a shipped split; nothing of another one."""
+    """Return, by region of a shipped split, its place and its half or part; nothing for another split."""
     try:
         spec = read_split_file(find_split_file(str(about.get("split") or "")))
     except ConfigError:
@@ -246,23 +213,20 @@ def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     return {region: (place.name, place.half or place.part or "") for place in spec.place for region in place.regions}
 
 
-def _pictures(said: Mapping[str, Any]) -> Pictures:
+def _pictures(record: Mapping[str, Any]) -> Pictures:
     def plain(item: Mapping[str, Any], *names: str) -> dict[str, str]:
-        """Some fields of a picture as text, empty where it has none."""
+        """Return some fields of a picture as text, empty where it has none."""
         return {name: str(item.get(name, "")) for name in names}
 
-    return Pictures(
-        regions=tuple(
-            Picture(of=str(item.get("region", "")), **plain(item, "file", "alt")) for item in said.get("regions", ())
-        ),
-        suites=tuple(
-            Picture(of=str(item.get("suite", "")), **plain(item, "file", "alt")) for item in said.get("suites", ())
-        ),
-        cases=tuple(
-            Case(
-                **plain(item, "query_id", "matcher", "failure", "file", "alt", "suite", "region", "kind"),
-                said={str(name): str(value) for name, value in dict(item.get("said") or {}).items()},
-            )
-            for item in said.get("cases", ())
-        ),
+    of_kind = {
+        kind: tuple(Picture(of=str(item.get(what, "")), **plain(item, "file", "alt")) for item in record.get(kind, ()))
+        for kind, what in (("regions", "region"), ("suites", "suite"))
+    }
+    cases = tuple(
+        Case(
+            **plain(item, "query_id", "matcher", "failure", "file", "alt", "suite", "region", "kind"),
+            said={str(name): str(value) for name, value in dict(item.get("said") or {}).items()},
+        )
+        for item in record.get("cases", ())
     )
+    return Pictures(**of_kind, cases=cases)

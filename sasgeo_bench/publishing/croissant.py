@@ -83,19 +83,6 @@ FEATURE_TEXTS: Final = {
 }
 
 
-def shown(texts: dict[str, str]) -> str:
-    """Return a table of columns in Markdown.
-
-    Examples
-    --------
-    >>> print(shown({"a": "first"}))
-    | Column | What |
-    |---|---|
-    | `a` | first |
-    """
-    return "\n".join(("| Column | What |", "|---|---|", *(f"| `{name}` | {text} |" for name, text in texts.items())))
-
-
 if TYPE_CHECKING:
     import mlcroissant as mlc
 
@@ -137,15 +124,7 @@ _TYPES: Final = (
 
 
 def write_croissant(folder: Path, release: Release) -> None:
-    """Write the metadata.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the release, its data written.
-    release : Release
-        What is in it, sizes and hashes of its files included.
-    """
+    """Write the metadata of a release whose data is written, sizes and hashes of its files included."""
     import mlcroissant as mlc  # noqa: PLC0415 - an extra: only whoever writes a release needs it
 
     versions = type(mlc.Context().conforms_to)  # the package shows it nowhere else
@@ -257,7 +236,7 @@ def _record_set(table: _Table) -> "mlc.RecordSet":
 
 
 def _map_field(table: _Table) -> "mlc.Field":
-    """The map that a row is of, which its file's path alone says."""
+    """Return the column with the map of a row, which only the path of its file states."""
     import mlcroissant as mlc  # noqa: PLC0415 - see write_croissant
 
     return mlc.Field(
@@ -279,10 +258,10 @@ def _field(table: _Table, column: pa.Field) -> "mlc.Field":
     is_list = pa.types.is_list(column.type)
     inner = column.type.value_type if is_list else column.type
     name = f"{table.name}/{column.name}"
-    said = {"id": name, "name": column.name, "description": table.texts.get(column.name)}
+    common = {"id": name, "name": column.name, "description": table.texts.get(column.name)}
     if not pa.types.is_struct(inner):
         is_array = True if is_list else None
-        return mlc.Field(**said, data_types=[_type(inner)], is_array=is_array, source=_source(table, column.name))
+        return mlc.Field(**common, data_types=[_type(inner)], is_array=is_array, source=_source(table, column.name))
     parts = [
         mlc.Field(
             id=f"{name}/{part.name}",
@@ -292,7 +271,7 @@ def _field(table: _Table, column: pa.Field) -> "mlc.Field":
         )
         for part in inner
     ]
-    return mlc.Field(**said, is_array=True, sub_fields=parts)
+    return mlc.Field(**common, is_array=True, sub_fields=parts)
 
 
 def _source(table: _Table, column: str, *, within: str | None = None) -> "mlc.Source":
@@ -303,5 +282,5 @@ def _source(table: _Table, column: str, *, within: str | None = None) -> "mlc.So
 
 
 def _type(kind: pa.DataType) -> str:
-    """Croissant's type of a column."""
+    """Return Croissant's type of a column."""
     return next((name for is_it, name in _TYPES if is_it(kind)), f"{_SCHEMA_ORG}Text")

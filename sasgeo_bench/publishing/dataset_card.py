@@ -2,12 +2,20 @@
 """`README.md` and `datasheet.md` of a release: dataset card, and the questions of Gebru et al. answered."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.publishing.croissant import QUERY_TEXTS, TRUTH_TEXTS, cite_as, shown
-from sasgeo_bench.publishing.release_files import COPYRIGHT_URL, LICENCE_URL, TRUTHS, Release, ReleaseTask, places_of
+from sasgeo_bench.publishing.croissant import QUERY_TEXTS, TRUTH_TEXTS, cite_as
+from sasgeo_bench.publishing.release_files import (
+    COPYRIGHT_URL,
+    LICENCE_URL,
+    TRUTHS,
+    Release,
+    ReleaseMap,
+    ReleaseTask,
+    places_of,
+)
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.texts import markdown, markdown_code, quoted
 
@@ -18,28 +26,10 @@ _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"),
 
 
 def card_text(release: Release) -> str:
-    """Write the card.
-
-    Parameters
-    ----------
-    release : Release
-        What is in the release.
-
-    Returns
-    -------
-    str
-        Markdown after a YAML head.
-    """
-    parts = (
-        "\n".join(("---", *_head(release), "---")),
-        _opening(release),
-        _suites(release),
-        _regions(release),
-        _loading(release),
-        _meaning(release),
-        _ending(release),
-    )
-    return "\n\n".join(parts) + "\n"
+    """Return the card: Markdown after a YAML head."""
+    sections = (_opening, _suites, _regions, _loading, _meaning, _ending)
+    head = "\n".join(("---", *_head(release), "---"))
+    return "\n\n".join((head, *(section(release) for section in sections))) + "\n"
 
 
 def _head(release: Release) -> Iterator[str]:
@@ -97,61 +87,59 @@ Everything is made from dated OpenStreetMap extracts by {release.made_by}; publi
 def _truth_line(release: Release) -> str:
     if release.with_truth:
         return "all are in this release"
-    told = sorted({part for task in release.tasks for part in task.told})
+    released = sorted({part for task in release.tasks for part in task.released})
     if release.split.kind == "crossfit":
         return "none here; in a cross-fit every place is a test place once, so all of them are kept back"
-    return f"those of {' and '.join(told)} are here, those of test are kept back" if told else "kept back"
+    return f"those of {' and '.join(released)} are here, those of test are kept back" if released else "kept back"
+
+
+def _table(head: str, rows: Iterable[str]) -> str:
+    """Join the lines of a Markdown table."""
+    return "\n".join((head, "|" + "---|" * (head.count("|") - 1), *rows))
 
 
 def _suites(release: Release) -> str:
-    lines = [
-        "## Suites",
-        "",
-        "| Configuration | What is asked | Split | Queries | Maps | Truths |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for suite in release.suites:
         tasks = release.tasks_of(suite)
         for part in release.tables_of(suite):
             own = [task for task in tasks if part in task.parts]
-            told = f"`{suite}-{TRUTHS}`" if any(part in task.told for task in own) else "kept back"
+            released = f"`{suite}-{TRUTHS}`" if any(part in task.released for task in own) else "kept back"
             count = sum(task.parts[part] for task in own)
             title = markdown(tasks[0].about["title"])
-            lines.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {told} |")
-    return "\n".join(lines)
+            rows.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {released} |")
+    return "## Suites\n\n" + _table("| Configuration | What is asked | Split | Queries | Maps | Truths |", rows)
 
 
 def _regions(release: Release) -> str:
     split = release.split
-    lines = [
+    places = (
+        f"| {place.name} | {place.part or f'half {place.half}'} | {', '.join((*place.regions, *place.blocks))} |"
+        for place in places_of(release)
+    )
+    crossfit = (
+        "Each place is tested once. What is learnt for a place comes from the other half; the rest of its own half "
+        "calibrates."
+    )
+    buffer = (
+        f"Split `{split.id}` ({markdown(split.title)}): places that are used for different purposes keep at least "
+        f"{split.buffer_m:g} m apart."
+    )
+    parts = (
         "## Maps and places",
-        "",
-        (
-            f"Split `{split.id}` ({markdown(split.title)}): places that are used for different purposes keep at least "
-            f"{split.buffer_m:g} m apart."
-        ),
-        "",
-        "| Place | Part or half | Regions |",
-        "|---|---|---|",
-    ]
-    for place in places_of(release):
-        regions = ", ".join((*place.regions, *place.blocks))
-        lines.append(f"| {place.name} | {place.part or f'half {place.half}'} | {regions} |")
-    if split.kind == "crossfit":
-        lines += [
-            "",
-            (
-                "Each place is tested once. What is learnt for a place comes from the other half; the rest of its own "
-                "half calibrates."
-            ),
-        ]
-    lines += ["", "| Map | What | Date | Size | CRS |", "|---|---|---|---|---|"]
-    for item in release.maps:
-        about = item.manifest
-        size = f"{about.cols} x {about.rows} cells of {about.cell_size_m:g} m"
-        lines.append(f"| `{item.name}` | {markdown(about.title)} | {about.extract.date} | {size} | EPSG:{about.epsg} |")
-    lines += ["", "`name@date` is an older map of a place, `name+suite` one that a suite has edited."]
-    return "\n".join(lines)
+        buffer,
+        _table("| Place | Part or half | Regions |", places),
+        *((crossfit,) if split.kind == "crossfit" else ()),
+        _table("| Map | What | Date | Size | CRS |", map(_map_row, release.maps)),
+        "`name@date` is an older map of a place, `name+suite` one that a suite has edited.",
+    )
+    return "\n\n".join(parts)
+
+
+def _map_row(item: ReleaseMap) -> str:
+    about = item.manifest
+    size = f"{about.cols} x {about.rows} cells of {about.cell_size_m:g} m"
+    return f"| `{item.name}` | {markdown(about.title)} | {about.extract.date} | {size} | EPSG:{about.epsg} |"
 
 
 def _loading(release: Release) -> str:
@@ -210,16 +198,19 @@ With sasgeo-bench itself, `sasgeo-bench run --tasks tasks/{suite}/{name}` runs a
 as the program's own."""
 
 
+def _columns(texts: Mapping[str, str]) -> str:
+    return _table("| Column | What |", (f"| `{name}` | {text} |" for name, text in texts.items()))
+
+
 def _meaning(release: Release) -> str:
     truths = ""
-    if any(task.told for task in release.tasks):
-        truths = (
-            f"\n\n## Columns of the truths\n\nA row for each query, to be joined by `query_id`.\n\n{shown(TRUTH_TEXTS)}"
-        )
+    if any(task.released for task in release.tasks):
+        head = "\n\n## Columns of the truths\n\nA row for each query, to be joined by `query_id`.\n\n"
+        truths = head + _columns(TRUTH_TEXTS)
     return f"""\
 ## Columns of the queries
 
-{shown(QUERY_TEXTS)}
+{_columns(QUERY_TEXTS)}
 
 Easting and northing are metres in the CRS of the map (`epsg` in its `region.json`); a yaw is a heading, clockwise
 from grid north. Outside the mapped area nothing is known, which is not the same as absent.
@@ -250,18 +241,7 @@ _M2_PER_KM2: Final = 1e6
 
 
 def datasheet_text(release: Release) -> str:
-    """Write the datasheet, its numbers counted from the release itself.
-
-    Parameters
-    ----------
-    release : Release
-        What is in the release.
-
-    Returns
-    -------
-    str
-        Markdown.
-    """
+    """Return the datasheet in Markdown, its numbers counted from the release itself."""
     opening = f"""\
 # Datasheet of sasgeo-bench, dataset release {release.version}
 
@@ -294,7 +274,8 @@ a right fix from a false one.
 
 def _composition(release: Release) -> str:
     area_km2, dates = _area_km2(release), sorted(item.manifest.extract.date for item in release.maps)
-    objects, parts = _objects(release), _parts(release)
+    objects = _sum(item.manifest.counts for item in release.maps)
+    parts = _sum(task.parts for task in release.tasks)
     made_up = [name for name in release.regions if name.startswith("town-")]
     towns = f", {len(made_up)} of them made up by a program" if made_up else ""
     queries = ", ".join(f"{part} {count}" for part, count in parts.items())
@@ -336,7 +317,7 @@ kept; names and ids of the accounts that edited them are not."""
 
 
 def _area_km2(release: Release) -> float:
-    """Ground of all regions, each counted once whatever the number of its maps."""
+    """Return the ground of all regions, each counted once whatever the number of its maps."""
     areas = {
         item.region: item.manifest.rows * item.manifest.cols * item.manifest.cell_size_m**2 / _M2_PER_KM2
         for item in release.maps
@@ -344,27 +325,17 @@ def _area_km2(release: Release) -> float:
     return sum(areas.values())
 
 
-def _objects(release: Release) -> Counter[str]:
+def _sum(counts: Iterable[Mapping[str, int]]) -> Counter[str]:
+    """Add counts by name, names that count 0 included."""
     found: Counter[str] = Counter()
-    for item in release.maps:
-        found.update(item.manifest.counts)
-    return found
-
-
-def _parts(release: Release) -> Counter[str]:
-    found: Counter[str] = Counter()
-    for task in release.tasks:
-        found.update(task.parts)
+    for one in counts:
+        found.update(one)
     return found
 
 
 def _class_table(objects: Counter[str]) -> str:
-    lines = [
-        "| Class | Objects in all maps |",
-        "|---|---|",
-        *(f"| {markdown_code(name)} | {count:,} |" for name, count in objects.items()),
-    ]
-    return "\n".join(lines)
+    lines = (f"| {markdown_code(name)} | {count:,} |" for name, count in objects.items())
+    return _table("| Class | Objects in all maps |", lines)
 
 
 def _mapped_line(release: Release) -> str:
@@ -378,14 +349,14 @@ def _mapped_line(release: Release) -> str:
 def _left_out_line(release: Release) -> str:
     hidden = sum(sum(item.manifest.hidden.values()) for item in release.maps)
     dropped = sum(sum(item.manifest.drops.values()) for item in release.maps)
-    said = f"{hidden:,} objects in and around the maps are not visible, {dropped:,} were dropped"
-    return f"{said}, with reasons in `region.json`"
+    counts = f"{hidden:,} objects in and around the maps are not visible, {dropped:,} were dropped"
+    return f"{counts}, with reasons in `region.json`"
 
 
 def _collection(release: Release) -> str:
     files = {item.manifest.extract.file: item.manifest.extract.sha256 for item in release.maps}
-    lines = [f"| {markdown_code(name)} | {markdown_code(files[name])} |" for name in sorted(files)]
-    table = "\n".join(("| Extract | SHA-256 |", "|---|---|", *lines))
+    lines = (f"| {markdown_code(name)} | {markdown_code(files[name])} |" for name in sorted(files))
+    table = _table("| Extract | SHA-256 |", lines)
     return f"""\
 ## Collection
 

@@ -48,24 +48,12 @@ _EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseRequest:
-    """A request for a release.
+    """A request for a release of built regions.
 
-    Parameters
-    ----------
-    regions : tuple of str
-        Ids of regions that are built.
-    suites : tuple of str
-        Names; none are all that have been drawn on the regions, controls left out.
-    split : str
-        Id or file of the split the queries were drawn by.
-    with_truth : bool
-        Whether the truths of test queries are in the release too.
-    out, into : Path
-        Root of what is built; the folder of the release.
-    published : str, optional
-        Day of publication as in 2026-01-31; the newest date of a map unless given.
-    url : str, optional
-        Where the release will be found.
+    Empty `suites` are all that were drawn on the regions, controls left out. `split` is the id or file of the split of
+    the queries. `with_truth` includes the truths of test queries. `out` is the root of what is built, `into` the folder
+    of the release. `published` is the day of publication, as in 2026-01-31, by default the newest date of a map; `url`
+    the address where the release will be found.
     """
 
     regions: tuple[str, ...]
@@ -81,22 +69,8 @@ class ReleaseRequest:
 def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     """Write a release, whole or not at all; the same regions and tasks give the same bytes.
 
-    Parameters
-    ----------
-    request : ReleaseRequest
-        What is asked for.
-    tell : callable
-        Gets one line for every step.
-
-    Returns
-    -------
-    Release
-        What was written, sizes and hashes included.
-
-    Raises
-    ------
-    SasgeoError
-        If anything is refused (see `plan_release`) or cannot be written; an older release is then as it was.
+    `tell` gets one line for every step. Raise `SasgeoError` if anything is refused (see `plan_release`) or cannot be
+    written; an older release then stays as it was.
     """
     planned = plan_release(request, tell=tell)
     with open_release(request.into, tell=tell) as folder:
@@ -113,16 +87,11 @@ def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
 
 
 def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
-    """Say what a release would hold; everything that can be refused is refused here, before anything is written.
+    """Return the content of a release; everything that can be refused is refused here, before anything is written.
 
-    Raises
-    ------
-    ConfigError
-        If a region, suite or split is unknown, the address is none, there are no tasks, or the extra packages are
-        missing.
-    StoreError
-        If a region is not built, says no licence, or its layers are no valid COG; if a task is of another map, another
-        split, or lacks its truths; or if the folder holds something else.
+    Raise `ConfigError` if a region, suite, split or address is wrong, there are no tasks, or the extra packages are
+    missing; `StoreError` if a region is not built, states no licence, or its layers are no valid COG, if a task is of
+    another map or split or lacks its truths, or if the folder holds something else.
     """
     check_installed()
     _check_address(request.url)
@@ -151,7 +120,7 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
 
 
 def check_installed() -> None:
-    """Refuse to begin where the packages that describe a release are not installed."""
+    """Raise `ConfigError` where the packages that describe a release are not installed."""
     missing = [shown for module, shown in _EXTRA.items() if find_spec(module) is None]
     if missing:
         message = f"a release needs {', '.join(missing)}: pip install 'sasgeo-bench[publish]'"
@@ -159,25 +128,17 @@ def check_installed() -> None:
 
 
 def _check_folder(into: Path, out: Path) -> None:
-    inside = next(
-        (
-            name
-            for name in ("regions", "tasks", "truth", "runs", "boards")
-            if into.resolve().is_relative_to((out / name).resolve())
-        ),
-        None,
-    )
+    others = (out / name for name in ("regions", "tasks", "truth", "runs", "boards"))
+    inside = next((folder for folder in others if into.resolve().is_relative_to(folder.resolve())), None)
     if inside is not None:
-        message = f"{into} lies inside {out / inside}, which others read: name another folder with --into"
+        message = f"{into} lies inside {inside}, which others read: name another folder with --into"
         raise ConfigError(message)
     check_target(into)
 
 
 def _check_region(name: str, split: SplitFile, out: Path) -> None:
     if not is_of_region(name, name):
-        message = (
-            f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries are searched in come by themselves"
-        )
+        message = f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries need are added automatically"
         raise ConfigError(message)
     if not (out / "regions" / name / region_files.MANIFEST).is_file():
         find_region_file(name)  # an unknown one is named with the nearest there is
@@ -189,7 +150,7 @@ def _check_region(name: str, split: SplitFile, out: Path) -> None:
 
 
 def _tasks(regions: Sequence[str], request: ReleaseRequest, tell: Tell) -> tuple[ReleaseTask, ...]:
-    """Tasks of the regions and of their older and edited maps, by suite and map."""
+    """Return the tasks of the regions and of their older and edited maps, by suite and map."""
     suites = [find_suite(name).card.name for name in dict.fromkeys(request.suites)] or list(SUITES)
     found = []
     for suite in sorted(suites):
@@ -219,13 +180,13 @@ def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
     if odd is not None:
         message = f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
         raise StoreError(message)
-    told = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
+    released = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
     truth = request.out / "truth" / str(about["suite"]) / str(about["region"])
-    return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, told=told)
+    return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, released=released)
 
 
 def _map(folder: Path) -> ReleaseMap:
-    """Read a map, after a look at its licence and its raster."""
+    """Read a map, after checking its licence and its raster."""
     manifest = region_files.read_manifest(folder)
     path = folder / region_files.MANIFEST
     stray = next((name for name in manifest.files if Path(name).name != name), None)
@@ -258,13 +219,13 @@ def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None
     if has_images(task.folder):
         message = f"{task.folder} holds images, whose licence is not that of the map: leave the suite out"
         raise StoreError(message)
-    if task.told:
+    if task.released:
         task_files.check_truths(task.folder, task.truth)
 
 
 def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
-    """Say where truths that are kept back could be drawn again by whoever tries a few seeds."""
-    hiding = [task for task in tasks if set(task.parts) - task.told]
+    """Report withheld truths that could be drawn again by trying a few seeds."""
+    hiding = [task for task in tasks if set(task.parts) - task.released]
     seeds: list[Any] = [task_files.read_hidden(task.truth).get("seed") for task in hiding]
     guessable = sum(isinstance(seed, int) and abs(seed) < 2**LEAST_BITS for seed in seeds)
     if guessable:

@@ -19,7 +19,7 @@ from sasgeo_bench.files.parquet import open_table, read_table, table_writer
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import TASK_VERSION
+from sasgeo_bench.tasks.query import TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Place, SplitFile
 from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA
 from sasgeo_bench.texts import json_text
@@ -57,44 +57,43 @@ under the ODbL, each source with its licence beside it.
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseMap:
-    """One map of a release: a folder of `regions/`, and what its `region.json` says."""
+    """One map of a release: a folder of `regions/`, and the content of its `region.json`."""
 
     folder: Path
     manifest: Manifest
 
     @property
     def name(self) -> str:
-        """The folder's name, which is what queries call the map: as in "vaduz" or "vaduz@2021-10-28"."""
+        """Return the folder's name, which is the map's name in queries, as in "vaduz" or "vaduz@2021-10-28"."""
         return self.folder.name
 
     @property
     def region(self) -> str:
-        """The region it is a map of, whatever its date and whether a suite has edited it."""
-        return self.name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
+        """Return the region, whatever the date of the map and whether a suite has edited it."""
+        return base_of(self.name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseTask:
-    """One task of a release.
+    """One task of a release: folders of the task and of its truths, and the content of `task.json` (`about`).
 
-    `folder` and `truth` are those of the task and its truths, `about` is what `task.json` says, `parts` how many
-    queries each part has, `told` the parts whose truths are released.
+    `parts` counts the queries of each part; `released` are the parts whose truths are released.
     """
 
     folder: Path
     truth: Path
     about: Mapping[str, Any]
     parts: Mapping[str, int]
-    told: frozenset[str] = frozenset()
+    released: frozenset[str] = frozenset()
 
     @property
     def suite(self) -> str:
-        """Name of the suite."""
+        """Return the name of the suite."""
         return str(self.about["suite"])
 
     @property
     def map_name(self) -> str:
-        """The map that is searched."""
+        """Return the map that is searched."""
         return str(self.about["region"])
 
     @property
@@ -103,7 +102,7 @@ class ReleaseTask:
         return len(self.parts) == 1
 
     def file_of(self, part: str, *, kind: str = "queries") -> str:
-        """Path in the release of a part's queries, or of its truths."""
+        """Return the path in the release of a part's queries, or of its truths."""
         root = "tasks" if kind == "queries" else "truth"
         name = f"{kind}.parquet" if self.is_whole else f"{kind}-{part}.parquet"
         return f"{root}/{self.suite}/{self.map_name}/{name}"
@@ -113,8 +112,8 @@ class ReleaseTask:
 class Release:
     """Content of a release, before and after it is written.
 
-    `published` is a day as in 2026-01-31, `url` where it will be found, `with_truth` whether all truths are in it;
-    `files` says size and hash of each file of maps and tasks by its path, once they are copied.
+    `published` is a day as in 2026-01-31, `url` the address of the release, `with_truth` whether it holds all truths;
+    `files` gives size and hash of each file of maps and tasks by its path, once they are copied.
     """
 
     regions: tuple[str, ...]
@@ -134,7 +133,7 @@ class Release:
 
     @property
     def suites(self) -> tuple[str, ...]:
-        """Suites in the order of their names."""
+        """Return the suites in the order of their names."""
         return tuple(sorted({task.suite for task in self.tasks}))
 
     @property
@@ -144,30 +143,24 @@ class Release:
 
     @property
     def bytes(self) -> int:
-        """Size of all files that are written."""
+        """Return the size of all files that are written."""
         return sum(record.bytes for record in self.files.values())
 
     def tasks_of(self, suite: str) -> list[ReleaseTask]:
-        """Tasks of one suite, in the order of their maps."""
+        """Return the tasks of one suite, in the order of their maps."""
         return [task for task in self.tasks if task.suite == suite]
 
     def tables_of(self, suite: str, *, kind: str = "queries") -> dict[str, list[str]]:
-        """Files of a suite's queries or truths by part; a part without any is left out."""
+        """Return the files of a suite's queries or truths by part, without parts that have none."""
         found: dict[str, list[str]] = {}
         for task in self.tasks_of(suite):
-            for part in task.parts if kind == "queries" else sorted(task.told):
+            for part in task.parts if kind == "queries" else sorted(task.released):
                 found.setdefault(part, []).append(task.file_of(part, kind=kind))
         return {part: found[part] for part in sorted(found)}
 
 
 def count_parts(task_folder: Path) -> dict[str, int]:
-    """Count the queries of each part of a task; no view is read.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be read, or lacks a column that this version writes.
-    """
+    """Count the queries of each part of a task without reading views; raise `StoreError` if a column is missing."""
     path, found = task_folder / task_files.QUERIES, Counter[str]()
     task_files.check_columns(path, FILE_SCHEMA.names)
     for batch in task_files.read_batches(path, ["part"]):
@@ -189,13 +182,7 @@ def has_images(task_folder: Path) -> bool:
 
 
 def check_target(folder: Path) -> None:
-    """Refuse a folder that a release cannot replace: one with a file in it that no release has written.
-
-    Raises
-    ------
-    StoreError
-        Naming the file.
-    """
+    """Raise `StoreError`, naming the file, if a folder holds a file that no release has written."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         message = f"{folder} is a file or a link: move it away, a release goes there"
         raise StoreError(message)
@@ -222,10 +209,7 @@ def _named_in_sums(folder: Path) -> list[str]:
 def open_release(folder: Path, *, tell: Callable[[str], None]) -> Iterator[Path]:
     """Yield an empty folder that becomes the release when the block ends well; an older release is whole until then.
 
-    Raises
-    ------
-    StoreError
-        If the folder holds something else, or cannot be written.
+    Raise `StoreError` if the folder holds something else, or cannot be written.
     """
     try:
         with locked(folder, tell=tell):
@@ -245,10 +229,7 @@ def open_release(folder: Path, *, tell: Callable[[str], None]) -> Iterator[Path]
 def copy_data(folder: Path, release: Release) -> None:
     """Copy maps and tasks into a release; files are copied whole, or a row group at a time where parts are mixed.
 
-    Raises
-    ------
-    StoreError
-        If a file is not what its manifest says.
+    Raise `StoreError` if a file is missing.
     """
     for item in release.maps:
         target = folder / "regions" / item.name
@@ -257,7 +238,7 @@ def copy_data(folder: Path, release: Release) -> None:
             _copy(item.folder / name, target / name)
     for task in release.tasks:
         _copy_queries(folder, task)
-        if task.told:
+        if task.released:
             _copy_truths(folder, task)
 
 
@@ -286,7 +267,7 @@ def _copy_truths(folder: Path, task: ReleaseTask) -> None:
     target = folder / "truth" / task.suite / task.map_name
     target.mkdir(parents=True)
     heads = read_table(task.folder / task_files.QUERIES, mend="make the queries again", columns=["query_id", "part"])
-    for part in sorted(task.told):
+    for part in sorted(task.released):
         ids = heads.filter(pc.equal(heads["part"], part))["query_id"].combine_chunks()
         rows = task_files.read_batches(task.truth / task_files.TRUTH, TRUTH_SCHEMA.names)
         plain = (_plain(batch.filter(pc.is_in(batch["query_id"], ids))) for batch in rows)
@@ -296,7 +277,7 @@ def _copy_truths(folder: Path, task: ReleaseTask) -> None:
 
 
 def _plain(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Truths with lists of pairs for maps, which not every reader of parquet knows."""
+    """Return truths with lists of pairs instead of maps, which not every reader of Parquet knows."""
     columns = [column.cast(item.type) for column, item in zip(batch.columns, PLAIN_TRUTH_SCHEMA, strict=True)]
     return pa.RecordBatch.from_arrays(columns, schema=PLAIN_TRUTH_SCHEMA)
 
@@ -309,18 +290,11 @@ def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBat
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    said = {**content, "licence": LICENCE, "attribution": ATTRIBUTION}
-    path.write_text(json_text(said), encoding="utf-8")
+    path.write_text(json_text({**content, "licence": LICENCE, "attribution": ATTRIBUTION}), encoding="utf-8")
 
 
 def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
-    """Size and hash of every file, by its path; those of maps and tasks are held against what their manifests say.
-
-    Raises
-    ------
-    StoreError
-        If one differs.
-    """
+    """Return size and hash of every file by its path; raise `StoreError` if one differs from its manifest."""
     found = {
         path.relative_to(folder).as_posix(): file_record(path) for path in sorted(folder.rglob("*")) if path.is_file()
     }
@@ -357,8 +331,8 @@ def write_index(folder: Path, release: Release) -> None:
         "regions": list(release.regions),
         "split": {"id": split.id, "title": split.title, "kind": split.kind, "buffer_m": split.buffer_m},
         "places": [place.model_dump(mode="json", exclude_defaults=True) for place in places_of(release)],
-        "maps": [_map_said(item) for item in release.maps],
-        "tasks": [_task_said(task) for task in release.tasks],
+        "maps": [_map_record(item) for item in release.maps],
+        "tasks": [_task_record(task) for task in release.tasks],
         "truths": "of all queries" if release.with_truth else "of the test part left out",
         "licence_url": LICENCE_URL,
     }
@@ -366,7 +340,7 @@ def write_index(folder: Path, release: Release) -> None:
 
 
 def places_of(release: Release) -> list[Place]:
-    """Places of the split that hold regions of the release, without those that it does not hold."""
+    """Return the places of the split with regions of the release, without the regions that it does not hold."""
     found = []
     for place in release.split.place:
         own = [name for name in place.regions if name in release.regions]
@@ -376,7 +350,7 @@ def places_of(release: Release) -> list[Place]:
     return found
 
 
-def _map_said(item: ReleaseMap) -> dict[str, Any]:
+def _map_record(item: ReleaseMap) -> dict[str, Any]:
     about = item.manifest
     return {
         "map": item.name,
@@ -390,22 +364,19 @@ def _map_said(item: ReleaseMap) -> dict[str, Any]:
     }
 
 
-def _task_said(task: ReleaseTask) -> dict[str, Any]:
+def _task_record(task: ReleaseTask) -> dict[str, Any]:
     return {
         "suite": task.suite,
         "suite_version": task.about["suite_version"],
         "map": task.map_name,
         "queries": dict(task.parts),
-        "truths": sorted(task.told),
+        "truths": sorted(task.released),
         "files": {part: task.file_of(part) for part in task.parts},
     }
 
 
 def write_sums(folder: Path, known: Mapping[str, FileRecord]) -> None:
-    """Write `SHA256SUMS`, the last file of a release: `sha256sum -c SHA256SUMS` holds all others against it.
-
-    What is `known` is not read again.
-    """
+    """Write `SHA256SUMS`, the last file of a release; hashes in `known` are not computed again."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     lines = [f"{(known.get(name) or file_record(folder / name)).sha256}  {name}\n" for name in names]
     (folder / SUMS).write_text("".join(lines), encoding="utf-8")

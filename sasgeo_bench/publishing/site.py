@@ -4,7 +4,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -40,8 +40,8 @@ class ContrastSummary:
     """A registered contrast in plain words.
 
     `outcome` is one of `OUTCOMES`; the cause of a gain is open where the falsifiers of the contrast gain, too.
-    `unstressed` says how both fare where they should not differ, empty where nobody looked; `bar` spans from -`reach`
-    to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
+    `unstressed` compares both where they should not differ, empty if nothing was measured there; `bar` spans from
+    -`reach` to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
     """
 
     name: str
@@ -58,7 +58,7 @@ class ContrastSummary:
 
 
 def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
-    """Registered contrasts, what is decided first."""
+    """Return registered contrasts, decided ones first."""
     records = [{str(name): value for name, value in row.items()} for row in source.contrasts.to_dict("records")]
     ends = [abs(float(row[name])) for row in records for name in ("lo", "hi", "difference")]
     reach = max((end for end in ends if math.isfinite(end)), default=1.0) or 1.0
@@ -102,7 +102,7 @@ def _headline(row: Record, verdict: str, outcome: str) -> str:
 
 
 def _sentence(row: Record, least: float) -> str:
-    """Return the difference with its interval, in words that say which way is good."""
+    """Return the difference with its interval, in words that state which direction is good."""
     if not int(row["n"]):
         return "No query of this board counts for it."
     difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
@@ -113,8 +113,8 @@ def _sentence(row: Record, least: float) -> str:
 
 def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
     """Return how both sides fare without the stress, all suites together: the first row of a contrast."""
-    mine = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
-    return None if mine.empty else {str(name): value for name, value in mine.iloc[0].items()}
+    own = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
+    return None if own.empty else {str(name): value for name, value in own.iloc[0].items()}
 
 
 def _outcome(row: Record, falsifier: Record | None) -> str:
@@ -196,33 +196,27 @@ class Group:
 
 
 def site_pages(source: SiteSource) -> dict[str, str]:
-    """All pages of a site with its style and script, by file name.
+    """Return all pages of a site with its style and script, by file name.
 
-    Parameters
-    ----------
-    source : SiteSource
-        The board and all that is shown with it.
-
-    Returns
-    -------
-    dict of str to str
-        No page names another host but as a link, and each can be read without the script.
+    Pages refer to other hosts only by links, and each can be read without the script.
     """
     templates = _environment()
     book = Book.of(source.board, source.about, source.scores)
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
-    there = set(_NAMES)
-    there -= set() if rejection or protection else {"rejection.html"}
-    there -= set() if source.figures else {"figures.html"}
-    there -= set() if source.pictures.cases else {"failures.html"}
+    optional = {
+        "rejection.html": rejection or protection,
+        "figures.html": source.figures,
+        "failures.html": source.pictures.cases,
+    }
+    there = [name for name in _NAMES if optional.get(name, True)]
     suites, matchers, sections = suites_of(source, book), matchers_of(source, book), sections_of(book)
     kinds = figures_by_kind(source.figures)
     common: dict[str, Any] = {
         "source": source,
         "about": source.about,
         "book": book,
-        "navigation": [(page, title) for page, title in _NAMES.items() if page in there],
+        "navigation": [(name, _NAMES[name]) for name in there],
         "note": NOTE.format(draws=source.about.get("draws", "?")),
     }
     controls = _verdicts(source)
@@ -253,7 +247,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
             "meanings": MEANINGS | MARKS,
         },
     }
-    pages = {name: _render(templates, name, name, common | special[name]) for name in _NAMES if name in there}
+    pages = {name: _render(templates, name, name, common | special[name]) for name in there}
     for suite in suites:
         pages[suite.page] = _render(templates, "suite.html", suite.page, common | {"suite": suite})
     for matcher in matchers:
@@ -282,18 +276,14 @@ def _render(templates: Environment, template: str, page: str, values: Mapping[st
 
 
 def _verdicts(source: SiteSource) -> list[Verdict]:
-    return [
-        Verdict(
-            control=str(row["control"]),
-            matcher=str(row["matcher"]),
-            n=int(row["n"]),
-            found=float(row["found"]),
-            expected=float(row["expected"]),
-            p=float(row["p"]),
-            holds=bool(row["holds"]),
-        )
-        for row in source.controls.to_dict("records")
-    ]
+    kinds: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(("control", "matcher"), str),
+        "n": int,
+        **dict.fromkeys(("found", "expected", "p"), float),
+        "holds": bool,
+    }
+    records = source.controls.to_dict("records")
+    return [Verdict(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in records]
 
 
 def _controls_state(verdicts: Sequence[Verdict]) -> str:
@@ -307,33 +297,23 @@ def _controls_state(verdicts: Sequence[Verdict]) -> str:
 def _counts(source: SiteSource, book: Book) -> dict[str, int]:
     """Count matchers, suites, queries, blocks and places of the board."""
     board, scores = source.board, source.scores
-    queries = scores["query_id"].nunique() if "query_id" in scores else 0
     return {
         "matchers": len(book.matcher_pages),
         "suites": len(book.suite_pages),
-        "queries": int(queries),
-        "blocks": int(board["blocks"].max()) if len(board) else 0,
-        "places": int(board["places"].max()) if len(board) else 0,
+        "queries": int(scores["query_id"].nunique()) if "query_id" in scores else 0,
+        **{name: int(board[name].max()) if len(board) else 0 for name in ("blocks", "places")},
     }
 
 
 def groups_of(cases: Sequence[Case]) -> tuple[Group, ...]:
-    """Failures by class, numbered through from 1.
-
-    Examples
-    --------
-    >>> said = {"query_id": "q", "matcher": "m", "file": "a.png", "alt": ""}
-    >>> cases = [Case(failure=name, **said) for name in ("other", "occluded", "aliased")]
-    >>> [(group.title, group.cases[0][0]) for group in groups_of(cases)]
-    [('aliased', 1), ('occluded', 2), ('other', 3)]
-    """
+    """Return failures by class, numbered through from 1."""
     counts = Counter(case.failure for case in cases)
     names = [name for name in FAILURES if name in counts]
     names += sorted(set(counts) - set(names))
     groups, number = [], 0
     for at, name in enumerate(names):
-        mine = [case for case in cases if case.failure == name]
-        listed = tuple((number + more, case) for more, case in enumerate(mine, start=1))
+        own = [case for case in cases if case.failure == name]
+        listed = tuple((number + more, case) for more, case in enumerate(own, start=1))
         groups.append(Group(title=name, stem=f"{file_stem('class', name)}-{at}", cases=listed))
-        number += len(mine)
+        number += len(own)
     return tuple(groups)

@@ -2,10 +2,9 @@
 """A board's folder read for its site, and the folder of the site; written whole or not at all."""
 
 import gzip
-import html
 import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import json_text
 
@@ -36,7 +36,7 @@ _TAGS: Final = frozenset(  # of SVG: what shapes and texts are made of
     }
 )
 _SVG: Final = "{http://www.w3.org/2000/svg}"
-_INERT: Final = f"{_SVG}metadata"  # says whose data it is, in words of other vocabularies; nobody follows its links
+_INERT: Final = f"{_SVG}metadata"  # attribution in other vocabularies; its links are not followed
 _ENTITY: Final = re.compile(
     r"<!(ENTITY|ATTLIST|ELEMENT)|<!DOCTYPE[^>]*\[|<\?xml-stylesheet|<\?xml[^>]*encoding\s*=\s*(?![\"']utf-8[\"'])",
     re.IGNORECASE,
@@ -48,14 +48,8 @@ _WITHIN: Final = re.compile(r"#|data:image/(png|jpeg|webp);base64,")
 def svg_fault(text: str) -> str | None:
     """Return what an SVG holds that a figure does not need: scripts, event handlers, links; None if nothing.
 
-    Raises
-    ------
-    ValueError
-        If it is no XML.
+    Raise `ValueError` if it is no XML.
 
-    Examples
-    --------
-    >>> svg_fault('<svg xmlns="http://www.w3.org/2000/svg"><path d="M 0 0"/></svg>')
     >>> svg_fault('<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)"/>')
     'an attribute onload'
     """
@@ -67,7 +61,7 @@ def svg_fault(text: str) -> str | None:
     except ET.ParseError as error:
         message = f"it is no XML: {error}"
         raise ValueError(message) from error
-    inert = {id(item) for told in root.iter(_INERT) for item in told.iter()}
+    inert = {id(item) for metadata in root.iter(_INERT) for item in metadata.iter()}
     drawn = (item for item in root.iter() if id(item) not in inert or item.tag == _INERT)
     return next((fault for item in drawn if (fault := _fault_of(item))), None)
 
@@ -88,9 +82,9 @@ def _fault_of(item: ET.Element) -> str | None:
 
 PICTURES: Final = "pictures"
 FILES: Final = "files"
-MOST_BYTES: Final = 5_000_000  # of a site, pictures of regions and cases apart; more is said
+MOST_BYTES: Final = 5_000_000  # of a site without pictures of regions and cases; a larger one is reported
 _TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, PROTECTION)
-_OFFERED: Final = {  # what is offered for download, and what it is
+_OFFERED: Final = {  # files for download, with descriptions
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
     f"{LEADERBOARD}.csv": "the same for a spreadsheet",
     f"{LEADERBOARD}.tex": "tables for a paper",
@@ -105,55 +99,24 @@ _OFFERED: Final = {  # what is offered for download, and what it is
     BOARD: "versions, hashes and cards",
 }
 _LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
-_LEFT_OUT_BYTES: Final = 1_500_000  # what is more, packed, stays with the board
-_MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz: what holds more is no text of ours
-_MOST_POINTS: Final = 100_000.0  # of a figure, either way
-_TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
-_SIZE: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
-_HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Drawn:
-    """An SVG: its text, and what it says of its title and size in points."""
-
-    text: str
-    title: str
-    width: float
-    height: float
-
-    @classmethod
-    def of(cls, text: str, name: str) -> "Drawn":
-        """Of the text of a figure; one without a title has its name.
-
-        Examples
-        --------
-        >>> drawn = Drawn.of('<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>', "mine")
-        >>> drawn.title, drawn.width, drawn.height
-        ('A & B', 90.0, 45.0)
-        """
-        title, *sizes = (pattern.search(text) for pattern in (_TITLE, _SIZE, _HEIGHT))
-        said = (float(found[1]) if found else 0.0 for found in sizes)
-        width, height = (size if 0 < size < _MOST_POINTS else 480.0 for size in said)
-        shown = html.unescape(title[1]).strip() if title else name
-        return cls(text=text, title=" ".join(shown.split()), width=width, height=height)
+_LEFT_OUT_BYTES: Final = 1_500_000  # larger files, packed, stay with the board
+_MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz; none of our texts is larger
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardFiles:
     """Files of a board's folder that a site shows.
 
-    `tables` are contrasts, controls, scores and protection, empty where there is none; `figures` by file name;
-    `downloads` the bytes to be offered, by file name, with what each is; `pictures` what `pictures.json` says;
-    `settings` how stored results were scored, empty of a board that is not stored.
+    `tables` are contrasts, controls, scores and protection, empty where there is none; `pictures` is the content of
+    `pictures.json`; `settings` those that stored results were scored with, empty for a board that is not stored.
     """
 
     folder: Path
     about: Mapping[str, Any]
     board: pd.DataFrame
     tables: Mapping[str, pd.DataFrame]
-    figures: Mapping[str, Drawn]
-    downloads: Mapping[str, tuple[bytes, str]]
+    figures: tuple[SiteFigure, ...]
+    downloads: tuple[Download, ...]
     pictures: Mapping[str, Sequence[Mapping[str, Any]]]
     settings: Mapping[str, Any]
 
@@ -161,10 +124,7 @@ class BoardFiles:
 def read_board_files(folder: Path) -> BoardFiles:
     """Read a board, or stored results, for its site.
 
-    Raises
-    ------
-    StoreError
-        If there is no board, or a file of it is damaged, a link, or a figure that does more than draw.
+    Raise `StoreError` if there is no board, or a file of it is damaged, a link, or a figure that does more than draw.
     """
     with _sound(folder):
         list_files(folder, without=SITE_FOLDERS)
@@ -175,8 +135,8 @@ def read_board_files(folder: Path) -> BoardFiles:
             about=about,
             board=board,
             tables={name: _read_table(folder / f"{name}.parquet") for name in _TABLES},
-            figures=_read_figures(folder / FIGURES),
-            downloads=dict(_read_downloads(folder)),
+            figures=tuple(_read_figures(folder / FIGURES)),
+            downloads=tuple(_read_downloads(folder)),
             pictures=_read_pictures(folder / PICTURES),
             settings=read_settings(folder) if is_pack(folder) else {},
         )
@@ -202,7 +162,7 @@ def _read_table(path: Path) -> pd.DataFrame:
 
 
 def _plain_or_packed(path: Path) -> bytes | None:
-    """Bytes of a file, or of its .gz unpacked; None where there is neither."""
+    """Return the bytes of a file, or of its .gz unpacked; None where there is neither."""
     packed = path.with_name(f"{path.name}.gz")
     if path.is_file():
         return path.read_bytes()
@@ -210,7 +170,7 @@ def _plain_or_packed(path: Path) -> bytes | None:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Text of a .gz, as much as anything of ours holds."""
+    """Unpack a .gz of limited size."""
     try:
         with gzip.open(path) as source:
             data = source.read(_MOST_UNPACKED + 1)
@@ -223,27 +183,25 @@ def _unpacked(path: Path) -> bytes:
     return data
 
 
-def _read_figures(folder: Path) -> dict[str, Drawn]:
-    names = sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")})
-    found = {name: _plain_or_packed(folder / name) for name in names if name.endswith(".svg")}
-    return {name: _figure_of(folder / name, data) for name, data in found.items() if data}
+def _read_figures(folder: Path) -> Iterator[SiteFigure]:
+    """Read figures, refusing an SVG that does more than draw: pages link to it."""
+    for name in sorted({path.name.removesuffix(".gz") for path in folder.glob("*.svg*")}):
+        data = _plain_or_packed(folder / name) if name.endswith(".svg") else None
+        if not data:
+            continue
+        try:
+            text = data.decode()
+            fault = svg_fault(text)
+        except ValueError as error:
+            message = f"{name}: {error}"
+            raise ValueError(message) from error
+        if fault is not None:
+            message = f"{folder / name} holds {fault}, as no figure of a board does: score it again, or remove the file"
+            raise StoreError(message)
+        yield SiteFigure.of(name, text)
 
 
-def _figure_of(path: Path, data: bytes) -> Drawn:
-    """Return a figure whose SVG only draws; pages link to it."""
-    try:
-        text = data.decode()
-        fault = svg_fault(text)
-    except ValueError as error:
-        message = f"{path.name}: {error}"
-        raise ValueError(message) from error
-    if fault is not None:
-        message = f"{path} holds {fault}, as no figure of a board does: score it again, or remove the file"
-        raise StoreError(message)
-    return Drawn.of(text, path.stem)
-
-
-def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
+def _read_downloads(folder: Path) -> Iterator[Download]:
     for name, what in _OFFERED.items():
         data = _plain_or_packed(folder / name)
         if data is None:
@@ -251,16 +209,16 @@ def _read_downloads(folder: Path) -> Iterator[tuple[str, tuple[bytes, str]]]:
         is_packed = len(data) > _LARGE_BYTES and not name.endswith(".parquet")
         data = gzip.compress(data, mtime=0) if is_packed else data
         if len(data) <= _LEFT_OUT_BYTES:
-            yield f"{name}.gz" if is_packed else name, (data, what)
+            yield Download(file=f"{name}.gz" if is_packed else name, data=data, what=what)
 
 
 def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Read regions, suites and cases of `pictures.json`, and check each file against the folder."""
-    said = folder / f"{PICTURES}.json"
-    if not said.is_file():
+    path = folder / f"{PICTURES}.json"
+    if not path.is_file():
         return {}
     try:
-        data = said.read_bytes()
+        data = path.read_bytes()
         parse_record(data, PicturesRecord)
         content = parse_json(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
@@ -270,13 +228,13 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         text = one_line(str(error))
-        message = f"{said} is damaged ({text}): make the pictures again, or move the folder away"
+        message = f"{path} is damaged ({text}): make the pictures again, or move the folder away"
         raise StoreError(message) from error
     return found
 
 
 def _check_picture(folder: Path, name: str) -> None:
-    """Refuse a picture that is none, is missing, or lies elsewhere."""
+    """Refuse a file that is no picture, is missing, or lies outside the folder."""
     path = folder / name
     is_inside = path.resolve().is_relative_to(folder.resolve()) and not Path(name).is_absolute()
     if not is_inside or path.suffix.lower() not in IMAGES or not path.is_file():
@@ -297,32 +255,23 @@ class Written:
     pages: int
 
     def to_text(self) -> str:
-        """In a line.
-
-        Examples
-        --------
-        >>> Written(folder=Path("site"), site_bytes=1_200_000, picture_bytes=0, pages=12).to_text()
-        'site: 12 pages, 1.20 MB and 0.00 MB of pictures'
-        """
+        """Return folder and sizes in one line."""
         sizes = f"{self.site_bytes / 1e6:.2f} MB and {self.picture_bytes / 1e6:.2f} MB of pictures"
         return f"{self.folder}: {self.pages} pages, {sizes}"
 
 
 @contextmanager
 def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
-    """Hold a board, and the site that is made of it: nobody else writes either of them meanwhile.
+    """Lock a board and its site against other writers.
 
-    Raises
-    ------
-    StoreError
-        If there is no board, or the target holds something that is no site.
+    Raise `StoreError` if there is no board, or the target holds something that is no site.
     """
     if not (folder / BOARD).is_file():
         message = f"{folder} holds no board ({BOARD}): name the folder of one, as out/boards/demo"
         raise StoreError(message)
     check_target(target)
     if target.parent.resolve() == folder.resolve():
-        with locked(folder, tell=tell):  # a lock beside the site would be a strange file in the board's folder
+        with locked(folder, tell=tell):  # a lock next to the site would be a foreign file in the board's folder
             yield
         return
     with locked(folder, tell=tell), locked(target, tell=tell):
@@ -330,13 +279,7 @@ def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator
 
 
 def check_target(target: Path) -> None:
-    """Refuse a folder that a site cannot take the place of.
-
-    Raises
-    ------
-    StoreError
-        If it is a file, or holds something and is no site, or one with files of somebody else.
-    """
+    """Raise `StoreError` if a site cannot replace a folder: a file, no site, or one with foreign files."""
     if target.exists() and not target.is_dir():
         message = f"{target} is a file: move it away, or name another folder"
         raise StoreError(message)
@@ -351,35 +294,19 @@ def write_site(
     board: BoardFiles,
     *,
     pages: Mapping[str, str],
-    drawn: Mapping[str, str],
+    figures: Iterable[SiteFigure],
     about: Mapping[str, Any],
 ) -> Written:
-    """Write a site, whole or not at all.
+    """Write a site, whole or not at all; an older one in the target folder is replaced.
 
-    Parameters
-    ----------
-    target : Path
-        Folder of the site; an older one there is replaced.
-    board : BoardFiles
-        Whose figures, downloads and pictures go with it.
-    pages : mapping of str to str
-        File name -> text: pages, style and script.
-    drawn : mapping of str to str
-        More figures, by file name.
-    about : mapping
-        What `site.json` says.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be written; an older site is then as it was.
+    `pages` are the texts of pages, style and script by file name, `about` further content of `site.json`; downloads and
+    pictures come from the board. Raise `StoreError` if the site cannot be written; an older site then stays as it was.
     """
     check_target(target)
     named = {str(item["file"]) for listed in board.pictures.values() for item in listed}
-    figures = {name: item.text for name, item in board.figures.items()} | dict(drawn)
     files: dict[str, bytes] = {name: text.encode() for name, text in pages.items()}
-    files |= {f"{FIGURES}/{name}": text.encode() for name, text in figures.items()}
-    files |= {f"{FILES}/{name}": data for name, (data, _) in board.downloads.items()}
+    files |= {f"{FIGURES}/{item.file}": item.text.encode() for item in figures}
+    files |= {f"{FILES}/{item.file}": item.data for item in board.downloads}
     pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
     content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION, "files": sorted({*files, *pictures})}
     files[MANIFEST] = json_text(content).encode()
@@ -410,7 +337,7 @@ def _put(path: Path, data: bytes) -> None:
 
 
 def draw_text(draw: Callable[[Path], None], folder: Path) -> str:
-    """Text of an SVG that a function draws into a path; the folder is scratch."""
+    """Return the text of an SVG that a function draws into a path in a scratch folder."""
     path = folder / "drawn.svg"
     draw(path)
     return path.read_text(encoding="utf-8")

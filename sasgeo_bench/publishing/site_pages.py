@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the other pages of a site show: suites, matchers, rejection, costs, places and measured ageing."""
+"""Content of the other pages of a site: suites, matchers, rejection, costs, places and measured ageing."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,28 +46,15 @@ KINDS: Final = {  # of figures, by how their names begin, in the order they are 
 
 
 def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]]:
-    """Figures under the titles of their kinds.
-
-    Examples
-    --------
-    >>> figures_by_kind([SiteFigure(file="age-real-age.svg", title="", width=1, height=1)]).keys()
-    dict_keys(['Success against the age of the map'])
-    """
-    found: dict[str, list[SiteFigure]] = {}
-    for kind, title in (*KINDS.items(), ("", "Other figures")):
-        mine = [item for item in figures if _kind_of(item) == kind]
-        if mine:
-            found[title] = mine
-    return found
-
-
-def _kind_of(figure: SiteFigure) -> str:
-    kind = figure.file.partition("-")[0]
-    return kind if kind in KINDS else ""
+    """Return figures under the titles of their kinds."""
+    found: dict[str, list[SiteFigure]] = {title: [] for title in (*KINDS.values(), "Other figures")}
+    for item in figures:
+        found[KINDS.get(item.file.partition("-")[0], "Other figures")].append(item)
+    return {title: items for title, items in found.items() if items}
 
 
 def _groups(book: Book) -> dict[tuple[str, str], list[Key]]:
-    """Keys of the board by track and prior group."""
+    """Return keys of the board by track and prior group."""
     found: dict[tuple[str, str], list[Key]] = {}
     for key in book.matchers:
         found.setdefault(key[1:], []).append(key)
@@ -118,7 +105,7 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherPage:
-    """A contestant: what it says of itself, how it fared, what it cannot do, what it costs."""
+    """A contestant: its card, results, limits and costs."""
 
     name: str
     page: str
@@ -126,7 +113,7 @@ class MatcherPage:
     cell: Cell
     card: Mapping[str, Any]
     trained: str
-    taught: tuple[str, ...]
+    training: tuple[str, ...]
     cannot: tuple[str, ...]
     results: tuple[Table, ...]
     rejection: Table | None
@@ -149,7 +136,7 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
         cell=book.name_cell(name),
         card=card,
         trained=_trained(card.get("trained_on")),
-        taught=tuple(_taught(entry)),
+        training=tuple(_training(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
         rejection=rejection_of(board, name),
@@ -157,21 +144,21 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
     )
 
 
-def _trained(said: object) -> str:
+def _trained(stated: object) -> str:
     """Return the training places that a card names: "none", some, or some for each half."""
-    if isinstance(said, Mapping):
-        return "; ".join(f"half {half}: {_trained(places)}" for half, places in said.items())
-    places = [] if isinstance(said, str) or not isinstance(said, Sequence) else list(map(str, said))
+    if isinstance(stated, Mapping):
+        return "; ".join(f"half {half}: {_trained(places)}" for half, places in stated.items())
+    places = [] if isinstance(stated, str) or not isinstance(stated, Sequence) else list(map(str, stated))
     return ", ".join(places) or "no place that its card names"
 
 
-def _taught(entry: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the training of an entry by the runner, and the regions it was asked on so: tasks are hundreds."""
+def _training(entry: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the training of an entry by the runner, and the regions it was then tested on: tasks are hundreds."""
     for one in entry.get("learned") or ():
-        verb = "Learnt" if one["file"] else "Could not learn"
+        verb = "Trained on" if one["file"] else "Could not be trained on"
         regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
         yield (
-            f"{verb} from {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; asked so in "
+            f"{verb} {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; then tested in "
             f"{counted(len(one['asked']), 'task')} on {', '.join(regions)}."
         )
 
@@ -241,7 +228,7 @@ def _costs_of(book: Book, name: str) -> Iterator[tuple[str, str, str]]:
 
 
 def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
-    """Return how protection levels fared at one alert limit, a table for each prior group."""
+    """Return the results of protection levels at one alert limit, a table for each prior group."""
     if not len(protection):
         return ()
     limits = sorted(set(protection["alert_limit_m"]))
@@ -275,7 +262,7 @@ def _share_cell(row: Mapping[Any, Any], area: str) -> Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceOnMap:
-    """A place of the board: its number on the map, where it lies, and the half or part that it belongs to."""
+    """A place of the board: its number on the map, its position, and the half or part that it belongs to."""
 
     number: int
     name: str
@@ -286,10 +273,8 @@ class PlaceOnMap:
 
 
 def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
-    """Tasks of a board by region, whatever date or copy of it they search.
+    """Return the tasks of a board by region, whatever date or copy of it they search.
 
-    Examples
-    --------
     >>> list(regions_of({"tasks": [{"region": "vaduz@2015-07-27"}, {"region": "vaduz+alias"}]}))
     ['vaduz']
     """
@@ -302,7 +287,7 @@ def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
 def places_on_map(
     about: Mapping[str, Any], spots: Mapping[str, Spot], parts: Mapping[str, tuple[str, str]]
 ) -> tuple[PlaceOnMap, ...]:
-    """Places of a board that are known to lie somewhere, numbered; of several regions the middle."""
+    """Return the places of a board with known positions, numbered; the middle of several regions."""
     by_place: dict[str, list[Spot]] = {}
     for region in (name for name in regions_of(about) if name in spots):
         by_place.setdefault(parts.get(region, (region, ""))[0], []).append(spots[region])
@@ -321,7 +306,7 @@ def places_on_map(
 
 
 def region_table(source: SiteSource) -> Table:
-    """Every region of the board, where it lies and what was drawn there."""
+    """Return a table of every region of the board, its position and what was drawn there."""
     numbers = {item.name: item.number for item in places_on_map(source.about, source.spots, source.parts)}
     rows = []
     for region, tasks in regions_of(source.about).items():
@@ -353,7 +338,7 @@ def region_table(source: SiteSource) -> Table:
 
 
 def rate_table(book: RateBook) -> Table:
-    """Measured yearly rates with their intervals, a class of a place a line."""
+    """Return measured yearly rates with their intervals, a row for each class of a place."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     rows = [
         Row(

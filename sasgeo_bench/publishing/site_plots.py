@@ -31,15 +31,7 @@ _LABEL_POINTS: Final = 6.5
 
 
 def draw_places(path: Path, places: Sequence[PlaceOnMap]) -> None:
-    """Draw where the places of a board lie: by degrees, Europe alone where some lie elsewhere, too.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    places : sequence of PlaceOnMap
-        One at least.
-    """
+    """Draw the places of a board on a map into a .svg or .png; Europe also alone where some lie elsewhere."""
     parts = sorted({item.part for item in places})
     near = [item for item in places if _is_near(item)]
     panels = [("all places", list(places))]
@@ -91,15 +83,7 @@ def _draw_spots(chart: Axes, places: Sequence[PlaceOnMap], parts: Sequence[str])
 
 
 def draw_rates(path: Path, book: RateBook) -> None:
-    """Draw what vanishes and what appears in a year, by class, a mark for each place.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    book : RateBook
-        The measured places.
-    """
+    """Draw into a .svg or .png what vanishes and what appears in a year, by class, a mark for each measured place."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     names = [name for name in titles if any(name in place.classes for place in book.places)]
     about = Page(

@@ -1,24 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a site is made of, as values: a board's tables and pictures, and what ships with the package."""
+"""Content of a site as values: a board's tables and pictures, and what ships with the package."""
 
+import html
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import RateBook
 from sasgeo_bench.scoring.contrasts import Contrast
 
+_MOST_POINTS: Final = 100_000.0  # of a figure, either way
+_TITLE: Final = re.compile(r"<dc:title>(.*?)</dc:title>", re.DOTALL)
+_WIDTH: Final = re.compile(r'<svg[^>]*?\swidth="([\d.]+)(?:pt|px)?"', re.DOTALL)
+_HEIGHT: Final = re.compile(r'<svg[^>]*?\sheight="([\d.]+)(?:pt|px)?"', re.DOTALL)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SiteFigure:
-    """A figure of the board: name of its file, title, and width and height in points."""
+    """A figure: name of its file, text of the SVG, title, and width and height in points."""
 
     file: str
+    text: str
     title: str
     width: float
     height: float
+
+    @classmethod
+    def of(cls, file: str, text: str) -> Self:
+        """Read title and size of an SVG; one without a title has the name of its file.
+
+        >>> figure = SiteFigure.of("own.svg", '<svg width="90pt" height="45pt"><dc:title>A &amp; B</dc:title></svg>')
+        >>> figure.title, figure.width, figure.height
+        ('A & B', 90.0, 45.0)
+        """
+        title, *sizes = (pattern.search(text) for pattern in (_TITLE, _WIDTH, _HEIGHT))
+        found = (float(size[1]) if size else 0.0 for size in sizes)
+        width, height = (size if 0 < size < _MOST_POINTS else 480.0 for size in found)
+        shown = html.unescape(title[1]).strip() if title else Path(file).stem
+        return cls(file=file, text=text, title=" ".join(shown.split()), width=width, height=height)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +60,7 @@ _LEFT_OUT: Final = (_VERDICT, "told_hpl_")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One query that a matcher failed on, with what is said of it by name."""
+    """One query that a matcher failed on, with facts about it by name."""
 
     query_id: str
     matcher: str
@@ -52,8 +75,6 @@ class Case:
     def lines(self) -> dict[str, str]:
         """Return the facts of a case for a page: a line for each rejector, without protection levels.
 
-        Examples
-        --------
         >>> said = {"error_m": "9", "p_false_own": "0.9", "accepted_own": "no", "told_hpl_gauss_0.01_m": "4"}
         >>> Case(query_id="q", matcher="m", failure="aged", file="a.webp", alt="", said=said).lines()
         {'error_m': '9', 'own': 'P(false) 0.9, withheld'}
@@ -93,41 +114,20 @@ class Spot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Download:
-    """A file that the site offers: name, bytes as they are to be fetched, and what is in it."""
+    """A file that the site offers: name, bytes as downloaded, and a description."""
 
     file: str
-    size_bytes: int
+    data: bytes
     what: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class SiteSource:
-    """All that the pages of a site are made of.
+    """Content of all pages of a site; a table that the board lacks is empty.
 
-    Parameters
-    ----------
-    name, title : str
-        Of the board; the title is that of its pipeline where it is known.
-    about : mapping
-        What `board.json` says.
-    board, contrasts, falsifiers, controls, scores, protection : pandas.DataFrame
-        Its tables; empty where it has none.
-    registered : tuple of Contrast
-        As they were registered, where that is known.
-    reasons : mapping of str to str
-        Name of a contrast -> why it was registered.
-    figures, downloads : tuple
-        Files beside the pages.
-    pictures : Pictures
-        Previews, examples and failures.
-    spots : mapping of str to Spot
-        By region; of some regions nobody knows where they lie.
-    parts : mapping of str to (str, str)
-        By region: place, and half or part of the split.
-    rates : RateBook
-        Measured ageing.
-    rates_figure, map_figure : SiteFigure, optional
-        Of the rates and of the places, where they are drawn.
+    `title` is that of the board's pipeline where it is known, `about` the content of `board.json`. `reasons` states why
+    each contrast was registered. `spots` are positions of regions, as far as they are known; `parts` holds place, and
+    half or part of the split, of each region; `rates` is measured ageing.
     """
 
     name: str

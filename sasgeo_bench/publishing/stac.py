@@ -40,15 +40,7 @@ _ASSETS: Final = {
 
 
 def write_stac(folder: Path, release: Release) -> None:
-    """Write the catalog: one collection, an item for each map.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the release; `stac/` goes into it.
-    release : Release
-        What is in it, sizes and hashes of its files included.
-    """
+    """Write the catalog into `stac/` of a release: one collection, an item for each map."""
     import pystac  # noqa: PLC0415 - an extra: only whoever writes a release needs it
 
     items = [_item(item, release) for item in release.maps]
@@ -153,21 +145,14 @@ def _item(item: ReleaseMap, release: Release) -> "pystac.Item":
 
 
 def _bands(name: str, item: ReleaseMap) -> dict[str, Any]:
-    """Bands of a raster; nothing of another file."""
+    """Return the bands of a raster; nothing for another file."""
     if name != region_files.LAYERS:
         return {}
     return {"data_type": "uint8", "nodata": OUTSIDE, "bands": [{"name": band} for band in item.manifest.classes]}
 
 
 def footprint(grid: Grid) -> shapely.Polygon:
-    """Outline of a region in WGS84, longitude first.
-
-    Examples
-    --------
-    >>> grid = Grid(epsg=32632, west_m=5e5, north_m=5.3e6, cell_size_m=1.0, rows=100, cols=100)
-    >>> [round(degrees, 3) for degrees in footprint(grid).bounds]
-    [9.0, 47.852, 9.001, 47.853]
-    """
+    """Return the outline of a region in WGS84, longitude first."""
     west, south, east, north = grid.bounds_m
     longest_m = max(east - west, north - south)
     outline = shapely.segmentize(shapely.box(west, south, east, north), longest_m / _SIDE_POINTS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers of others: a submission made of predictions and a card, held against a board, and scored with it."""
+"""Answers of others: a submission of predictions and a card, checked against a board and scored with it."""
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,26 +25,18 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import list_submissions, read_card, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION
+from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split, find_split
 
-FOLDER: Final = Path("submissions")  # where they lie, unless said otherwise
+FOLDER: Final = Path("submissions")  # the default folder of submissions
 
 
 @dataclass(frozen=True, kw_only=True)
 class SubmitRequest:
     """A request for a submission.
 
-    Parameters
-    ----------
-    predictions : Path
-        A file of predictions, or the folder of a matcher's runs.
-    card : Path
-        The card, TOML.
-    board : Path
-        Stored results of the board it is for.
-    into : Path, optional
-        Folder to write; submissions/<name> unless said.
+    `predictions` is a file of predictions or the folder of a matcher's runs, `card` a TOML file, `board` the stored
+    results of the board, `into` the folder to write (submissions/<name> by default).
     """
 
     predictions: Path
@@ -54,26 +46,10 @@ class SubmitRequest:
 
 
 def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
-    """Put predictions and a card into a folder that `validate` accepts.
+    """Put predictions and a card into a folder that `validate` accepts, and return it.
 
-    Parameters
-    ----------
-    request : SubmitRequest
-        What is asked for.
-    tell : callable
-        Gets a line for whatever the author should know: misses, controls that are not answered.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    ConfigError
-        If the card does not fit the board or the runs, or the predictions hold faults; nothing is written.
-    StoreError
-        If something cannot be read or written.
+    `tell` gets a line on misses and on controls that are not answered. Raise `ConfigError` if the card does not fit the
+    board or the runs, or the predictions hold faults; `StoreError` if something cannot be read or written.
     """
     card = read_card(request.card)
     if not is_pack(request.board):
@@ -86,7 +62,7 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
         _check_runs(card, request.predictions, split, tasks)
         _check_rows(request.predictions, folders)
         rows = _rows_of(request.predictions, tasks)
-    said = Submission(
+    submission = Submission(
         schema_version=SCHEMA_VERSION,
         card=card,
         board=board_of([request.board]),
@@ -102,8 +78,8 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     )
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     folder = request.into or FOLDER / card.name
-    write_submission(folder, said, list(rows.values()), asked)
-    for line in _remarks(said):
+    write_submission(folder, submission, list(rows.values()), asked)
+    for line in _remarks(submission):
         tell(line)
     return folder
 
@@ -114,7 +90,7 @@ def _split_of(board: Path) -> Split | None:
 
 
 def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> None:
-    """Refuse a name that another row has, and training on places that nobody knows."""
+    """Refuse a name that another row has, and training on unknown places."""
     taken = {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
     kinds = {
         "a control of every board": is_unranked(card.name),
@@ -142,7 +118,7 @@ def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> Non
 
 
 def _hint(unknown: str, split: Split | None) -> str:
-    """Suggest the place that was meant by one that the split does not know."""
+    """Suggest a known place for one that the split does not know."""
     if split is None:
         return "and this board has no split"
     home = split.places_in(unknown)
@@ -153,11 +129,11 @@ def _hint(unknown: str, split: Split | None) -> str:
 
 
 def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Sequence[AskedTask]) -> None:
-    """Refuse a card that does not say what the runs say: whose they are, and which places taught them."""
+    """Refuse a card that disagrees with the runs on the matcher or its training places."""
     named = {(task.about["suite"], task.about["region"]) for task in tasks}
     for about in _runs_in(predictions):
-        said = about.get("matcher")
-        found = {name: said.get(name) for name in ("name", "version")} if isinstance(said, dict) else {}
+        matcher = about.get("matcher")
+        found = {name: matcher.get(name) for name in ("name", "version")} if isinstance(matcher, dict) else {}
         if found != {"name": card.name, "version": card.version}:
             message = (
                 f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {found.get('name')!r} "
@@ -179,12 +155,11 @@ def _runs_in(predictions: Path) -> Iterator[Mapping[str, Any]]:
 
 def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> None:
     """Check that the card states the runner's training, for the half it was asked about."""
-    said = about.get("learned")
-    taught = said.get("trained_on", ()) if isinstance(said, dict) else ()
-    region = str(about["region"]).split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
-    places = () if split is None else split.places_in(region)
+    training = about.get("learned")
+    places_trained = training.get("trained_on", ()) if isinstance(training, dict) else ()
+    places = () if split is None else split.places_in(base_of(str(about["region"])))
     half = split.half_of.get(places[0]) if split is not None and places else None
-    lost = sorted(set(taught) - set(card.taught(half)))
+    lost = sorted(set(places_trained) - set(card.taught(half)))
     if lost:
         message = (
             f"the runs on {about['suite']}/{about['region']} learnt from {lost[0]}, which trained_on of the card does "
@@ -204,7 +179,7 @@ def _check_rows(predictions: Path, folders: Sequence[Path]) -> None:
 
 
 def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Prediction]:
-    """Answers to the board's queries, by id; those of runs to other queries are left out."""
+    """Return answers to the board's queries by id; answers of runs to other queries are left out."""
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     if predictions.is_dir():
         return prediction_files.read_answers(predictions, asked, is_tied=False).found
@@ -212,7 +187,7 @@ def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Predict
 
 
 def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predictions: Path) -> list[TaskManifest]:
-    """All tasks of every suite that is answered at all: whoever answers chooses suites, and nothing within them."""
+    """Return all tasks of every suite with an answer: an author may choose suites, but not tasks within them."""
     counts = [(task, sum(name in rows for name in task.asked)) for task in tasks]
     suites = {task.about["suite"] for task, count in counts if count}
     if not suites:
@@ -231,72 +206,43 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
     ]
 
 
-def _remarks(said: Submission) -> Iterator[str]:
-    """Yield what an author should know before anyone else does."""
-    queries, answered = (sum(getattr(task, name) for task in said.tasks) for name in ("queries", "answered"))
-    yield f"{said.card.name}: {answered} of {counted(queries, 'query', 'queries')} of the board {said.board} have a row"
+def _remarks(submission: Submission) -> Iterator[str]:
+    """Yield remarks for the author on misses and controls."""
+    queries, answered = (sum(getattr(task, name) for task in submission.tasks) for name in ("queries", "answered"))
+    asked = counted(queries, "query", "queries")
+    yield f"{submission.card.name}: {answered} of {asked} of the board {submission.board} have a row"
     if answered < queries:
         yield f"  {queries - answered} have none and count as misses"
-    if CONTROLS not in {task.suite for task in said.tasks}:
+    if CONTROLS not in {task.suite for task in submission.tasks}:
         yield f"  the suite {CONTROLS!r} is not answered: nothing vouches for these answers but their author"
 
 
 def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tuple[Violation, ...]]:
-    """Hold a submission against itself and against tasks.
+    """Check a submission against itself and against tasks, task folders or stored results, if any.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the submission.
-    tasks : sequence of Path
-        Task folders and stored results; without any, its rows are held against nothing.
-
-    Returns
-    -------
-    tuple of Submission and tuple of Violation
-        What it says, and all that is wrong with it, queries without a row among them.
-
-    Raises
-    ------
-    StoreError
-        If its files are not what it says, or something cannot be read.
-    ConfigError
-        If what it says is wrong in itself.
+    Return its record and all faults, queries without a row among them. Raise `StoreError` if its files differ from its
+    record or something cannot be read, and `ConfigError` if the record is wrong in itself.
     """
-    said = read_submission(folder)
-    split = None if said.split is None else find_split(said.split)
+    submission = read_submission(folder)
+    split = None if submission.split is None else find_split(submission.split)
     places = () if split is None else tuple(split.blocks)
     if not tasks:
-        return said, tuple(submission_faults(folder, said, None, places=places))
+        return submission, tuple(submission_faults(folder, submission, None, places=places))
     with laid_tasks(tasks) as folders:
-        faults = submission_faults(folder, said, folders, board=board_of(tasks), places=places)
-        return said, tuple(faults)
+        faults = submission_faults(folder, submission, folders, board=board_of(tasks), places=places)
+        return submission, tuple(faults)
 
 
 def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:
-    """Submissions that are for a board, by name; how many are for others is told.
+    """Return the submissions for a board id, in `paths` or folders of them; report how many are for others.
 
-    Parameters
-    ----------
-    board : str
-        Its id.
-    paths : sequence of Path
-        Submissions, and folders of them.
-    tell : callable
-        Gets a line where some are left out.
-
-    Raises
-    ------
-    StoreError
-        If something is no submission, or not what it says.
-    ConfigError
-        If nobody says which board it is.
+    Raise `StoreError` if something is no submission or differs from its record, and `ConfigError` if `board` is empty.
     """
     if not board:
         message = "submissions are scored beside the stored results of a board: name them with --predictions"
         raise ConfigError(message)
     found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
-    boards = {folder: _board_said(folder, board) for folder in found.values()}
+    boards = {folder: _board_named(folder, board) for folder in found.values()}
     others = sorted({name for name in boards.values() if name != board})
     if others:
         count = sum(name != board for name in boards.values())
@@ -304,8 +250,8 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
     return tuple(folder for folder, name in boards.items() if name == board)
 
 
-def _board_said(folder: Path, board: str) -> str:
-    """Read the board that a submission is for; an unreadable one becomes the board that says that it failed."""
+def _board_named(folder: Path, board: str) -> str:
+    """Return the board that a submission names; an unreadable one fails on this board, which reports it."""
     try:
         return read_submission(folder).board
     except (StoreError, ConfigError):
@@ -317,30 +263,10 @@ def with_submissions(
 ) -> Board:
     """Score stored results again together with submissions, and write the board of both.
 
-    Parameters
-    ----------
-    stored : Path
-        Stored results.
-    submissions : sequence of Path
-        Submissions, and folders of them; those for other boards are left out.
-    board : Path
-        Folder to write.
-    tell : callable
-        Gets a line now and then.
-    root : Path
-        Where regions/, tasks/ and truth/ may be, for pictures.
-    jobs : int
-        Processes that fit rejectors.
-
-    Returns
-    -------
-    Board
-        As it was written: submissions are `as submitted`, runs as the stored results say.
-
-    Raises
-    ------
-    StoreError, ConfigError
-        If results or submissions are damaged or do not fit; nothing is written.
+    `submissions` are submissions and folders of them; those for other boards are left out. `root` holds regions/,
+    tasks/ and truth/ for pictures, `jobs` counts the processes that fit rejectors. Rows of submissions are marked `as
+    submitted`. Raise `StoreError` or `ConfigError` if results or submissions are damaged or do not fit; nothing is
+    written then.
     """
     if not is_pack(stored):
         message = f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written"

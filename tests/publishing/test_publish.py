@@ -301,7 +301,7 @@ def test_a_board_without_a_row_says_so(tmp_path):
     put_board(tmp_path / "mine", tasks=[], split=None)
     pages = read(publish(tmp_path / "mine", tell=quiet).folder)
     assert "This board holds no figure." in pages["index.html"].said("p")
-    assert "Nobody is on this board." in pages["matchers.html"].said("li")
+    assert "This board has no entry." in pages["matchers.html"].said("li")
     assert pages.keys() & {"rejection.html", "figures.html", "failures.html"} == set()
 
 

@@ -273,9 +273,9 @@ def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
     )
 
 
-def test_what_a_matcher_was_taught_is_told_by_region_for_tasks_are_hundreds():
+def test_the_training_of_a_matcher_is_listed_by_region_because_tasks_are_hundreds():
     learned = {"file": "a.json", "trained_on": ["porto"], "pairs": 24}
     learned["asked"] = ["alias/vaduz+alias", "clean/vaduz", "real-age/eschen@2015-07-27"]
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"learned": [learned]}})
     (page,) = matchers_of(given, book_of(given))
-    assert page.taught == ("Learnt from 24 queries of porto; asked so in 3 tasks on eschen, vaduz.",)
+    assert page.training == ("Trained on 24 queries of porto; then tested in 3 tasks on eschen, vaduz.",)

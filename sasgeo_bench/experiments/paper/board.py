@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a board holds of the paper's experiment besides its own files: the order of the steps."""
+"""Files of a board for the paper's experiment besides its own: the order of the steps."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,18 +40,10 @@ _LEAST_P: Final = 0.001
 def paper_markdown(
     summary: pd.DataFrame, findings: Sequence[Finding], about: Mapping[str, str], figures: Mapping[str, str]
 ) -> str:
-    """The summary as a document.
+    """Return the summary as a document in Markdown.
 
-    Parameters
-    ----------
-    summary : pandas.DataFrame
-        From `summary_frame`.
-    findings : sequence of Finding
-        Contrasts of this suite.
-    about : mapping
-        "trials" in words, "made_by" and "data".
-    figures : mapping of str to str
-        File -> caption.
+    `summary` is from `summary_frame`, `findings` are contrasts of this suite, `about` holds "trials" in words,
+    "made_by" and "data", `figures` the caption of each file.
     """
     known = [item.matcher for item in PUBLISHED if item.matcher in set(summary["matcher"])]
     others = [name for name in dict.fromkeys(summary["matcher"]) if name not in known]
@@ -90,13 +82,13 @@ def _interval_note(summary: pd.DataFrame) -> str:
 
 
 def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
-    """Return a matcher a line: each figure of the paper and ours; of Recall@1 the other interval too."""
+    """Return a row for each matcher: each figure of the paper and ours; for Recall@1 the other interval too."""
     rows = []
     for matcher in matchers:
-        mine = _by_metric(summary, matcher)
-        row = {"method": mine["recall_1"]["title"]}
+        by_metric = _by_metric(summary, matcher)
+        row = {"method": by_metric["recall_1"]["title"]}
         for metric, title in METRICS.items():
-            one = mine[metric]
+            one = by_metric[metric]
             if not math.isnan(one["paper"]):
                 row[f"{title}, paper"] = shown(one["paper"], one["paper_lo"], one["paper_hi"])
             row[f"{title}, ours"] = shown(one["value"], *used_interval(one))
@@ -104,12 +96,12 @@ def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
                 is_tile = one["cluster"] == "tile"
                 other = (one["cluster_lo"], one["cluster_hi"]) if is_tile else (one["lo"], one["hi"])
                 row["by tiles" if is_tile else "Wilson"] = shown(one["value"], *other).partition(" ")[2] or "-"
-        rows.append(row | {"n": str(mine["recall_1"]["n"])})
+        rows.append(row | {"n": str(by_metric["recall_1"]["n"])})
     return pd.DataFrame(rows).fillna("-")
 
 
 def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]:
-    """Rows of one matcher."""
+    """Return the rows of one matcher by metric."""
     rows = summary[summary["matcher"] == matcher].to_dict("records")
     return {str(row["metric"]): {str(name): value for name, value in row.items()} for row in rows}
 
@@ -117,8 +109,6 @@ def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]
 def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
     """Return a figure as the paper prints it.
 
-    Examples
-    --------
     >>> shown(0.586, 0.52, 0.649), shown(1.0)
     ('0.586 [0.520, 0.649]', '1.000')
     """
@@ -130,29 +120,29 @@ def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
 def difference_lines(summary: pd.DataFrame) -> Iterator[str]:
     """Yield a line for each of the paper's variants: the distance of each figure from the paper's."""
     for item in PUBLISHED:
-        mine = _by_metric(summary, item.matcher)
-        if mine:
-            told = [f"{title} {_difference(mine[metric])}" for metric, title in METRICS.items()]
-            yield f"**{item.title}**: {'; '.join(told)}."
+        by_metric = _by_metric(summary, item.matcher)
+        if by_metric:
+            parts = [f"{title} {_difference(by_metric[metric])}" for metric, title in METRICS.items()]
+            yield f"**{item.title}**: {'; '.join(parts)}."
 
 
 def _difference(row: Mapping[str, Any]) -> str:
     ours, paper = shown(row["value"]), shown(row["paper"])
     if ours == paper:
         return f"{ours}, as in the paper"
-    apart = float(ours) - float(paper)  # of the figures as they are printed
-    said = f"{ours} is {abs(apart):.3f} {'above' if apart > 0 else 'below'} the paper's {paper}, which lies "
+    gap = float(ours) - float(paper)  # of the figures as they are printed
+    start = f"{ours} is {abs(gap):.3f} {'above' if gap > 0 else 'below'} the paper's {paper}, which lies "
     if row["is_within"]:
-        return f"{said}inside our interval"
+        return f"{start}inside our interval"
     if math.isnan(row["paper_lo"]):
-        return f"{said}outside our interval"
+        return f"{start}outside our interval"
     lo, hi = used_interval(row)
     meet = lo <= row["paper_hi"] and row["paper_lo"] <= hi
-    return f"{said}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
+    return f"{start}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
 
 
 def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
-    """Consecutive variants: the paper's difference in Recall@1 and ours, paired."""
+    """Compare consecutive variants: the paper's difference in Recall@1 and ours, paired."""
     rows = []
     for before, after in pairwise(PUBLISHED):
         one = next((item for item in findings if (item.first, item.second) == (after.matcher, before.matcher)), None)
@@ -181,15 +171,7 @@ CAPTIONS: Final = {
 
 
 def paper_extra(board: Board, *, root: Path) -> Extra:
-    """Table beside the paper's, all trials, and figures.
-
-    Parameters
-    ----------
-    board : Board
-        With the paper's trials among what was scored.
-    root : Path
-        Where tasks/, truth/ and regions/ are.
-    """
+    """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
     scores = {name: frame[frame["suite"] == SUITE].reset_index(drop=True) for name, frame in board.scores.items()}
     regions = [str(about["region"]) for about in board.tasks if about["suite"] == SUITE]
     truths = {region: list(task_files.read_truths(root / "truth" / SUITE / region)) for region in regions}
@@ -232,7 +214,7 @@ def _example(region: str, truths: list[Truth], root: Path) -> Panel:
 
 
 def _ablation(summary: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the ablation: over seeds where there are several, else as if trials were independent."""
+    """Return the rows of the ablation: over seeds where there are several, else as if trials were independent."""
     rows = summary[(summary["metric"] == "recall_1") & ~summary["matcher"].map(is_unranked) & summary["value"].notna()]
     if (rows["cluster"] == "tile").all():
         return rows.assign(how="Wilson's 95 % intervals, trials taken for independent")

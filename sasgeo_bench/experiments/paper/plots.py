@@ -21,7 +21,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.sheet import HIDDEN, Panel, paint
 
-# Okabe and Ito's colours, told apart by all kinds of sight; marks and dashes differ too.
+# Okabe and Ito's colours, distinct for colour-blind readers; marks and dashes differ too.
 _COLOURS: Final = ("#e69f00", "#0072b2", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#000000", "#f0e442")
 _MARKS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DASHES: Final = ("-", "-", "--", "-.", ":", "-", "--", "-.")
@@ -53,8 +53,8 @@ def _page(path: Path, width: float, height: float, title: str, note: str, data: 
         figure.text(0.15 / width, 0.09 / height, f"Data: {data}", fontsize=7.5, color=_GREY, va="bottom")
         yield figure
         kind = path.suffix.removeprefix(".")
-        said = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
-        figure.savefig(path, format=kind, metadata={"Title": title, "Source": data, **said})
+        plain = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
+        figure.savefig(path, format=kind, metadata={"Title": title, "Source": data, **plain})
 
 
 def _wrapped(title: str) -> str:
@@ -67,17 +67,7 @@ def _wrapped(title: str) -> str:
 
 
 def draw_example(path: Path, panel: Panel, *, data: str) -> None:
-    """Draw one trial: the view, which of its cells are known, the map at the true place and at the hardest decoy.
-
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    panel : Panel
-        From `panels.panels`.
-    data : str
-        Where the data are from.
-    """
+    """Draw one trial: the view, which of its cells are known, the map at the true place and at the hardest decoy."""
     query, done = panel.query, panel.truth.measured
     rows, cols = query.evidence.shape
     note = (
@@ -110,7 +100,7 @@ def draw_example(path: Path, panel: Panel, *, data: str) -> None:
 
 
 def _mask(evidence: Evidence) -> NDArray[np.float64]:
-    """White where any class is known, else the grey of what is hidden."""
+    """Return white where any class is known, else the grey of hidden cells."""
     known = (evidence.cells != UNKNOWN).any(axis=0)[..., None]
     white, grey = (np.array(mpl.colors.to_rgb(name)) for name in (_SEEN, HIDDEN))
     return np.asarray(np.where(known, white, grey))
@@ -129,19 +119,10 @@ def _class_keys(evidence: Evidence) -> list[Patch]:
 
 
 def draw_ablation(path: Path, summary: pd.DataFrame, *, chance: float, data: str) -> None:
-    """Draw Recall@1 of each variant beside the paper's, with intervals.
+    """Draw Recall@1 of each variant next to the paper's, with intervals.
 
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    summary : pandas.DataFrame
-        Rows of the figure in the order they are drawn: title, value, lo, hi, n; paper, paper_lo, paper_hi, paper_n,
-        NaN where the paper has none; `how` says in words what the interval is.
-    chance : float
-        What guessing reaches.
-    data : str
-        Where the data are from.
+    `summary` has a row for each variant in drawing order: title, value, lo, hi, n; paper, paper_lo, paper_hi, paper_n,
+    NaN where the paper has none; `how` describes the interval in words. `chance` is the rate of guessing.
     """
     count = len(summary)
     note = f"Ours: {summary['how'].iloc[0]}. Paper's: Wilson's 95 % intervals over its 220 trials."
@@ -172,7 +153,7 @@ def draw_ablation(path: Path, summary: pd.DataFrame, *, chance: float, data: str
 
 
 def _bars(chart: Axes, at: NDArray[np.float64], table: pd.DataFrame, names: tuple[str, str, str], colour: str) -> None:
-    """Bars with whiskers, the figure written in each."""
+    """Draw bars with whiskers, the figure written in each."""
     for place, (value, lo, hi) in zip(at, table[list(names)].to_numpy(float), strict=True):
         if math.isnan(value):
             continue
@@ -187,17 +168,7 @@ def _bars(chart: Axes, at: NDArray[np.float64], table: pd.DataFrame, names: tupl
 
 
 def draw_robustness(path: Path, table: pd.DataFrame, *, data: str) -> None:
-    """Draw Recall@1 against map-change probability, a panel for each variant.
-
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    table : pandas.DataFrame
-        matcher, title, low, high, mean, n, value, lo, hi.
-    data : str
-        Where the data are from.
-    """
+    """Draw Recall@1 against map-change probability, a panel for each variant of a table from `robustness_frame`."""
     names = list(dict.fromkeys(table["matcher"]))
     across = min(len(names), 5)
     down = math.ceil(len(names) / across)
@@ -215,23 +186,23 @@ def draw_robustness(path: Path, table: pd.DataFrame, *, data: str) -> None:
             if number >= len(names):
                 chart.set_visible(False)
                 continue
-            mine = table[table["matcher"] == names[number]]
-            _steps(chart, mine, _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)])
-            chart.set_title(_wrapped(mine["title"].iloc[0]), fontsize=9, pad=5)
+            rows = table[table["matcher"] == names[number]]
+            _steps(chart, rows, _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)])
+            chart.set_title(_wrapped(rows["title"].iloc[0]), fontsize=9, pad=5)
         for chart in charts[:, 0]:
             chart.set_ylabel("Recall@1")
         figure.text(0.53, 0.73 / height, "map-change probability", ha="center", fontsize=9)
 
 
-def _steps(chart: Axes, mine: pd.DataFrame, colour: str, mark: str) -> None:
-    value, lo, hi = (mine[name].to_numpy(float) for name in ("value", "lo", "hi"))
+def _steps(chart: Axes, rows: pd.DataFrame, colour: str, mark: str) -> None:
+    value, lo, hi = (rows[name].to_numpy(float) for name in ("value", "lo", "hi"))
     chart.errorbar(
-        mine["mean"], value, yerr=[value - lo, hi - value], color=colour, marker=mark, ms=5, lw=1.3, capsize=3
+        rows["mean"], value, yerr=[value - lo, hi - value], color=colour, marker=mark, ms=5, lw=1.3, capsize=3
     )
-    edges = sorted({*mine["low"], *mine["high"]})
+    edges = sorted({*rows["low"], *rows["high"]})
     for edge in edges:
         chart.axvline(edge, color="#eeeeee", lw=0.7, zorder=0)
-    for middle, count in zip((mine["low"] + mine["high"]) / 2, mine["n"], strict=True):
+    for middle, count in zip((rows["low"] + rows["high"]) / 2, rows["n"], strict=True):
         chart.text(middle, 0.02, f"n {count}", fontsize=6, ha="center", color=_GREY)
     chart.set_xticks(edges, [f"{edge:g}" for edge in edges], fontsize=7.5)
     chart.set_ylim(0, 1.03)
@@ -242,17 +213,7 @@ def _steps(chart: Axes, mine: pd.DataFrame, colour: str, mark: str) -> None:
 
 
 def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
-    """Draw risk against coverage of every variant, all of it and the lower part again.
-
-    Parameters
-    ----------
-    path : Path
-        A .png or .svg to write.
-    table : pandas.DataFrame
-        matcher, title, coverage, risk, n, aurc; points of a matcher by growing coverage.
-    data : str
-        Where the data are from.
-    """
+    """Draw risk against coverage of every variant, all of it and the lower part again, from a table of `risk_frame`."""
     names = list(dict.fromkeys(table["matcher"]))
     note = (
         "Answers are accepted from the largest margin down; margin: score of the first candidate less that of the "
@@ -265,12 +226,12 @@ def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
         charts = figure.subplots(1, 2)
         figure.subplots_adjust(left=0.07, right=0.985, top=0.9, bottom=0.35, wspace=0.17)
         for number, name in enumerate(names):
-            mine = table[table["matcher"] == name]
-            first = mine.iloc[0]
+            rows = table[table["matcher"] == name]
+            first = rows.iloc[0]
             for chart in charts:
                 chart.plot(
-                    [0, *mine["coverage"]],
-                    [first["risk"], *mine["risk"]],
+                    [0, *rows["coverage"]],
+                    [first["risk"], *rows["risk"]],
                     color=_COLOURS[number % len(_COLOURS)],
                     ls=_DASHES[number % len(_DASHES)],
                     lw=1.6,

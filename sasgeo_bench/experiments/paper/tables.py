@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's experiment as tables: every trial, our figures beside its Table II, and what its figures show."""
+"""The paper's experiment as tables: every trial, our figures next to its Table II, and data of its figures."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,10 +55,8 @@ PUBLISHED: Final = tuple(
 
 
 def in_order(matchers: Sequence[str]) -> list[str]:
-    """The paper's variants in its order, then other matchers by name, then controls.
+    """Sort matchers: the paper's variants in its order, then others by name, then controls.
 
-    Examples
-    --------
     >>> in_order(["random", "mine", "raster_graph", "global_descriptor"])
     ['global_descriptor', 'raster_graph', 'mine', 'random']
     """
@@ -77,23 +75,11 @@ def trials_frame(
     predictions: Mapping[str, Mapping[str, Prediction]],
     truths: Mapping[str, Truth],
 ) -> pd.DataFrame:
-    """Every trial of every matcher: what was done to the view and what became of it.
+    """Return a row for each trial and matcher: the changes to the view, and the result.
 
-    Parameters
-    ----------
-    scores : mapping of str to pandas.DataFrame
-        Scored rows of the paper's trials, by matcher.
-    predictions : mapping of str to mapping of str to Prediction
-        By matcher and query id.
-    truths : mapping of str to Truth
-        By query id.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for each trial and matcher, matchers as `in_order`. `rank_best` and `rank_worst` differ where the true
-        candidate's score is tied; both are missing where it is not in the answer. `margin` is the first score less
-        the second.
+    `scores` are scored rows by matcher, `predictions` by matcher and query id, `truths` by query id. Matchers come as
+    in `in_order`. `rank_best` and `rank_worst` differ where the true candidate's score is tied; both are missing where
+    it is not in the answer. `margin` is the first score less the second.
     """
     frames = [_trials_of(name, scores[name], predictions[name], truths) for name in in_order(list(scores))]
     return pd.concat(frames, ignore_index=True)
@@ -132,56 +118,46 @@ def _trials_of(
 
 
 def _two_scores(prediction: Prediction | None) -> tuple[float, float]:
-    """Scores of the first candidate and the second; NaN where there is none."""
+    """Return the scores of the first candidate and the second; NaN where there is none."""
     found = [] if prediction is None else [score for _, score in prediction.candidates[:2]]
     first, second = (*found, math.nan, math.nan)[:2]
     return first, second
 
 
 def _whole(values: np.ndarray, is_there: Bools) -> pd.Series:
-    """Whole numbers, missing where there is none."""
+    """Return whole numbers, missing where there is none."""
     return pd.Series(values, dtype="Int64").where(pd.Series(is_there))
 
 
 def summary_frame(trials: pd.DataFrame, board: pd.DataFrame) -> pd.DataFrame:
-    """Our figures beside the paper's.
+    """Return a row for each matcher and figure, ours next to the paper's.
 
-    Parameters
-    ----------
-    trials : pandas.DataFrame
-        From `trials_frame`.
-    board : pandas.DataFrame
-        Rows of the leaderboard of this suite: their intervals are those over clusters.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for each matcher and figure: `paper` with `paper_lo` and `paper_hi` where the paper gives them; `value`
-        with Wilson's interval `lo`, `hi` as if trials were independent; `cluster_lo`, `cluster_hi` by resampling
-        `clusters` of one `cluster` ("tile" or "seed"), then trials within; `is_within`, whether the paper's figure
-        lies in our interval: Wilson's of one seed, that over seeds of several.
+    `trials` is from `trials_frame`; `board` holds the leaderboard's rows of this suite, with intervals over clusters.
+    `paper` comes with `paper_lo` and `paper_hi` where the paper gives them; `value` with Wilson's interval `lo`, `hi`
+    as if trials were independent; `cluster_lo`, `cluster_hi` by resampling `clusters` of one `cluster` ("tile" or
+    "seed"), then trials within; `is_within` is whether the paper's figure lies in the interval of `used_interval`.
     """
     seeds = int(trials["seed"].nunique())
     whole = board[(board["stratum"] == ALL) & (board["rejector"] == "")].set_index(["matcher", "metric"])
     rows = []
     for matcher in in_order(list(dict.fromkeys(trials["matcher"]))):
-        mine = trials[trials["matcher"] == matcher]
-        is_asked = bool((mine["status"] != NOT_APPLICABLE).any())
+        own = trials[trials["matcher"] == matcher]
+        is_asked = bool((own["status"] != NOT_APPLICABLE).any())
         paper = next((item for item in PUBLISHED if item.matcher == matcher), None)
         for metric in METRICS:
-            found = wilson_mean(mine[metric].to_numpy(float)) if is_asked else _NOTHING
+            found = wilson_mean(own[metric].to_numpy(float)) if is_asked else _NOTHING
             over = _over_clusters(whole, matcher, metric)
             row: dict[str, Any] = {
                 "matcher": matcher,
                 "title": title_of(matcher),
                 "metric": metric,
-                **_said(paper, metric),
+                **_published(paper, metric),
                 "value": found.value,
                 "lo": found.lo,
                 "hi": found.hi,
-                "n": len(mine),
+                "n": len(own),
                 "cluster": "tile" if seeds == 1 else "seed",
-                "clusters": int(mine["block"].nunique()),
+                "clusters": int(own["block"].nunique()),
                 "cluster_lo": over.lo,
                 "cluster_hi": over.hi,
             }
@@ -190,7 +166,7 @@ def summary_frame(trials: pd.DataFrame, board: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _said(paper: Published | None, metric: str) -> dict[str, float]:
+def _published(paper: Published | None, metric: str) -> dict[str, float]:
     """Return the paper's figure; it gives an interval of Recall@1 alone."""
     if paper is None:
         return {"paper": math.nan, "paper_lo": math.nan, "paper_hi": math.nan, "paper_n": 0}
@@ -199,7 +175,7 @@ def _said(paper: Published | None, metric: str) -> dict[str, float]:
 
 
 def _over_clusters(whole: pd.DataFrame, matcher: str, metric: str) -> Interval:
-    """The leaderboard's interval; none where the matcher cannot answer."""
+    """Return the leaderboard's interval; none where the matcher cannot answer."""
     if (matcher, metric) not in whole.index:
         return _NOTHING
     row = whole.loc[[(matcher, metric)]].iloc[0]
@@ -207,7 +183,7 @@ def _over_clusters(whole: pd.DataFrame, matcher: str, metric: str) -> Interval:
 
 
 def used_interval(row: Mapping[str, Any]) -> tuple[float, float]:
-    """The interval of ours that a figure of the paper's is held against: Wilson's of one seed, that over several."""
+    """Return our interval that is compared with the paper's figure: Wilson's for one seed, over seeds for several."""
     is_wilson = row["cluster"] == "tile" or math.isnan(row["cluster_lo"])
     return (row["lo"], row["hi"]) if is_wilson else (row["cluster_lo"], row["cluster_hi"])
 
@@ -215,51 +191,45 @@ def used_interval(row: Mapping[str, Any]) -> tuple[float, float]:
 def robustness_frame(trials: pd.DataFrame) -> pd.DataFrame:
     """Return Recall@1 of each matcher in quarters of map-change probability, with Wilson's interval.
 
-    Returns
-    -------
-    pandas.DataFrame
-        matcher, title, low and high edge, mean probability, n, value, lo, hi; no row for an empty quarter. Controls are
-        left out.
+    Columns: matcher, title, low and high edge, mean probability, n, value, lo, hi; no row for an empty quarter.
+    Controls are left out.
     """
     rows = []
-    for matcher, mine in _contestants(trials):
-        at = np.clip(np.digitize(mine["change_probability"], CHANGE_EDGES[1:-1]), 0, len(CHANGE_EDGES) - 2)
+    for matcher, own in _contestants(trials):
+        at = np.clip(np.digitize(own["change_probability"], CHANGE_EDGES[1:-1]), 0, len(CHANGE_EDGES) - 2)
         for index, (low, high) in enumerate(pairwise(CHANGE_EDGES)):
-            part = mine[at == index]
+            part = own[at == index]
             if len(part):
                 found = wilson_mean(part["recall_1"].to_numpy(float))
                 mean = float(part["change_probability"].mean())
-                said = {"matcher": matcher, "title": title_of(matcher), "low": low, "high": high, "mean": mean}
-                rows.append(said | {"n": len(part), "value": found.value, "lo": found.lo, "hi": found.hi})
+                head = {"matcher": matcher, "title": title_of(matcher), "low": low, "high": high, "mean": mean}
+                rows.append(head | {"n": len(part), "value": found.value, "lo": found.lo, "hi": found.hi})
     return pd.DataFrame(rows)
 
 
 def risk_frame(trials: pd.DataFrame) -> pd.DataFrame:
-    """Risk against coverage of each matcher whose answers are accepted from the largest margin down.
+    """Return risk against coverage of each matcher whose answers are accepted from the largest margin down.
 
-    Returns
-    -------
-    pandas.DataFrame
-        matcher, title, margin (the threshold), coverage, risk, and n and aurc, the same in all rows of a matcher.
-        Controls are left out.
+    Columns: matcher, title, margin (the threshold), coverage, risk, and n and aurc, the same in all rows of a matcher.
+    Controls are left out.
     """
     frames = []
-    for matcher, mine in _contestants(trials):
+    for matcher, own in _contestants(trials):
         some = Answers(
-            confidence=mine["margin"].to_numpy(float),
-            is_answered=mine["is_answered"].to_numpy(bool),
-            is_right=mine["is_right"].to_numpy(bool),
-            is_present=np.ones(len(mine), dtype=bool),
+            confidence=own["margin"].to_numpy(float),
+            is_answered=own["is_answered"].to_numpy(bool),
+            is_right=own["is_right"].to_numpy(bool),
+            is_present=np.ones(len(own), dtype=bool),
         )
         curve = risk_coverage(some)
-        said = {"matcher": matcher, "title": title_of(matcher)}
+        head = {"matcher": matcher, "title": title_of(matcher)}
         points = {"margin": curve.threshold, "coverage": curve.coverage, "risk": curve.risk}
-        frames.append(pd.DataFrame(said | points | {"n": len(mine), "aurc": aurc(some)}))
+        frames.append(pd.DataFrame(head | points | {"n": len(own), "aurc": aurc(some)}))
     return pd.concat(frames, ignore_index=True)
 
 
 def _contestants(trials: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Trials of each matcher that is no control and can answer."""
+    """Yield the trials of each matcher that is no control and can answer."""
     asked = trials[trials["status"] != NOT_APPLICABLE]
     for matcher in in_order(list(dict.fromkeys(asked["matcher"]))):
         if not is_unranked(matcher):
@@ -267,9 +237,9 @@ def _contestants(trials: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def example_of(truths: Sequence[Truth]) -> Truth:
-    """The trial to show: nearest to the middle of what is occluded and changed, of those turned and cropped.
+    """Choose the trial to show: nearest to the middle of occlusion and change, if possible turned and cropped.
 
-    What matchers made of it has no part in the choice. Where none is turned and cropped, all trials count.
+    Results of matchers have no part in the choice.
     """
     turned = [item for item in truths if item.measured["rotation_deg"] > 0 and item.measured["crop_fraction"] < 1]
     middle = {"occlusion_share": 0.24 / 2, "change_probability": CHANGE_EDGES[-1] / 2}

@@ -71,25 +71,11 @@ _LONGEST: Final = 2.0  # sides of an occluding rectangle at most
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transformation:
-    """Changes to the view of one trial; with the default values, none.
+    """Changes to the view of one trial, none by default; `PerturbError` if a value is beyond the ranges of the paper.
 
-    Parameters
-    ----------
-    rotation_deg : float
-        Heading of the view, clockwise from north.
-    scale : float
-        Metres on the ground a side of a view's cell.
-    crop_fraction : float
-        Share of the view that is retained, around its middle.
-    occlusion_share : float
-        Share of the view's cells behind one rectangle.
-    change_probability : float
-        Of a thing of the most volatile class.
-
-    Raises
-    ------
-    PerturbError
-        If a value is beyond what the paper allows.
+    `rotation_deg` is the heading of the view, clockwise from north; `scale` metres on the ground for each side of a
+    view's cell; `crop_fraction` the share of the view retained around its middle; `occlusion_share` the share of cells
+    behind one rectangle; `change_probability` that of an object of the most volatile class.
     """
 
     rotation_deg: float = 0.0
@@ -99,7 +85,7 @@ class Transformation:
     change_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what the paper does not do."""
+        """Check the ranges."""
         check_ranges(
             self,
             rotation_deg=(min(ROTATIONS_DEG), max(ROTATIONS_DEG)),
@@ -111,13 +97,7 @@ class Transformation:
 
 
 def draw_transformation(rng: np.random.Generator) -> Transformation:
-    """Draw every part on its own, each value of a set as likely as the others, shares and probabilities uniformly.
-
-    Examples
-    --------
-    >>> draw_transformation(np.random.default_rng(0)).scale in SCALES
-    True
-    """
+    """Draw every part independently: values of a set with equal probability, shares and probabilities uniformly."""
     return Transformation(
         rotation_deg=float(rng.choice(ROTATIONS_DEG)),
         scale=float(rng.choice(SCALES)),
@@ -129,17 +109,17 @@ def draw_transformation(rng: np.random.Generator) -> Transformation:
 
 @dataclass(frozen=True, kw_only=True)
 class Crops:
-    """The candidates of one trial as numbers of windows, in the order in which they are shown, and which is true."""
+    """Candidates of one trial as numbers of windows, in display order, and the index of the true one."""
 
     windows: NDArray[np.int64]
     true: int
 
 
 def draw_crops(windows: Windows, rng: np.random.Generator) -> Crops:
-    """Draw ten windows that are alike, and by lot which of them is the true one.
+    """Draw ten similar windows, and one of them as the true one.
 
-    Were the others the nearest to the true one, it would lie in their middle, and whoever ranks candidates by how near
-    they are to the mean of all ten would find it in a third of the trials without a look at the query.
+    Were the others the nearest to the true one, it would lie in their middle: ranking candidates by distance from the
+    mean of all ten would find it in a third of the trials without using the query.
     """
     alike = windows.alike(int(rng.integers(len(windows.tile))))
     shown = rng.permutation(alike)
@@ -147,18 +127,16 @@ def draw_crops(windows: Windows, rng: np.random.Generator) -> Crops:
 
 
 def rectangle(shape: tuple[int, int], share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """One rectangle at any place in a view that covers a share of it, or up to a row less; shape (rows, cols).
+    """Return a random rectangle in a view that covers a share of it, or up to a row less; shape (rows, cols).
 
-    Examples
-    --------
     >>> covered = rectangle((96, 96), 0.24, np.random.default_rng(0))
     >>> bool(0.23 < covered.mean() <= 0.24)
     True
     """
     stretch = _LONGEST ** float(rng.uniform(-0.5, 0.5))
-    wanted = share * shape[0] * shape[1]
-    rows = min(shape[0], max(1, round(math.sqrt(wanted) * stretch)))
-    cols = min(shape[1], int(wanted / rows))
+    area_cells = share * shape[0] * shape[1]
+    rows = min(shape[0], max(1, round(math.sqrt(area_cells) * stretch)))
+    cols = min(shape[1], int(area_cells / rows))
     top, left = rng.integers(0, (shape[0] - rows + 1, shape[1] - cols + 1)).tolist()
     covered = np.zeros(shape, dtype=bool)
     covered[top : top + rows, left : left + cols] = True
@@ -166,10 +144,8 @@ def rectangle(shape: tuple[int, int], share: float, rng: np.random.Generator) ->
 
 
 def map_change(probability: float) -> Ageing:
-    """Change the world against the map: things vanish, and as many new ones appear.
+    """Change the world against the map: objects vanish, and as many new ones appear.
 
-    Examples
-    --------
     >>> rates = map_change(0.32).rates["building"]
     >>> round(1 - math.exp(-rates.vanish_per_year), 2), round(math.expm1(rates.appear_per_year), 2)
     (0.24, 0.24)
@@ -184,7 +160,7 @@ def map_change(probability: float) -> Ageing:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One trial: the evidence, the map at the same pose, and the world there before any is hidden.
+    """One trial: the evidence, the map at the same pose, and the world there before any of it is hidden.
 
     `occlusion_share` and `retained_share` are those of the cells that the rectangle covers and the crop leaves.
     """
@@ -197,19 +173,7 @@ class View:
 
 
 def draw_view(state: State, center_m: tuple[float, float], done: Transformation, seeds: Seeds) -> View:
-    """See a place turned, magnified, changed, cropped and occluded, in this order.
-
-    Parameters
-    ----------
-    state : State
-        The map.
-    center_m : tuple of float
-        Easting and northing of the middle of the view.
-    done : Transformation
-        What is done to it.
-    seeds : Seeds
-        Of the trial.
-    """
+    """Rotate, scale, change, crop and occlude, in this order, a view around an easting and northing."""
     pose = true_pose(center_m, done)
     mapped = only_paper(state.view(pose, size_cells=WINDOW_CELLS, cell_size_m=CELL_M))
     world = map_change(done.change_probability)(mapped, seeds.rng("change"))
@@ -226,12 +190,12 @@ def draw_view(state: State, center_m: tuple[float, float], done: Transformation,
 
 
 def true_pose(center_m: tuple[float, float], done: Transformation) -> Pose:
-    """The pose of a trial's view."""
+    """Return the pose of a trial's view."""
     return Pose(easting_m=center_m[0], northing_m=center_m[1], yaw_deg=done.rotation_deg, scale=done.scale)
 
 
 def only_paper(view: Evidence) -> Evidence:
-    """The five layers of the paper."""
+    """Keep the five layers of the paper."""
     cells = view.cells[[view.classes.index(name) for name in CLASSES]]
     return Evidence(classes=CLASSES, cells=cells, cell_size_m=view.cell_size_m)
 
@@ -242,38 +206,18 @@ TRIALS: Final = 220
 GROUP: Final = PriorGroup(radius_m=None, yaw="unknown", scale_sigma=0.15)
 DATE: Final = dt.date(2026, 1, 1)
 STRENGTH_UNIT: Final = "map-change probability"
-DATA: Final = "procedural regions, no OSM data in them"  # what pictures and tables say of where they come from
+DATA: Final = "procedural regions, no OSM data in them"  # source stated by pictures and tables
 
 
 def make_paper_task(
     *, seed: int, out: Path, trials: int = TRIALS, private: PrivateSeed | None = None, tell: Tell
 ) -> Path:
-    """Make the paper's 30 regions and draw its retrieval trials on them.
+    """Make the paper's 30 regions, draw its retrieval trials on them, and return the folder of the task.
 
-    Parameters
-    ----------
-    seed : int
-        Of regions and trials; the paper's is 42.
-    out : Path
-        Root: the region goes to `out/regions/paper-poc-<seed>`, the task to `out/tasks/paper-poc/paper-poc-<seed>`.
-    trials : int
-        How many; the first of a longer request are those of a shorter one.
-    private : PrivateSeed, optional
-        Root of all chance instead; the public seed is then a name.
-    tell : callable
-        Gets one line for every step.
-
-    Returns
-    -------
-    Path
-        Folder of the task.
-
-    Raises
-    ------
-    ConfigError
-        If the seed is negative, there are no trials, or truths would lie where the queries are.
-    StoreError
-        If a folder cannot be written, or holds something that is not ours.
+    The region is written to `out/regions/paper-poc-<seed>`, the task to `out/tasks/paper-poc/paper-poc-<seed>`; the
+    paper's seed is 42. The first of many `trials` are those of a shorter request. `private` replaces the seed of all
+    random draws; the public seed is then a name. Raise `ConfigError` if the seed is negative, there are no trials, or
+    truths would lie where the queries are; `StoreError` if a folder cannot be written, or holds something else.
     """
     if seed < 0:
         message = f"the seed names the region and must be 0 or more, got {seed}"
@@ -296,18 +240,13 @@ def make_paper_task(
 
 
 def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS, private: PrivateSeed | None = None) -> Path | None:
-    """Task folder of these trials, or None if they have to be drawn; nothing is drawn to find out.
+    """Return the task folder of these trials, or None if they have to be drawn; nothing is drawn to find out.
 
-    Task, truths and region are as they were written, and nothing that decides what they hold has changed since.
-
-    Examples
-    --------
-    >>> made_paper_task(seed=42, out=Path("nowhere")) is None
-    True
+    Task, truths and region are as they were written, and nothing that decides their content has changed since.
     """
     folder = out / "tasks" / SUITE / region_name(seed)
-    said = task_files.read_hidden(out / "truth" / SUITE / region_name(seed))
-    if said.get("request_sha256") != _request_sha256(seed, trials, private):
+    record = task_files.read_hidden(out / "truth" / SUITE / region_name(seed))
+    if record.get("request_sha256") != _request_sha256(seed, trials, private):
         return None
     try:
         faults = [*check_task(folder, out=out), *region_files.differing_files(out / "regions" / region_name(seed))]
@@ -317,8 +256,8 @@ def made_paper_task(*, seed: int, out: Path, trials: int = TRIALS, private: Priv
 
 
 def _request_sha256(seed: int, trials: int, private: PrivateSeed | None) -> str:
-    """Hash of all that decides which trials come of a seed; the recipe itself is in it by its version."""
-    said = {
+    """Hash all that decides which trials a seed gives; the recipe itself is in it by its version."""
+    record = {
         "suite": [SUITE, VERSION, TASK_VERSION],
         "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().model_dump(mode="json")],
         "seed": seed,
@@ -326,18 +265,12 @@ def _request_sha256(seed: int, trials: int, private: PrivateSeed | None) -> str:
         "made_by": version("sasgeo-bench"),
     }
     if private is not None:
-        said["private_seed"] = private.commitment
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        record["private_seed"] = private.commitment
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def region_name(seed: int) -> str:
-    """Name of the region of a seed.
-
-    Examples
-    --------
-    >>> region_name(42)
-    'paper-poc-42'
-    """
+    """Return the name of the region of a seed, as in paper-poc-42."""
     return f"{SUITE}-{seed}"
 
 
@@ -361,7 +294,7 @@ def _spec(seed: int) -> RegionFile:
 
 
 def _generated(seed: int, seeds: Seeds) -> Reading:
-    """The tiles in the place of what is read from an extract."""
+    """Return the tiles in the form of a read extract."""
     return Reading(
         features=make_tiles(seeds),
         coverage=shapely.multipolygons(tile_boxes()),
@@ -396,7 +329,7 @@ def _about(region: Region) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class PaperDrawer:
-    """Draws the trials of one region."""
+    """Draw the trials of one region."""
 
     region: Region
     seeds: Seeds
@@ -463,13 +396,13 @@ class PaperDrawer:
 
 
 def _density(view: View) -> float:
-    """Share of the place's map with a road, building or hedge."""
+    """Return the share of the place's map with a road, building or hedge."""
     drawn = [view.mapped.layer(name) == PRESENT for name in view.mapped.classes if name in DRAWN_CLASSES]
     return float(np.any(drawn, axis=0).mean())
 
 
 def _measured(done: Transformation, view: View) -> dict[str, float]:
-    """Return what was done to a view and what it caused."""
+    """Return the changes to a view and their effects."""
     return {
         "rotation_deg": done.rotation_deg,
         "scale": done.scale,

@@ -37,22 +37,14 @@ Point = tuple[float, float]
 
 
 def mosaic_grid() -> Grid:
-    """The lattice that holds all tiles.
-
-    Examples
-    --------
-    >>> mosaic_grid().shape
-    (1664, 1984)
-    """
+    """Return the lattice that holds all tiles."""
     rows, cols = (round((count * (TILE_M + GAP_M) + GAP_M) / CELL_M) for count in (_DOWN, ACROSS))
     return Grid(epsg=EPSG, west_m=CORNER_M[0], north_m=CORNER_M[1], cell_size_m=CELL_M, rows=rows, cols=cols)
 
 
 def tile_centre_m(tile: int) -> Point:
-    """Easting and northing of the middle of a tile; they are counted from the north-west, row by row.
+    """Return easting and northing of the middle of a tile; tiles are counted from the north-west, row by row.
 
-    Examples
-    --------
     >>> tile_centre_m(0), tile_centre_m(1)
     ((500192.0, 101808.0), (500512.0, 101808.0))
     """
@@ -62,29 +54,13 @@ def tile_centre_m(tile: int) -> Point:
 
 
 def tile_boxes() -> NDArray[np.object_]:
-    """Outlines of all tiles: what is mapped."""
+    """Return outlines of all tiles: the mapped area."""
     centres = np.array([tile_centre_m(tile) for tile in range(TILES)])
     return np.asarray(shapely.box(*(centres - _HALF_M).T, *(centres + _HALF_M).T))
 
 
 def make_tiles(seeds: Seeds) -> gpd.GeoDataFrame:
-    """Draw all tiles.
-
-    Parameters
-    ----------
-    seeds : Seeds
-        Each tile has a stream of its own.
-
-    Returns
-    -------
-    geopandas.GeoDataFrame
-        A feature table with `CLASSES` alone; no feature leaves its tile.
-
-    Examples
-    --------
-    >>> sorted(set(make_tiles(Seeds(root=1, names=("doc",)))["class"])) == sorted(CLASSES)
-    True
-    """
+    """Draw all tiles, each from its own random stream, as a feature table; no feature leaves its tile."""
     taxonomy = load_taxonomy()
     rows: list[tuple[str, float, shapely.Geometry]] = []
     for tile in range(TILES):
@@ -120,13 +96,7 @@ def _moved(shape: shapely.Geometry, centre_m: Point) -> shapely.Geometry:
 
 
 def draw_tile(rng: np.random.Generator) -> list[Way]:
-    """Draw one tile around (0, 0): a main road, a river or ponds, streets with houses on one part, fields on the rest.
-
-    Examples
-    --------
-    >>> len(draw_tile(np.random.default_rng(1))) > 50
-    True
-    """
+    """Draw one tile around (0, 0): main road, river or ponds, streets with houses, fields on the rest."""
     sketch = Sketch(half_m=_HALF_M, rng=rng)
     heading = float(rng.uniform(0, np.pi))
     main = _main_roads(sketch, heading)
@@ -141,7 +111,7 @@ def draw_tile(rng: np.random.Generator) -> list[Way]:
 
 
 def _turned(points: list[Point] | Line, heading: float) -> Line:
-    """Points (across, along) of a heading, clockwise from north in radians -> points (east, north)."""
+    """Turn points (across, along) of a heading, clockwise from north in radians, into points (east, north)."""
     across, along = np.asarray(points, dtype=np.float64).T
     sin, cos = np.sin(heading), np.cos(heading)
     return np.column_stack((across * cos + along * sin, along * cos - across * sin))
@@ -155,12 +125,12 @@ def _crossing(sketch: Sketch, heading: float, offset_m: float, sway_m: float) ->
 
 
 def _inside(sketch: Sketch, line: Line) -> list[Line]:
-    """Parts of a line within the tile."""
+    """Return the parts of a line within the tile."""
     return _pieces(shapely.intersection(shapely.linestrings(line), sketch.square))
 
 
 def _pieces(shape: shapely.Geometry) -> list[Line]:
-    """The longer lines of a geometry."""
+    """Return the longer lines of a geometry."""
     parts = shapely.get_parts(shapely.line_merge(shape) if shape.geom_type == "MultiLineString" else shape)
     return [
         shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString" and part.length >= _SHORTEST_M
@@ -230,19 +200,19 @@ def _streets(sketch: Sketch, heading: float, village: shapely.Geometry, wet: sha
 
 
 def _offsets(rng: np.random.Generator, least_m: float, most_m: float) -> list[float]:
-    """Places of parallel lines, from one side of the tile to the other."""
+    """Return offsets of parallel lines, from one side of the tile to the other."""
     offsets = -_BEYOND + np.cumsum(rng.uniform(least_m, most_m, 2 * round(_BEYOND / least_m)))
     return [float(offset) for offset in offsets if offset < _BEYOND]
 
 
 def _houses(sketch: Sketch, line: Line, village: shapely.Geometry) -> None:
-    """Houses on both sides of a road where it runs through the village."""
+    """Draw houses on both sides of a road where it runs through the village."""
     for part in _pieces(shapely.intersection(shapely.linestrings(line), village)):
         sketch.houses_along(part, spacing_m=16.0, setback_m=7.5, size_m=(11.0, 9.0), chance=0.8)
 
 
 def _barns(sketch: Sketch, village: shapely.Geometry) -> None:
-    """Some larger buildings in and around the village."""
+    """Draw some larger buildings in and around the village."""
     rng = sketch.rng
     centre = shapely.get_coordinates(village.centroid)[0]
     for _ in range(int(rng.integers(4, 9))):
@@ -253,7 +223,7 @@ def _barns(sketch: Sketch, village: shapely.Geometry) -> None:
 
 
 def _hedges(sketch: Sketch, heading: float, village: shapely.Geometry, wet: shapely.Geometry) -> None:
-    """Parcels of fields outside of the village, their borders broken by roads, water and houses, some grubbed up."""
+    """Draw borders of fields outside the village, broken by roads, water and houses, some of them removed."""
     rng = sketch.rng
     taken = shapely.union_all([village.buffer(-12), wet.buffer(2), *sketch.taken])
     for turn, least_m, most_m in ((0.0, 30.0, 52.0), (np.pi / 2, 55.0, 95.0)):
@@ -277,7 +247,7 @@ class Windows:
     """All candidate crops.
 
     `points_m` is the middle of each, easting and northing, shape (N, 2), `tile` the number of its tile, and `counts`,
-    shape (N, 5), its global semantic descriptor: in how many of its cells each of `CLASSES` is present.
+    shape (N, 5), its global semantic descriptor: the number of its cells in which each of `CLASSES` is present.
     """
 
     points_m: NDArray[np.float64]
@@ -299,10 +269,8 @@ class Windows:
         return cls(points_m=points_m, tile=tile, counts=counts)
 
     def alike(self, anchor: int, count: int = CANDIDATES) -> NDArray[np.int64]:
-        """Numbers of a window and of those with the nearest descriptors, no two of which share ground; nearest first.
+        """Return a window and those with the nearest descriptors, no two of which overlap; nearest first.
 
-        Examples
-        --------
         >>> row = np.array([(0.0, 0.0), (16.0, 0.0), (96.0, 0.0), (192.0, 0.0)])
         >>> counts = np.array([[10], [10], [30], [20]])
         >>> Windows(points_m=row, tile=np.zeros(4, dtype=np.int64), counts=counts).alike(0, 3).tolist()
@@ -326,14 +294,7 @@ class Windows:
 
 
 def lattice_m() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Middles of all windows, tile by tile, shape (N, 2), metres, and the number of the tile of each.
-
-    Examples
-    --------
-    >>> points_m, tile = lattice_m()
-    >>> len(points_m), len(points_m) // TILES
-    (1470, 49)
-    """
+    """Return the middles of all windows, tile by tile, shape (N, 2), metres, and the tile of each."""
     reach_m = TILE_M / 2 - MARGIN_M
     steps_m = np.arange(-reach_m, reach_m + STEP_M / 2, STEP_M)
     offsets_m = np.stack(np.meshgrid(steps_m, -steps_m), axis=-1).reshape(-1, 2)

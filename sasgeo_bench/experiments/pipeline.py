@@ -367,9 +367,9 @@ class _Go:
 
     def lines(self) -> list[str]:
         """What is learnt for it."""
-        if self.name and self.plan.lesson is None:
+        if self.name and self.plan.training_set is None:
             return ["nothing to learn from, asked untaught"]
-        return self.plan.lesson_lines()
+        return self.plan.training_lines()
 
 
 def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) -> list[Path]:
@@ -379,7 +379,7 @@ def _run(spec: str, goes: Sequence[_Go], tell: Tell, progress: Progress | None) 
         left, done = _count([go])
         label = f"{spec}, {go.name}" if go.name else spec
         tell(f"{label}: {left} queries to ask, {done} answered before")
-        for line in () if go.plan.lesson is not None else go.lines():
+        for line in () if go.plan.training_set is not None else go.lines():
             tell(f"{label}: {line}")
         run(go.plan, tell=tell if left else _silent, progress=progress)
         folders += [part.folder for part in go.plan.parts]

@@ -68,9 +68,9 @@ class TrainingRecord:
         return cls(key=said["key"], file=said["file"], trained_on=tuple(places or ()), pairs=said["pairs"])
 
 
-def learned_path(run: Path, lesson_sha256: str) -> Path:
-    """File of what a matcher has learnt from a lesson, below out/runs/<matcher>/<hash>."""
-    return run / FOLDER / f"{lesson_sha256}.json"
+def learned_path(run: Path, training_sha256: str) -> Path:
+    """File of what a matcher has learnt from a training set, below out/runs/<matcher>/<hash>."""
+    return run / FOLDER / f"{training_sha256}.json"
 
 
 def read_learned(path: Path) -> str | None:

@@ -328,15 +328,15 @@ class _Map:
         with self._asked() as worker:
             for writer, query, blob in schedule.items(number):
                 if ready is None:
-                    learned = self._plan.learned
-                    region, text = self._writers[0].part.region, None if learned is None else learned.text
+                    result = self._plan.training_result
+                    region, text = self._writers[0].part.region, None if result is None else result.text
                     ready = guarded(self._plan, partial(worker.prepare, region, text))
                     self._check_map(ready)
                     if schedule.is_stopped:
                         return
                 if self._unlearned() is None:
                     writer.told_by(worker, ready)
-                reason = lacks(self._plan.card, query, is_taught=self._plan.lesson is not None)
+                reason = lacks(self._plan.card, query, is_taught=self._plan.training_set is not None)
                 if reason is not None:
                     writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
                     continue
@@ -359,10 +359,10 @@ class _Map:
 
     def _unlearned(self) -> Reply | None:
         """Return the reply to every query after a failed training; starts no process."""
-        learned = self._plan.learned
-        if learned is None or learned.text is not None:
+        result = self._plan.training_result
+        if result is None or result.text is not None:
             return None
-        return Reply(status=learned.status, message=learned.message)
+        return Reply(status=result.status, message=result.message)
 
     def _check_map(self, ready: Reply) -> None:
         """Refuse a map that another run has replaced since, or that is damaged: no failure of whoever prepared it."""

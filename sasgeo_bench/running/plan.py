@@ -16,7 +16,7 @@ from sasgeo_bench.matching.results import STATUSES, Status, matcher_hash
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
-from sasgeo_bench.running.training_tasks import Lesson, plan_lesson
+from sasgeo_bench.running.training_tasks import TrainingSet, plan_training
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import Split
@@ -111,7 +111,7 @@ class RunPart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Learned:
+class TrainingResult:
     """Result of training: a text, or the status and one line of cause where there is none."""
 
     text: str | None = None
@@ -123,7 +123,7 @@ class Learned:
 class RunPlan:
     """Plan of a run, made after the plugin's card was read in its own process.
 
-    `lesson` is what a matcher that learns is to learn from, `learned` what came of it, None until it was tried.
+    `training_result` is None before training.
     """
 
     request: RunRequest
@@ -131,8 +131,8 @@ class RunPlan:
     hash: str
     parts: tuple[RunPart, ...]
     learns: bool = False
-    lesson: Lesson | None = None
-    learned: Learned | None = None
+    training_set: TrainingSet | None = None
+    training_result: TrainingResult | None = None
 
     @property
     def run_folder(self) -> Path:
@@ -142,33 +142,35 @@ class RunPlan:
     @property
     def key(self) -> str | None:
         """Hash that ties rows to the training result; None without training."""
-        return None if self.lesson is None else _key(self.lesson, self.learned)
+        return None if self.training_set is None else _key(self.training_set, self.training_result)
 
     @property
     def learned_file(self) -> Path | None:
         """Path of the learned text, which may not exist yet."""
-        return None if self.lesson is None else learned_path(self.run_folder, self.lesson.sha256)
+        return None if self.training_set is None else learned_path(self.run_folder, self.training_set.sha256)
 
     @property
-    def said(self) -> TrainingRecord | None:
+    def training_record(self) -> TrainingRecord | None:
         """Record of the training for `run.json`."""
-        if self.lesson is None or self.key is None or self.learned_file is None:
+        if self.training_set is None or self.key is None or self.learned_file is None:
             return None
-        has_text = self.learned is not None and self.learned.text is not None
+        has_text = self.training_result is not None and self.training_result.text is not None
         file = self.learned_file.relative_to(self.run_folder).as_posix() if has_text else None
-        return TrainingRecord(key=self.key, file=file, trained_on=self.lesson.places, pairs=self.lesson.count)
+        return TrainingRecord(
+            key=self.key, file=file, trained_on=self.training_set.places, pairs=self.training_set.count
+        )
 
-    def lesson_lines(self) -> list[str]:
+    def training_lines(self) -> list[str]:
         """Describe the training in a line; no line if none was requested."""
-        if self.lesson is not None:
-            state = "to be learnt from" if self.learned is None else "has learnt from"
-            return [f"{state} {self.lesson.to_text()}"]
+        if self.training_set is not None:
+            state = "to be learnt from" if self.training_result is None else "has learnt from"
+            return [f"{state} {self.training_set.to_text()}"]
         return ["does not learn: what there is to learn from is passed over"] if self.request.train else []
 
     def to_text(self) -> str:
         """Describe the training, the pending and finished queries, and each of the first tasks in a line."""
         lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
-        lines += [f"  {line}" for line in self.lesson_lines()]
+        lines += [f"  {line}" for line in self.training_lines()]
         lines += [f"  {part.folder}: {_state((part,))}" for part in self.parts[:MOST_LINES]]
         if len(self.parts) > MOST_LINES:
             lines.append(f"  {len(self.parts) - MOST_LINES} more tasks: {_state(self.parts[MOST_LINES:])}")
@@ -192,7 +194,7 @@ def plan_run(request: RunRequest) -> RunPlan:
     MatchError
         If the plugin cannot be loaded or its card is not sound.
     ConfigError
-        If the shard or a number makes no sense, or there is nothing to learn from but what is asked (`plan_lesson`).
+        If the shard or a number makes no sense, or there is nothing to learn from but what is asked (`plan_training`).
     StoreError
         If a task is missing, of another version, or its map is.
     """
@@ -208,15 +210,23 @@ def plan_run(request: RunRequest) -> RunPlan:
     said = {"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}
     settings = json.dumps(said, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    lesson = learned = None
+    training_set = result = None
     if learns and request.train:
         apart = () if request.is_oracle else request.tasks
-        lesson = plan_lesson(request.train, asked=apart, split=request.split, most=request.most_trained)
-        text = read_learned(learned_path(_run_folder(request, card, found), lesson.sha256))
-        learned = None if text is None else Learned(text=text)
-    key = None if lesson is None else _key(lesson, learned)
+        training_set = plan_training(request.train, asked=apart, split=request.split, most=request.most_trained)
+        text = read_learned(learned_path(_run_folder(request, card, found), training_set.sha256))
+        result = None if text is None else TrainingResult(text=text)
+    key = None if training_set is None else _key(training_set, result)
     parts = tuple(_part(request, card, found, key, *item) for item in abouts.items())
-    return RunPlan(request=request, card=card, hash=found, parts=parts, learns=learns, lesson=lesson, learned=learned)
+    return RunPlan(
+        request=request,
+        card=card,
+        hash=found,
+        parts=parts,
+        learns=learns,
+        training_set=training_set,
+        training_result=result,
+    )
 
 
 def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
@@ -226,14 +236,14 @@ def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
     return {name: value for name, value in asdict(limits).items() if name not in passed}
 
 
-def with_learned(plan: RunPlan, learned: Learned) -> RunPlan:
+def with_training_result(plan: RunPlan, result: TrainingResult) -> RunPlan:
     """The same plan with what came of learning: only answers under it are done.
 
     Parameters
     ----------
     plan : RunPlan
-        One with a lesson.
-    learned : Learned
+        One with a training_set.
+    result : TrainingResult
         What came of it.
 
     Raises
@@ -241,7 +251,7 @@ def with_learned(plan: RunPlan, learned: Learned) -> RunPlan:
     StoreError
         As `plan_run` does.
     """
-    plan = replace(plan, learned=learned)
+    plan = replace(plan, training_result=result)
     parts = tuple(_part(plan.request, plan.card, plan.hash, plan.key, part.task, part.about) for part in plan.parts)
     return replace(plan, parts=parts)
 
@@ -250,10 +260,10 @@ def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
     return request.out / "runs" / card.name / found
 
 
-def _key(lesson: Lesson, learned: Learned | None) -> str:
+def _key(training_set: TrainingSet, result: TrainingResult | None) -> str:
     """Hash of the text that was learnt; where there is none, of what it was to be learnt from."""
-    text = None if learned is None else learned.text
-    said = f"nothing yet from {lesson.sha256}" if text is None else text
+    text = None if result is None else result.text
+    said = f"nothing yet from {training_set.sha256}" if text is None else text
     return hashlib.sha256(said.encode()).hexdigest()
 
 

@@ -33,7 +33,7 @@ class Reply:
     """Reply to a question: status, cause as one line, seconds by the runner's clock, answer.
 
     Of the process itself: seconds by its own clock, and of its processors. Of a plugin that was loaded: its card, a
-    hash of its code, and whether it has a `learn`; of a map: by how much memory grew; of a lesson: what was learnt.
+    hash of its code, and whether it has a `learn`; of a map: by how much memory grew; of a training_set: what was learnt.
     """
 
     status: Status
@@ -123,7 +123,7 @@ class _Loaded(_Strict):
         return Reply(status="ok", card=MatcherCard(**said), code=self.code, learns=self.learns)
 
 
-class _Learnt(_Strict):
+class _Trained(_Strict):
     status: Literal["ok"]
     seconds: Seconds
     learned: str
@@ -167,9 +167,9 @@ class _Matched(_Strict):
         return Reply(status="ok", own_s=self.seconds, cpu_s=self.cpu_s, match=match)
 
 
-_KINDS: Final[Mapping[str, type[_Loaded | _Learnt | _Prepared | _Matched]]] = {
+_KINDS: Final[Mapping[str, type[_Loaded | _Trained | _Prepared | _Matched]]] = {
     "load": _Loaded,
-    "learn": _Learnt,
+    "learn": _Trained,
     "prepare": _Prepared,
     "match": _Matched,
 }

@@ -16,7 +16,7 @@ from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files, prediction_rows
 from sasgeo_bench.running.answers import Cost, Watch, answer, pool_costs
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map
-from sasgeo_bench.running.training import taught
+from sasgeo_bench.running.training import trained
 from sasgeo_bench.tasks import task_files
 
 if TYPE_CHECKING:
@@ -168,9 +168,9 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
         If a cluster was named that is not there.
     """
     progress = progress or Lines(tell)
-    for line in plan.lesson_lines() if plan.lesson is None else ():
+    for line in plan.training_lines() if plan.training_set is None else ():
         tell(f"{plan.card.name}: {line}")
-    plan = taught(plan, tell=tell)
+    plan = trained(plan, tell=tell)
     _tell_state(plan, tell)
     for part in plan.parts:
         if not part.left and part.done and prediction_files.read_key(part.folder) != plan.key:
@@ -199,7 +199,7 @@ def _tell_state(plan: RunPlan, tell: Tell) -> None:
             tell(f"{part.folder}: nothing left, {part.done} done")
     aside = sum(part.aside for part in plan.parts)
     if aside:
-        others = "" if plan.lesson is None else ", or of other learning"
+        others = "" if plan.training_set is None else ", or of other learning"
         said = f"{counted(aside, 'answer')} to queries that these tasks do not hold now{others}, set aside"
         tell(f"{plan.card.name}: {said}")
 
@@ -326,7 +326,7 @@ def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
             "top_k": plan.request.top_k,
             "limits": asdict(plan.request.limits),
             "warm_up": "one query of each process is asked twice and timed the second time",
-            "learned": None if plan.said is None else asdict(plan.said),
+            "learned": None if plan.training_record is None else asdict(plan.training_record),
             "map_bytes": sum(path.stat().st_size for path in part.region.iterdir() if path.is_file()),
             **told,
             "licence": LICENCE,

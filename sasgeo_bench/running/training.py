@@ -10,13 +10,13 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.learned_file import read_learned, write_learned
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.running.failures import LOG, stops_all, write_log
-from sasgeo_bench.running.plan import Learned, RunPlan, reach_of, with_learned
+from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_training_result
 from sasgeo_bench.running.replies import Reply
-from sasgeo_bench.running.training_tasks import Lesson, read_pairs
+from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import Worker
 
 
-def taught(plan: RunPlan, *, tell: Tell) -> RunPlan:
+def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:
     """Have a matcher learn, if there is anything to learn and to ask, and nothing was learnt from it before.
 
     Parameters
@@ -36,27 +36,32 @@ def taught(plan: RunPlan, *, tell: Tell) -> RunPlan:
     StoreError
         If a task was made anew meanwhile, or what was learnt cannot be kept.
     """
-    lesson, path = plan.lesson, plan.learned_file
-    if lesson is None or path is None or plan.learned is not None or not any(part.left for part in plan.parts):
+    training_set, path = plan.training_set, plan.learned_file
+    if (
+        training_set is None
+        or path is None
+        or plan.training_result is not None
+        or not any(part.left for part in plan.parts)
+    ):
         return plan
     with locked(path, tell=tell):
         text = read_learned(path)
         if text is None:
-            reply = _learn(plan, lesson)
+            reply = _learn(plan, training_set)
             if reply.status != "ok" or reply.learned is None:
                 failed = _failed(reply)
-                tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {lesson.to_text()}")
-                return with_learned(plan, failed)
+                tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {training_set.to_text()}")
+                return with_training_result(plan, failed)
             write_learned(path, reply.learned)
             text = reply.learned
-            tell(f"{plan.card.name}: learnt from {lesson.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
-    return with_learned(plan, Learned(text=text))
+            tell(f"{plan.card.name}: learnt from {training_set.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
+    return with_training_result(plan, TrainingResult(text=text))
 
 
-def _learn(plan: RunPlan, lesson: Lesson) -> Reply:
+def _learn(plan: RunPlan, training_set: TrainingSet) -> Reply:
     """Ask a process of its own, which may read the maps and is sent the truths."""
-    request, regions = plan.request, lesson.regions
-    pairs = read_pairs(lesson)
+    request, regions = plan.request, training_set.regions
+    pairs = read_pairs(training_set)
     reach = reach_of(request, tuple(regions.values()))
     with Worker(spec=request.spec, reach=reach, limits=request.limits) as worker:
         return guarded(plan, partial(worker.learn, regions, pairs))
@@ -83,8 +88,8 @@ def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
     )
 
 
-def _failed(reply: Reply) -> Learned:
+def _failed(reply: Reply) -> TrainingResult:
     """Return the message of all rows after a failed training."""
     if reply.status == "ok":
-        return Learned(status="invalid", message="while learning: no text in an answer")
-    return Learned(status=reply.status, message=one_line(f"while learning: {reply.message}"))
+        return TrainingResult(status="invalid", message="while learning: no text in an answer")
+    return TrainingResult(status=reply.status, message=one_line(f"while learning: {reply.message}"))

@@ -28,7 +28,7 @@ class Taken:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lesson:
+class TrainingSet:
     """A training set; `sha256` is the hash of its queries, maps and truths."""
 
     taken: tuple[Taken, ...]
@@ -62,7 +62,7 @@ class _Pair:
     said: tuple[str, str]
 
 
-def plan_lesson(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> Lesson:
+def plan_training(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> TrainingSet:
     """Choose the training set; reads nothing twice and writes nothing.
 
     Parameters
@@ -84,7 +84,7 @@ def plan_lesson(train: Sequence[Path], *, asked: Sequence[Path], split: Split | 
 
     Examples
     --------
-    >>> plan_lesson([Path("nowhere")], asked=[], split=None, most=200)
+    >>> plan_training([Path("nowhere")], asked=[], split=None, most=200)
     Traceback (most recent call last):
         ...
     sasgeo_bench.errors.StoreError: nowhere holds no task.json: make the queries first
@@ -106,7 +106,7 @@ def plan_lesson(train: Sequence[Path], *, asked: Sequence[Path], split: Split | 
     )
     ids = {folder: tuple(sorted(pair.query_id for pair in chosen if pair.task == folder)) for folder in order}
     said = {pair.query_id: pair.said for pair in chosen}
-    return Lesson(
+    return TrainingSet(
         taken=tuple(
             Taken(task=folder, truth=_truth_of(folder, abouts[folder]), region=maps[folder], ids=ids[folder])
             for folder in order
@@ -229,23 +229,23 @@ def _rank(name: str) -> bytes:
     return hashlib.sha256(name.encode()).digest()
 
 
-def read_pairs(lesson: Lesson) -> list[tuple[bytes, Truth]]:
+def read_pairs(training_set: TrainingSet) -> list[tuple[bytes, Truth]]:
     """Queries as they travel, with their truths, in the order of maps, suites and ids.
 
     Raises
     ------
     StoreError
-        If a task was made anew since the lesson was planned.
+        If a task was made anew since the training set was planned.
     """
     found: list[tuple[bytes, Truth]] = []
     said: list[tuple[str, str]] = []
-    for item in lesson.taken:
+    for item in training_set.taken:
         truths = {truth.query_id: truth for truth in task_files.read_truths(item.truth)}
         for query, blob, asked in task_files.read_some(item.task, frozenset(item.ids)):
             if query.query_id in truths:
                 found.append((blob, truths[query.query_id]))
                 said.append((asked, truth_sha256(truths[query.query_id])))
-    if _hash_of(said) != lesson.sha256:
-        message = f"{lesson.taken[0].task} or another task of --train was made anew meanwhile: run again"
+    if _hash_of(said) != training_set.sha256:
+        message = f"{training_set.taken[0].task} or another task of --train was made anew meanwhile: run again"
         raise StoreError(message)
     return found

@@ -9,7 +9,7 @@ import time
 from typing import Any, Final
 
 MOST_BYTES: Final = 2**20  # of a message from a matcher's process; what it sends is not trusted
-MOST_LEARNT_BYTES: Final = 8 * 2**20  # of one with what was learnt: JSON may write a byte of it as six
+MOST_LEARN_BYTES: Final = 8 * 2**20  # of one with what was learnt: JSON may write a byte of it as six
 _HEAD: Final = struct.Struct("!II")
 _LEAST_S: Final = 1e-3  # no time at all would be taken for a socket that never waits
 

@@ -123,7 +123,7 @@ class Worker:
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
         message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
-        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARNT_BYTES)
+        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARN_BYTES)
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, with what was learnt before."""

@@ -74,14 +74,14 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     lines = plan_run(request).to_text().splitlines()
     plan, report, folder = carry_out(request)
     count = plan.training_set.count
-    assert lines[1] == f"  to be learnt from {count} queries of 1 place (town-grid)"
+    assert lines[1] == f"  to be trained on {count} queries of 1 place (town-grid)"
     assert report.counts == {"ok": 2}
     assert told(request, folder) == {float(count)}
     said = prediction_files.read_run(folder)["learned"]
     assert (said["trained_on"], said["pairs"]) == (["town-grid"], count)
     text = (plan.run_folder / said["file"]).read_text(encoding="utf-8")
     assert json.loads(text)["suites"] == ["alias"]
-    assert plan_run(request).to_text().splitlines()[1].startswith("  has learnt from ")
+    assert plan_run(request).to_text().splitlines()[1].startswith("  trained on ")
     assert next(validate(folder, request.tasks)).is_missing_row  # the rest was not asked, and no row is strange
     assert set_aside(folder, request.tasks) == 0
     merged = prediction_files.merge_runs(

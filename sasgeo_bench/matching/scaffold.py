@@ -19,20 +19,9 @@ _LONGEST: Final = 60
 _TAKEN: Final = frozenset(
     {
         *sys.stdlib_module_names,
-        *(
-            "affine",
-            "cv2",
-            "filelock",
-            "geopandas",
-            "lazy_loader",
-            "matplotlib",
-            "numpy",
-            "osmium",
-            "pandas",
-            "pooch",
-            "psutil",
-        ),
-        *("pyarrow", "pydantic", "pyproj", "rasterio", "rich", "scipy", "shapely", "tqdm", "typer", "click"),
+        *("affine", "cv2", "filelock", "geopandas", "lazy_loader", "matplotlib", "numpy", "osmium", "pandas"),
+        *("pooch", "psutil", "pyarrow", "pydantic", "pyproj", "rasterio", "rich"),
+        *("scipy", "shapely", "tqdm", "typer", "click"),
         *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
         *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),

@@ -349,9 +349,9 @@ class _Run:
 
     def lines(self) -> list[str]:
         """Report the training for it."""
-        if self.name and self.plan.lesson is None:
+        if self.name and self.plan.training_set is None:
             return ["nothing to learn from, asked untaught"]
-        return self.plan.lesson_lines()
+        return self.plan.training_lines()
 
 
 def _run(spec: str, runs: Sequence[_Run], tell: Tell, progress: Progress | None) -> list[Path]:
@@ -361,7 +361,7 @@ def _run(spec: str, runs: Sequence[_Run], tell: Tell, progress: Progress | None)
         left, done = _count([one])
         label = f"{spec}, {one.name}" if one.name else spec
         tell(f"{label}: {left} queries to ask, {done} answered before")
-        for line in () if one.plan.lesson is not None else one.lines():
+        for line in () if one.plan.training_set is not None else one.lines():
             tell(f"{label}: {line}")
         run(one.plan, tell=tell if left else _silent, progress=progress)
         folders += [part.folder for part in one.plan.parts]

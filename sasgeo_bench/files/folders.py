@@ -98,6 +98,25 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextmanager
+def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
+    """Yield a scratch file next to `path` that replaces it if the block succeeds, and is removed otherwise.
+
+    Raise `StoreError`, with the advice `mend`, if it cannot be written.
+    """
+    scratch = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield scratch
+        _flush(scratch)
+        scratch.rename(path)
+    except OSError as error:
+        with suppress(OSError):
+            scratch.unlink()
+        message = f"{path} cannot be written ({error.strerror or error}): {mend}"
+        raise StoreError(message) from error
+
+
+@contextmanager
 def fresh_folder(target: Path) -> Iterator[Path]:
     """Yield an empty folder next to `target` that replaces it if the block succeeds, and is removed otherwise.
 

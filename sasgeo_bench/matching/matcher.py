@@ -19,13 +19,13 @@ Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_SAID: Final = 4000  # characters of a field of a card
 MOST_SHOWN: Final = 80  # of a wrong one
-MOST_LEARNED_BYTES: Final = 2**20  # of what a matcher has learnt, as UTF-8
-SAME_PLACE_M: Final = 0.05  # a candidate is given back as it was, coordinates rounded at most
+MOST_LEARNED_BYTES: Final = 2**20  # of a learned text, as UTF-8
+SAME_PLACE_M: Final = 0.05  # a candidate is returned unchanged, except for rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatcherCard:
-    """Description of a matcher, printed on the board beside its row.
+    """Description of a matcher, printed on the board with its row.
 
     Parameters
     ----------
@@ -38,28 +38,22 @@ class MatcherCard:
     source : str
         Paper, page or "original": where the method comes from.
     ours : str
-        What of it is the implementer's own.
+        The implementer's own part of it.
     licence : str
         SPDX name of the code's licence.
     tracks : tuple of {"retrieval", "localization"}
-        What it answers; elsewhere its row says "not applicable".
+        Tracks that it answers; on others its row is "not applicable".
     needs : tuple of str
-        Of `NEEDS`: what a query must tell or hold; without it the row says "not applicable".
+        Of `NEEDS`: what a query must hold; without it the row is "not applicable".
     limits : str
-        What it is known not to do.
+        Known limits.
     trained_on : tuple of str
         Places its parameters come from; a row that was trained on a test place is set apart.
 
     Raises
     ------
     MatchError
-        If a field is empty, too long or not printable, or says what is not known.
-
-    Examples
-    --------
-    >>> said = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
-    >>> MatcherCard(**said, tracks=("localization",)).needs
-    ()
+        If a field is empty, too long or not printable, or has an unknown value.
     """
 
     name: str
@@ -74,7 +68,7 @@ class MatcherCard:
     trained_on: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse a card that does not say what a reader of the board needs."""
+        """Refuse a card without the facts that a reader of the board needs."""
         check_said(self)
         check_identity(self.name, self.version)
         for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
@@ -90,7 +84,7 @@ class MatcherCard:
 
 
 def check_said(card: object) -> None:
-    """Refuse a card on which one of the fields that every card has says nothing."""
+    """Refuse a card on which one of the fields that every card has is empty or no line."""
     for name in ("name", "version", "title", "source", "ours", "licence"):
         value = getattr(card, name)
         if not isinstance(value, str) or not value.strip():
@@ -107,17 +101,10 @@ def _check_line(name: str, value: object) -> None:
 
 
 def check_identity(name: str, version: str) -> None:
-    """Refuse a name or a version that could not be part of a folder's name, a flag or a cell of any table.
+    """Raise `MatchError` for a name or version that cannot be part of a folder's name, a flag or any table.
 
-    Raises
-    ------
-    MatchError
-        Saying what it may hold.
-
-    Examples
-    --------
-    >>> check_identity("mine", "1.0.0rc1+cpu")
-    >>> check_identity("mine", "=1+1")
+    >>> check_identity("graph", "1.0.0rc1+cpu")
+    >>> check_identity("graph", "=1+1")
     Traceback (most recent call last):
         ...
     sasgeo_bench.errors.MatchError: card: version '=1+1' may hold letters, digits, dots, hyphens, underscores and plus
@@ -136,7 +123,7 @@ def check_identity(name: str, version: str) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
-    """An answer to one query: places with scores, best first; no place at all is an answer withheld.
+    """An answer to one query: places with scores, best first; an answer without a place is withheld.
 
     Parameters
     ----------
@@ -145,9 +132,9 @@ class Match:
     scores : sequence of float
         As many as poses, none greater than the one before it; any scale.
     confidence : float, optional
-        Probability, 0..1, that the first pose is right; None where the matcher does not say.
+        Probability, 0..1, that the first pose is right; None if the matcher gives none.
     diagnostics : mapping of str to float
-        Whatever a rejector or a reader may want, as in "margin".
+        Further numbers for a rejector or a reader, as in "margin".
     """
 
     poses: Sequence[Pose]
@@ -183,7 +170,7 @@ class Matcher(Protocol):
     card: MatcherCard
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Index a map; called once for each map, timed apart. `learned` is what `learn` said, None without one."""
+        """Index a map; called and timed once for each map. `learned` is the text of `learn`, None without one."""
         ...
 
     def match(self, query: Query, *, top_k: int) -> Match:
@@ -195,29 +182,17 @@ class Matcher(Protocol):
 class Learner(Matcher, Protocol):
     """A matcher that learns, once for each set of training places and in a process of its own.
 
-    All that is learnt is a text, which the runner keeps and hands to every `prepare`; the same training gives the same
-    text. Where nothing could be learnt `prepare` gets None: a matcher that then cannot answer needs "training" on its
-    card.
+    The result is a text, which the runner stores and passes to every `prepare`; the same training gives the same text.
+    After a failed training `prepare` gets None: a matcher that then cannot answer needs "training" on its card.
     """
 
     def learn(self, training: Training) -> str:
-        """Say what is to be known from now on, as JSON or any other text of at most `MOST_LEARNED_BYTES`."""
+        """Return the result as JSON or any other text of at most `MOST_LEARNED_BYTES`."""
         ...
 
 
 def check_learned(learned: object) -> str:
-    """Hold what a matcher has learnt to what can be kept.
-
-    Raises
-    ------
-    MatchError
-        With found and expected, if it is no text, too long, or cannot be written as UTF-8.
-
-    Examples
-    --------
-    >>> check_learned('{"bias_m": 3.5}')
-    '{"bias_m": 3.5}'
-    """
+    """Return a learned text, if it is one that can be stored; raise `MatchError` otherwise."""
     if not isinstance(learned, str):
         message = f"learn() returned {type(learned).__name__}, expected a text: write it as JSON, say"
         raise MatchError(message)
@@ -233,28 +208,14 @@ def check_learned(learned: object) -> str:
 
 
 def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
-    """Hold an answer to what an answer must be.
-
-    Parameters
-    ----------
-    match : object
-        What a matcher returned.
-    query : Query or Head
-        What it was asked.
-    top_k : int
-        How many poses it may give.
-
-    Returns
-    -------
-    Match
-        The answer, with floats for numbers.
+    """Check an answer to a query of at most `top_k` poses, and return it with floats for numbers.
 
     Raises
     ------
     MatchError
-        With found and expected, if it is not a Match, gives more than `top_k` poses, as many scores as it should not,
-        a number out of `bounds.BOUNDS`, scores out of order, a pose twice or one that is no candidate of a retrieval
-        query, or diagnostics with a name that is no line of at most `bounds.MOST_NAME` characters.
+        If it is not a Match, has more than `top_k` poses, another number of scores, a number out of `bounds.BOUNDS`,
+        scores out of order, a pose twice or one that is no candidate of a retrieval query, or a diagnostic whose name
+        is no line of at most `bounds.MOST_NAME` characters.
     """
     if not isinstance(match, Match):
         message = f"match() returned {type(match).__name__}, expected sasgeo_bench.matching.matcher.Match"
@@ -263,7 +224,7 @@ def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
     if count > min(top_k, MOST_CANDIDATES):
         message = f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}"
         raise MatchError(message)
-    # What has a length may still give more or fewer than it says.
+    # An object of some length may still yield more or fewer items.
     scores = [_number(score, "score") for score in islice(match.scores, MOST_CANDIDATES + 1)]
     poses = [_pose(pose) for pose in islice(match.poses, count)]
     if len(poses) != count or len(scores) != count:
@@ -306,7 +267,7 @@ def _pose(pose: object) -> Pose:
 
 
 def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None:
-    """Every pose of a retrieval answer is one of the candidates, and none is given twice."""
+    """Check that every pose of a retrieval answer is one of the candidates, and none is given twice."""
     given: set[int] = set()
     for pose in poses:
         near = candidates_at(pose, candidates)
@@ -322,17 +283,10 @@ def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None
 
 
 def candidates_at(pose: Pose, candidates: Sequence[Pose]) -> list[int]:
-    """Candidates that lie where a pose lies, within 5 cm, the nearest first; heading and scale may have been refined.
-
-    Examples
-    --------
-    >>> one, two = (Pose(easting_m=x, northing_m=0.0, yaw_deg=0.0) for x in (1.0, 7.0))
-    >>> candidates_at(two, [one, two])
-    [1]
-    """
-    apart_m = [math.hypot(pose.easting_m - item.easting_m, pose.northing_m - item.northing_m) for item in candidates]
-    near = [index for index, gap_m in enumerate(apart_m) if gap_m <= SAME_PLACE_M]
-    return sorted(near, key=apart_m.__getitem__)
+    """Return the candidates within 5 cm of a pose, the nearest first; heading and scale may have been refined."""
+    gaps_m = [math.hypot(pose.easting_m - item.easting_m, pose.northing_m - item.northing_m) for item in candidates]
+    near = [index for index, gap_m in enumerate(gaps_m) if gap_m <= SAME_PLACE_M]
+    return sorted(near, key=gaps_m.__getitem__)
 
 
 def _diagnostics(given: object) -> dict[str, float]:
@@ -355,11 +309,7 @@ def _diagnostics(given: object) -> dict[str, float]:
 
 
 def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | None:
-    """Why a query is not applicable to a matcher, or None if it is.
-
-    A disc, a heading or vectors that a card needs and a query lacks are named; so is a track it does not answer, and
-    training where there was nothing to learn from.
-    """
+    """Return why a query is not applicable to a matcher, or None: its track, or a need of the card that it lacks."""
     if query.track not in card.tracks:
         return f"track {query.track}"
     has = {

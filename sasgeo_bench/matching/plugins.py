@@ -27,15 +27,8 @@ ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the tr
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     """Return the entry points of a group by name; of two with one name the built-in one, else the first listed.
 
-    Warns
-    -----
-    UserWarning
-        Where a name stands twice, or is that of the runner's own control.
-
-    Raises
-    ------
-    MatchError
-        If an installed package has entry points that cannot be read.
+    Warn of a name that occurs twice, or is that of the runner's own control. Raise `MatchError` if an installed package
+    has entry points that cannot be read.
     """
     found: dict[str, EntryPoint] = {}
     for point in _installed(group):
@@ -74,35 +67,15 @@ def _clash(first: EntryPoint, other: EntryPoint) -> str:
 
 
 def shipped_names() -> frozenset[str]:
-    """Return the names of shipped matchers, which no other plugin may use.
-
-    Examples
-    --------
-    >>> "oracle_pose" in shipped_names()
-    True
-    """
+    """Return the names of shipped matchers, which no other plugin may use."""
     return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in SHIPPED)})
 
 
 def check_card_name(spec: str, name: str, *, is_oracle: bool = False) -> None:
-    """Refuse a card name by which a row would pass for another: that of a shipped matcher, or an oracle's.
+    """Raise `MatchError` for a card name that would imitate a shipped matcher or an oracle.
 
-    Parameters
-    ----------
-    spec : str
-        How it was named: a name, or module:Class.
-    name : str
-        Of its card.
-    is_oracle : bool
-        Whether a pipeline names it among its oracles.
+    `spec` is the name of the plugin, or module:Class; `is_oracle` states that a pipeline lists it as an oracle.
 
-    Raises
-    ------
-    MatchError
-        Naming both.
-
-    Examples
-    --------
     >>> check_card_name("mine:Matcher", "oracle_pose")
     Traceback (most recent call last):
         ...
@@ -124,26 +97,16 @@ def _home(point: EntryPoint) -> str:
     return "" if point.dist is None else _name_of(point.dist)
 
 
-@lru_cache(maxsize=16)  # its entry points share a distribution, which reads its metadata anew at every question
+@lru_cache(maxsize=16)  # its entry points share a distribution, which reads its metadata anew at every access
 def _name_of(distribution: Distribution) -> str:
     return distribution.name
 
 
 def load_matcher(spec: str) -> "Matcher":
-    """Import a matcher and make one.
+    """Import and make the matcher of a name, or of "module:Class".
 
-    Parameters
-    ----------
-    spec : str
-        A name, or "module:Class".
+    Raise `MatchError` if there is none of that name, it cannot be imported or made, or has no sound card or methods.
 
-    Raises
-    ------
-    MatchError
-        If there is none of that name, it cannot be imported or made, is not a matcher, or has no sound card.
-
-    Examples
-    --------
     >>> load_matcher("no_such_matcher")
     Traceback (most recent call last):
         ...
@@ -157,33 +120,14 @@ def load_matcher(spec: str) -> "Matcher":
 
 
 def load_rejector(spec: str) -> "Rejector":
-    """Import a rejector and make one.
-
-    Parameters
-    ----------
-    spec : str
-        A name, or "module:Class".
-
-    Raises
-    ------
-    MatchError
-        If there is none of that name, it cannot be imported or made, is not a rejector, or has no sound card.
-    """
+    """Import and make the rejector of a name, or of "module:Class"; raise `MatchError` as `load_matcher` does."""
     return rejector_maker(spec)()
 
 
 def rejector_maker(spec: str) -> "Callable[[], Rejector]":
-    """Return a function that makes rejectors as `load_rejector` does, but looks for the name once.
+    """Return a function that makes rejectors as `load_rejector` does, but looks up the name once.
 
-    Parameters
-    ----------
-    spec : str
-        A name, or "module:Class".
-
-    Raises
-    ------
-    MatchError
-        If there is none of that name, or it cannot be imported.
+    Raise `MatchError` if there is none of that name, or it cannot be imported.
     """
     return partial(_rejector, spec, _find(spec, REJECTORS, "rejector"))
 
@@ -213,12 +157,7 @@ def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequenc
         raise MatchError(message)
 
 
-def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
-    """Return the class behind a name or module:Class."""
-    return _from_module(spec) if ":" in spec else _from_entry_point(spec, group, kind)
-
-
-def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever the plugin is
+def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any plugin
     """Make a plugin; a failure is reported in one line."""
     try:
         return target()
@@ -227,7 +166,10 @@ def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatev
         raise MatchError(message) from error
 
 
-def _from_module(spec: str) -> Callable[[], Any]:
+def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
+    """Return the class behind a name or module:Class."""
+    if ":" not in spec:
+        return _from_entry_point(spec, group, kind)
     module, _, name = spec.partition(":")
     try:
         return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
@@ -251,17 +193,7 @@ def _known(name: str, group: str, kind: str) -> EntryPoint:
 
 
 def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) -> None:
-    """Refuse names that no installed package registers. Imports nothing, and accepts any module:Class.
-
-    Raises
-    ------
-    MatchError
-        If there is none of that name.
-
-    Examples
-    --------
-    >>> check_names(matchers=["mine:Matcher", "oracle_pose"])
-    """
+    """Raise `MatchError` for names that no installed package registers; import nothing, accept any module:Class."""
     for listed, group, kind in ((matchers, MATCHERS, "matcher"), (rejectors, REJECTORS, "rejector")):
         for name in listed:
             if ":" not in name and not (group == MATCHERS and name == ORACLE):
@@ -269,23 +201,9 @@ def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) 
 
 
 def check_registered(rejectors: Sequence[str], *, source: str) -> None:
-    """Refuse rejectors that a data file names by module:Class: importing them would run any code that it names.
+    """Raise `MatchError` if a data file, `source`, names a rejector that no installed package registers.
 
-    Parameters
-    ----------
-    rejectors : sequence of str
-        As the data name them.
-    source : str
-        What the data are called.
-
-    Raises
-    ------
-    MatchError
-        If one is not registered by an installed package; nothing is imported.
-
-    Examples
-    --------
-    >>> check_registered(["margin"], source="stored")
+    Importing a module:Class from data would run any code. Nothing is imported here.
     """
     known = list_entry_points(REJECTORS) if rejectors else {}
     stray = next((name for name in rejectors if name not in known), None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second door: rules that say of an answer how likely it is a false fix, fitted on calibration blocks."""
+"""The second interface: rules that estimate how likely an answer is a false fix, fitted on calibration blocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,24 +16,10 @@ from sasgeo_bench.matching.results import Prediction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RejectorCard:
-    """Description of a rejector: the fields of a `MatcherCard`, and one more.
+    """Description of a rejector: the fields of a `MatcherCard`, and `is_calibrated`.
 
-    Parameters
-    ----------
-    is_calibrated : bool
-        False where `p_false` keeps an order alone and is no probability. A board then tells neither Brier score nor
-        calibration error nor costs by Eq. 14: they would judge numbers that claim nothing.
-
-    Raises
-    ------
-    MatchError
-        If a field is empty or the name holds what a name may not.
-
-    Examples
-    --------
-    >>> said = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
-    >>> RejectorCard(**said).limits
-    ''
+    It is False where `p_false` only orders answers and is no probability. A board then reports neither Brier score nor
+    calibration error nor costs by Eq. 14. Raise `MatchError` if a field is empty or the name is not allowed.
     """
 
     name: str
@@ -46,7 +32,7 @@ class RejectorCard:
     is_calibrated: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse a card that does not say what a reader of the board needs."""
+        """Refuse a card without the facts that a reader of the board needs."""
         check_said(self)
         check_identity(self.name, self.version)
 
@@ -55,14 +41,14 @@ class RejectorCard:
 class Rejector(Protocol):
     """A rule over the answers of one matcher; it is made without arguments and sees no query, map or truth.
 
-    Of each answer it sees what the matcher told: candidates with scores, confidence, diagnostics. After a fit it may
-    have a `remark`, a text that the board is to say of that fit, as where calibration was too little to learn from.
+    Of each answer it sees the matcher's output: candidates with scores, confidence, diagnostics. After a fit it may
+    have a `remark`, a text about that fit for the board, for instance that there was too little calibration data.
     """
 
     card: RejectorCard
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Learn from answers of calibration blocks; `is_false`, shape (N,), says which of them were false fixes."""
+        """Fit to answers of calibration blocks; `is_false`, shape (N,), marks false fixes."""
         ...
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
@@ -71,40 +57,13 @@ class Rejector(Protocol):
 
 
 def remark_of(rejector: Rejector) -> str:
-    """Return a rejector's remark on its last fit in one line; empty where it has no `remark`.
-
-    Examples
-    --------
-    >>> class Plain:
-    ...     remark = "too few answers"
-    >>> remark_of(Plain())
-    'too few answers'
-    """
+    """Return a rejector's remark on its last fit in one line; empty where it has no `remark`."""
     return one_line(str(getattr(rejector, "remark", "") or ""))
 
 
 def check_p_false(found: object, count: int) -> NDArray[np.float64]:
-    """Hold what a rejector returned to what it must be.
+    """Return the result of `p_false` as float64, shape (count,); raise `MatchError` if it is not `count` numbers, 0..1.
 
-    Parameters
-    ----------
-    found : object
-        What `p_false` returned.
-    count : int
-        Answers it was asked about.
-
-    Returns
-    -------
-    ndarray of float64, shape (count,)
-        Probabilities.
-
-    Raises
-    ------
-    MatchError
-        If these are not as many finite numbers from 0 to 1.
-
-    Examples
-    --------
     >>> check_p_false([0.25, 1.0], 2)
     array([0.25, 1.  ])
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prediction: one row of an answer, whether a program gave it or a file; its place and hash in a run."""
+"""Prediction: one row of an answer, of a program or a file; and the hash of a run."""
 
 import hashlib
 from collections.abc import Mapping
@@ -25,17 +25,17 @@ class Prediction:
     confidence : float, optional
         Probability that the first pose is right.
     diagnostics : mapping of str to float
-        What the matcher tells besides.
+        Further numbers of the matcher.
     status : str
-        "ok"; "timeout", "crash", "invalid" or "refused" where there is no answer, and why; "not applicable" where
-        the matcher's card says it cannot.
+        "ok"; "timeout", "crash", "invalid" or "refused" where there is no answer; "not applicable" where the matcher's
+        card excludes the query.
     message : str
-        In one line, why there is no answer.
+        The reason, in one line, if there is no answer.
     latency_s : float, optional
         By the runner's clock, from when the query was sent until the answer was read; None where there is no answer,
-        and in files whose author says nothing of it. Rows of older programs have the matcher's own clock here.
+        and in files whose author gives none. Rows of older programs have the matcher's own clock here.
     matcher_s : float, optional
-        Of `match` alone by the clock of the matcher's own process; no figure is made of it.
+        Of `match` alone by the clock of the matcher's own process; no metric uses it.
     """
 
     query_id: str
@@ -49,13 +49,7 @@ class Prediction:
 
 
 def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
-    """First 12 hex digits of what makes two runs of a matcher the same: its name, version, code and the run's settings.
-
-    Examples
-    --------
-    >>> len(matcher_hash("mine", "1", b"", ""))
-    12
-    """
+    """Return 12 hex digits that identify a run: by the name, version and code of its matcher, and its settings."""
     digest = hashlib.sha256()
     for part in (spec.encode(), version.encode(), code, settings.encode()):
         digest.update(len(part).to_bytes(8, "big") + part)

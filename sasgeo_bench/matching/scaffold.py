@@ -5,6 +5,7 @@ import keyword
 import re
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -14,24 +15,13 @@ from sasgeo_bench.matching.submission import example_card
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
-# Modules that a package of this name would hide: of Python, of this package and what it imports, and around them.
+# Modules that a package of this name would hide: of Python, of this package and its imports, and of common tools.
 _TAKEN: Final = frozenset(
     {
         *sys.stdlib_module_names,
-        *(
-            "affine",
-            "cv2",
-            "filelock",
-            "geopandas",
-            "lazy_loader",
-            "matplotlib",
-            "numpy",
-            "osmium",
-            "pandas",
-            "pooch",
-            "psutil",
-        ),
-        *("pyarrow", "pydantic", "pyproj", "rasterio", "rich", "scipy", "shapely", "tqdm", "typer", "click"),
+        *("affine", "cv2", "filelock", "geopandas", "lazy_loader", "matplotlib", "numpy", "osmium", "pandas"),
+        *("pooch", "psutil", "pyarrow", "pydantic", "pyproj", "rasterio", "rich"),
+        *("scipy", "shapely", "tqdm", "typer", "click"),
         *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
         *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),
@@ -153,22 +143,9 @@ sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/re
 
 
 def plugin_files(name: str) -> dict[str, str]:
-    """Text of every file of a new plugin package, by its path.
+    """Return the text of every file of a new plugin package, by its path.
 
-    Parameters
-    ----------
-    name : str
-        Of the matcher: lower-case letters, digits, hyphens, underscores.
-
-    Raises
-    ------
-    ConfigError
-        If it is no such name, or taken.
-
-    Examples
-    --------
-    >>> sorted(plugin_files("my-matcher"))[:3]
-    ['README.md', 'card.toml', 'pyproject.toml']
+    `name` is that of the matcher; raise `ConfigError` if it is not allowed, or taken.
     """
     module = name.replace("-", "_")
     if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
@@ -186,10 +163,10 @@ def plugin_files(name: str) -> dict[str, str]:
         raise ConfigError(message)
     words = re.split(r"[-_]", name)
     own = "".join(word.capitalize() for word in words)
-    said = {
+    words_of = {
         "name": name,
         "distribution": name.replace("_", "-"),
-        "module": name.replace("-", "_"),
+        "module": module,
         "cls": f"{own}Matcher" if own in _IMPORTED or keyword.iskeyword(own) else own,
         "title": " ".join(words).capitalize(),
     }
@@ -200,18 +177,12 @@ def plugin_files(name: str) -> dict[str, str]:
         "src/{module}/matcher.py": _MATCHER,
         "tests/test_conforms.py": _TEST,
     }
-    made = {path.format(**said): text.format(**said) for path, text in files.items()}
+    made = {path.format(**words_of): text.format(**words_of) for path, text in files.items()}
     return made | {"card.toml": example_card(name)}
 
 
 def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
-    """Write every file of a package, or leave things as they were.
-
-    Raises
-    ------
-    StoreError
-        If the folder is there and not empty, or cannot be written.
-    """
+    """Write all files of a package, or none; raise `StoreError` if the folder is not empty or cannot be written."""
     if not _is_free(folder):
         message = f"{folder} is there already and not empty: name another folder"
         raise StoreError(message)
@@ -227,7 +198,8 @@ def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
             target.write_text(text, encoding="utf-8")
     except OSError as error:
         for path in reversed(made):
-            _remove(path)
+            with suppress(OSError):
+                path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
         message = f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
         raise StoreError(message) from error
 
@@ -238,11 +210,3 @@ def _is_free(folder: Path) -> bool:
     except OSError as error:
         message = f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
         raise StoreError(message) from error
-
-
-def _remove(path: Path) -> None:
-    """Remove a file or an empty folder; what cannot be removed stays."""
-    try:
-        path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
-    except OSError:
-        return

@@ -12,7 +12,7 @@ from sasgeo_bench.tasks.split import HALVES, Half
 from sasgeo_bench.texts import FOLDER, NAME, VERSION
 
 SCHEMA_VERSION: Final = 1
-NONE: Final = "none"  # what `trained_on` says of a method that has learnt nothing from any place of the split
+NONE: Final = "none"  # `trained_on` of a method that was not trained on any place of the split
 MOST_PLACES: Final = 1000
 _SHORT: Final = 60  # characters
 
@@ -20,7 +20,7 @@ _HALVES_SAID: Final = '{ a = ["munich"], b = ["porto"] }'
 
 
 def _trained(said: object) -> object:
-    """Refuse whatever is neither "none" nor places, nor places for each half."""
+    """Refuse anything but "none", a list of places, or a list for each half."""
     lists = list(said.values()) if isinstance(said, Mapping) and set(said) == set(HALVES) else [said]
     is_sound = all(
         isinstance(item, list) and len(item) <= MOST_PLACES and all(isinstance(name, str) for name in item)
@@ -48,29 +48,10 @@ TrainedOn = Annotated[str | list[str] | dict[str, list[str]], BeforeValidator(_t
 class Card(Document):
     """Author's description of a method, shown on the board as text.
 
-    Parameters
-    ----------
-    name, version : str
-        Of the row: lower-case letters, digits, hyphens and underscores; of the version, raised whenever answers change,
-        capitals, dots and plus signs too.
-    title, source, ours, licence : str
-        One line for people; paper, page or "original"; what of it is the author's own; SPDX name of the code's licence.
-    trained_on : "none", list of str, or a list for each half
-        Places of the split that taught the method. By halves, "a" are the places that taught the answers about half a.
-    trained_elsewhere : str
-        Whatever else taught it, in a line.
-    needs : list of str
-        Of `matcher.NEEDS`: what a query must tell.
-    uses : list of str
-        What it looks at besides the query and the map, as in "imagery".
-    limits, authors, contact, code
-        What it is known not to do; who made it, and how to reach them; address of its code.
-
-    Examples
-    --------
-    >>> said = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}
-    >>> Card.model_validate(said | {"trained_on": {"a": ["munich"], "b": ["porto"]}}).taught("a")
-    ('munich',)
+    The fields `name` to `licence`, `needs` and `limits` are those of a `MatcherCard`. `trained_on` is "none", or places
+    of the split; by halves, "a" lists the training places of the answers about half a. `trained_elsewhere` describes
+    other training in a line. `uses` lists inputs besides the query and the map, as in "imagery"; `authors`, `contact`
+    and `code` name the authors, a way to reach them, and the address of the code.
     """
 
     name: Name
@@ -99,7 +80,7 @@ class Card(Document):
         return tuple(sorted({place for half in HALVES for place in self.taught(half)}))
 
     def taught(self, half: Half | None) -> tuple[str, ...]:
-        """Places that taught the answers about places of a half; of None, where a split has none, all of them."""
+        """Return the training places of the answers about a half; of None, where a split has no halves, all of them."""
         said = self.trained_on
         if isinstance(said, dict):
             return self.places if half is None else tuple(said[half])
@@ -141,14 +122,7 @@ class Submission(Document):
 
 
 def example_card(name: str = "my-matcher") -> str:
-    """A card to begin with, as TOML.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.config import parse_toml
-    >>> parse_toml(example_card(), Card, source="card.toml").name
-    'my-matcher'
-    """
+    """Return an example of a card, as TOML."""
     return _EXAMPLE.format(name=name, halves=_HALVES_SAID)
 
 

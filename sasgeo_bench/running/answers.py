@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries of some tasks -> rows in their run folders; a process answers all tasks that search its map."""
+"""Answer the queries of tasks and write their rows; one process answers all tasks that search its map."""
 
 import threading
 import time
@@ -29,27 +29,17 @@ from sasgeo_bench.tasks.task_rows import asked_under
 
 Item = TypeVar("Item")
 
-# Help begins with a start and a map to prepare: 1.6 s of a core, or far more. While nobody knows what a query takes,
-# 10 ms or 10 s, fewer than this for each process are not worth one; chunks for a cluster are no smaller either.
+# One more process has to start and to prepare a map: 1.6 s of a core, or far more. While the time of a query is unknown
+# (10 ms or 10 s), fewer queries than this for each process do not justify one; chunks for a cluster are no smaller.
 LEAST_ITEMS: Final = 8
 
 
 def pays(*, left: int, askers: int, start_s: float, pace_s: float | None) -> bool:
-    """True if one more process is worth its start: its share of the queries must take at least as long.
+    """Return whether one more process pays: whether its share of the queries takes at least as long as its start.
 
-    Parameters
-    ----------
-    left : int
-        Queries that nobody was given yet.
-    askers : int
-        Processes that work on them.
-    start_s : float
-        What the start of a process takes, the map included.
-    pace_s : float or None
-        What a query takes; None while nobody knows, and the share must then be of `LEAST_ITEMS` queries.
+    `left` queries are pending for `askers` processes; `start_s` includes preparing the map. While the time of a query,
+    `pace_s`, is unknown, the share must hold `LEAST_ITEMS` queries.
 
-    Examples
-    --------
     >>> pays(left=40, askers=1, start_s=2.0, pace_s=0.01), pays(left=40, askers=1, start_s=2.0, pace_s=1.0)
     (False, True)
     """
@@ -58,17 +48,8 @@ def pays(*, left: int, askers: int, start_s: float, pace_s: float | None) -> boo
 
 
 class Schedule(Generic[Item]):
-    """Queries of several maps, for some threads to share out among them.
+    """Queries of several maps, shared by threads; `lines` holds the queries of each map, and their number.
 
-    Parameters
-    ----------
-    lines : sequence of tuple of iterator and int
-        For each map its queries, and how many these are.
-    clock : callable
-        Seconds.
-
-    Examples
-    --------
     >>> schedule = Schedule([(iter("ab"), 2), (iter("c"), 1)])
     >>> while (number := schedule.take()) is not None:
     ...     print(number, *schedule.items(number))
@@ -82,17 +63,12 @@ class Schedule(Generic[Item]):
         self._lines = [_Line(items, count) for items, count in lines]
         self._clock = clock
         self._changed = threading.Condition()
-        self._is_stopped = False
-
-    @property
-    def is_stopped(self) -> bool:
-        """True if no more work is given."""
-        return self._is_stopped
+        self.is_stopped = False
 
     def take(self) -> int | None:
-        """The map to work on next, or None when nothing is left; waits as long as nobody knows whether help pays."""
+        """Return the map to work on next, or None if nothing is left; wait until it is known whether help pays."""
         with self._changed:
-            while not self._is_stopped:
+            while not self.is_stopped:
                 line = next((line for line in self._lines if line.askers == 0), None) or self._in_need()
                 if line is not None:
                     line.askers += 1
@@ -108,9 +84,9 @@ class Schedule(Generic[Item]):
         return max(in_need, key=lambda line: line.left / (line.askers + 1), default=None)
 
     def items(self, number: int) -> Iterator[Item]:
-        """Queries of a map, each to one of those who ask; the time until the next one is asked for is noted."""
+        """Yield queries of a map, each to one thread only; measure the time until the thread asks for the next."""
         line, is_first = self._lines[number], True
-        while not self._is_stopped:
+        while not self.is_stopped:
             item = line.draw()
             if item is None:
                 break
@@ -124,19 +100,19 @@ class Schedule(Generic[Item]):
             self._changed.notify_all()
 
     def wait_for_stop(self, seconds: float) -> bool:
-        """True if no more work is given, now or within some seconds."""
+        """Return whether the schedule is stopped, now or within some seconds."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._is_stopped, timeout=seconds)
+            return self._changed.wait_for(lambda: self.is_stopped, timeout=seconds)
 
     def stop(self) -> None:
         """Give no more work, and wake all waiting threads."""
         with self._changed:
-            self._is_stopped = True
+            self.is_stopped = True
             self._changed.notify_all()
 
 
 class _Line(Generic[Item]):
-    """Queries of one map, and what is known of the time they take."""
+    """Queries of one map, and measurements of the time they take."""
 
     def __init__(self, items: Iterator[Item], count: int) -> None:
         self.left = count
@@ -147,27 +123,27 @@ class _Line(Generic[Item]):
         self._spent_s, self._count = 0.0, 0
 
     def draw(self) -> Item | None:
-        """The next one; None when there is none."""
+        """Return the next query, or None."""
         with self._lock:
             item = next(self._items, None)
             self.left = 0 if item is None else self.left - 1
             return item
 
     def note(self, seconds: float, *, is_first: bool) -> None:
-        """Take note of what one took; the first of a process takes its start too and says nothing of the pace."""
+        """Record the time of a query; the first of a process includes its start, and is not part of the pace."""
         if is_first:
             self._start_s = max(self._start_s, seconds)
         else:
             self._spent_s, self._count = self._spent_s + seconds, self._count + 1
 
     def pays(self) -> bool:
-        """True if help is worth its start."""
+        """Return whether one more process pays."""
         pace_s = self._spent_s / self._count if self._count else None
         return self.left > 0 and pays(left=self.left, askers=self.askers, start_s=self._start_s, pace_s=pace_s)
 
 
 PART_ROWS: Final = 64
-PART_S: Final = 1.0  # rows wait no longer than this to be written: what a kill loses
+PART_S: Final = 1.0  # longest time between two writes: a kill loses no more
 
 
 Question = tuple["_Writer", Query, bytes]
@@ -175,22 +151,11 @@ Question = tuple["_Writer", Query, bytes]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """Cost of some rows: time, memory, counts.
+    """Cost of some rows.
 
-    Parameters
-    ----------
-    counts : dict of str to int
-        Rows by status.
-    prepare_s, index_bytes : float and int, optional
-        Of one map: seconds, and by how much the memory of the process grew; None where no map could be prepared.
-    cpu_s : float
-        Processor seconds inside of `match`, all queries together.
-    peak_bytes : int
-        Most memory that a matcher's process and all that came from it held at once, in whatever task of its map.
-    isolation : dict of str to str
-        How the matcher was shut in.
-    messages : dict of str to str
-        By status, what the first row without an answer said.
+    `counts` gives rows by status, `messages` the first message of each other status than ok. Of one map, `prepare_s`
+    seconds and `index_bytes` of growth, None where no map could be prepared; `cpu_s` within `match`, over all queries;
+    `peak_bytes` is the most memory that the processes of the matcher held at once; `isolation` as in `run.json`.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
@@ -203,13 +168,7 @@ class Cost:
 
 
 def pool_costs(costs: Sequence[Cost]) -> Cost:
-    """Several costs as one: counts and processor seconds added, the largest of the others, every isolation there was.
-
-    Examples
-    --------
-    >>> pool_costs([Cost(counts={"ok": 2}, prepare_s=1.0), Cost(counts={"ok": 1}, prepare_s=3.0)]).counts
-    {'ok': 3}
-    """
+    """Pool costs: sum counts and processor seconds, keep the largest of the others, join all isolations."""
     counts: dict[str, int] = {}
     messages: dict[str, str] = {}
     for cost in costs:
@@ -228,13 +187,7 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
 
 
 class Watch:
-    """Observer of the progress of tasks, called by several threads at once; this one does nothing.
-
-    Examples
-    --------
-    >>> isinstance(Watch(), Watch)
-    True
-    """
+    """Observer of the progress of tasks, called by several threads at once; this one does nothing."""
 
     def begin(self, part: RunPart) -> None:
         """Record that a task has begun."""
@@ -247,28 +200,10 @@ class Watch:
 
 
 def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) -> Cost:
-    """Ask what is left of some tasks, by as many processes as are wanted, and write the rows.
+    """Ask the pending queries of some tasks in at most `jobs` processes, and write the rows.
 
-    Parameters
-    ----------
-    plan : RunPlan
-        From `plan_run`.
-    parts : sequence of RunPart
-        The tasks. Those that search one map share processes; no process has more than one map.
-    jobs : int
-        Processes at once.
-    watch : Watch
-        Is told of each task and each row.
-
-    Returns
-    -------
-    Cost
-        What it took.
-
-    Raises
-    ------
-    StoreError
-        If rows cannot be written; those that were stay.
+    Tasks that search one map share processes; no process has more than one map. Raise `StoreError` if rows cannot be
+    written; written ones stay.
     """
     groups = [[_Writer(part, watch=watch) for part in group] for group in by_map(plan.request.spec, parts)]
     maps = [_Map(plan, group) for group in groups]
@@ -284,19 +219,19 @@ def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) 
                 for asking in as_completed([pool.submit(_ask_all, schedule, maps) for _ in range(threads)]):
                     asking.result()
             finally:
-                schedule.stop()  # before the pool waits for its threads: each ends with the query it is at
+                schedule.stop()  # before the pool waits for its threads: each ends with its current query
             writing.result()
     return pool_costs([writer.cost for writer in writers])
 
 
 def _ask_all(schedule: Schedule[Question], maps: Sequence["_Map"]) -> None:
-    """One thread: map after map, each by a process of its own."""
+    """Work on map after map in one thread, each in a new process."""
     while (number := schedule.take()) is not None:
         maps[number].ask(schedule, number)
 
 
 def _write_in_time(writers: Sequence["_Writer"], schedule: Schedule[Question]) -> None:
-    """Write rows now and then; a failure to write stops the run."""
+    """Write rows at regular times; a failure to write stops the run."""
     try:
         while not schedule.wait_for_stop(PART_S):
             for writer in writers:
@@ -313,7 +248,7 @@ class _Map:
         self._plan, self._writers = plan, writers
 
     def questions(self) -> Iterator[Question]:
-        """Query after query, task after task, each with where its row goes; a row group in memory."""
+        """Yield the queries of all tasks, each with the writer of its row; hold one row group in memory."""
         for writer in self._writers:
             writer.begin()
             for query, blob, asked in task_files.read_some(writer.part.task, frozenset(writer.part.left)):
@@ -323,20 +258,20 @@ class _Map:
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
-        """One process: prepare with the first query, then answer one after the other."""
-        top_k, ready, is_warm = self._plan.request.top_k, self._unlearned(), False
-        with self._asked() as worker:
+        """Prepare the map in a new process with the first query, then answer queries until none is left."""
+        top_k, ready, is_warm = self._plan.request.top_k, self._failed_training(), False
+        with self._process() as worker:
             for writer, query, blob in schedule.items(number):
                 if ready is None:
-                    learned = self._plan.learned
-                    region, text = self._writers[0].part.region, None if learned is None else learned.text
+                    result = self._plan.training_result
+                    region, text = self._writers[0].part.region, None if result is None else result.text
                     ready = guarded(self._plan, partial(worker.prepare, region, text))
                     self._check_map(ready)
                     if schedule.is_stopped:
                         return
-                if self._unlearned() is None:
-                    writer.told_by(worker, ready)
-                reason = lacks(self._plan.card, query, is_taught=self._plan.lesson is not None)
+                if self._failed_training() is None:
+                    writer.add_process(worker, ready)
+                reason = lacks(self._plan.card, query, is_taught=self._plan.training_set is not None)
                 if reason is not None:
                     writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
                     continue
@@ -350,22 +285,22 @@ class _Map:
                 writer.add(self._row(query, reply), cpu_s=reply.cpu_s)
 
     def _row(self, query: Query, reply: Reply) -> Prediction:
-        """Make a row of a reply, checked again on this side."""
+        """Make a row of a reply, checked again in this process."""
         try:
             return _prediction(query, reply, self._plan.request.top_k)
-        except Exception as error:  # noqa: BLE001 - whatever is made of an answer costs its own row
+        except Exception as error:  # noqa: BLE001 - any failure costs only its own row
             failed = failed_by_us(self._plan, error)
             return Prediction(query_id=query.query_id, status=failed.status, message=failed.message)
 
-    def _unlearned(self) -> Reply | None:
+    def _failed_training(self) -> Reply | None:
         """Return the reply to every query after a failed training; starts no process."""
-        learned = self._plan.learned
-        if learned is None or learned.text is not None:
+        result = self._plan.training_result
+        if result is None or result.text is not None:
             return None
-        return Reply(status=learned.status, message=learned.message)
+        return Reply(status=result.status, message=result.message)
 
     def _check_map(self, ready: Reply) -> None:
-        """Refuse a map that another run has replaced since, or that is damaged: no failure of whoever prepared it."""
+        """Refuse a map that was replaced meanwhile, or is damaged: the matcher is not at fault."""
         part = self._writers[0].part
         if not task_files.is_of_map(part.about, read_manifest(part.region)):
             message = f"{part.region} was built anew while it was searched: run again, answers are kept"
@@ -373,8 +308,8 @@ class _Map:
         if ready.status != "ok":
             check_files(part.region)
 
-    def _asked(self) -> Worker | Oracle:
-        """Return what answers: a plugin in its own process, or the control that is given the truth."""
+    def _process(self) -> Worker | Oracle:
+        """Return the process that answers: a plugin's own, or the control that is given the truth."""
         request, part = self._plan.request, self._writers[0].part
         if request.spec == ORACLE:
             return Oracle(part.truth)
@@ -402,7 +337,7 @@ def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
 
 
 class _Writer:
-    """Rows of one task: gathered, counted, and written a part at a time; and what they took."""
+    """Collects the rows of one task, counts them, writes them in parts, and adds up their cost."""
 
     def __init__(self, part: RunPart, *, watch: Watch) -> None:
         self.part = part
@@ -412,7 +347,7 @@ class _Writer:
         self._counts: dict[str, int] = {}
         self._messages: dict[str, str] = {}
         self._cpu_s = 0.0
-        self._askers: dict[int, tuple[Worker | Oracle, Reply]] = {}
+        self._processes: dict[int, tuple[Worker | Oracle, Reply]] = {}
         self._is_open = False
 
     def begin(self) -> None:
@@ -420,13 +355,13 @@ class _Writer:
         self._watch.begin(self.part)
         self._is_open = True
 
-    def told_by(self, worker: Worker | Oracle, ready: Reply) -> None:
-        """Take note of who answers, and of what came of the map there."""
+    def add_process(self, worker: Worker | Oracle, ready: Reply) -> None:
+        """Record a process that answers, and the outcome of preparing the map in it."""
         with self._lock:
-            self._askers[id(worker)] = (worker, ready)
+            self._processes[id(worker)] = (worker, ready)
 
     def add(self, prediction: Prediction, *, cpu_s: float = 0.0) -> None:
-        """Take a row; with the last one the task is at its end."""
+        """Add a row; end the task with the last one."""
         with self._lock:
             self._rows.append(prediction)
             self._cpu_s += cpu_s
@@ -447,7 +382,7 @@ class _Writer:
             self._rows = []
 
     def end(self) -> None:
-        """Write what is left and say what it took; a second time, or where nothing was begun, nothing."""
+        """Write the remaining rows and report the cost, once; do nothing where no task was begun."""
         with self._lock:
             self.flush()
             if self._is_open:
@@ -459,15 +394,16 @@ class _Writer:
         """Cost of the rows so far and of their processes."""
         with self._lock:
             own = Cost(counts=dict(self._counts), cpu_s=self._cpu_s, messages=dict(self._messages))
-            return pool_costs([own, *(_process_cost(*asker) for asker in self._askers.values())])
+            return pool_costs([own, *(_process_cost(*process) for process in self._processes.values())])
 
 
 def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
-    """Cost that a process reported for its map and for itself."""
+    """Return the cost of a process and its map."""
+    is_shut_in = "truth" in worker.isolation
+    isolation = {} if is_shut_in else dict.fromkeys(PROMISES, "trusted code, not shut in")
     return Cost(
         prepare_s=ready.own_s if ready.own_s is None or ready.seconds is None else min(ready.own_s, ready.seconds),
         index_bytes=ready.grown_bytes,
         peak_bytes=worker.peak_bytes,
-        isolation=dict.fromkeys(() if "truth" in worker.isolation else PROMISES, "trusted code, not shut in")
-        | worker.isolation,
+        isolation=isolation | worker.isolation,
     )

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import SasgeoError
 
-LOG: Final = "failures.log"  # in the folder of a run; beside that of a board
+LOG: Final = "failures.log"  # in the folder of a run; next to that of a board
 _DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 _MOST_LOGGED: Final = 100_000  # characters of one traceback
 
@@ -19,13 +19,7 @@ Item = TypeVar("Item")
 
 
 def stops_all(error: BaseException | None) -> bool:
-    """True if an error comes from a disk that is full, read-only or broken, and from no entry.
-
-    Examples
-    --------
-    >>> stops_all(OSError(errno.ENOSPC, "No space left on device")), stops_all(ValueError("an answer of mine"))
-    (True, False)
-    """
+    """Return whether an error comes from a disk that is full, read-only or broken, and not from an entry."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _DISK:
             return True
@@ -34,7 +28,7 @@ def stops_all(error: BaseException | None) -> bool:
 
 
 def write_log(log: Path, name: str, error: BaseException) -> None:
-    """Add the traceback of an error to a log; where that cannot be written there is none."""
+    """Append the traceback of an error to a log, if that can be written."""
     text = "".join(traceback.format_exception(error))[-_MOST_LOGGED:]
     with suppress(OSError):
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -43,34 +37,19 @@ def write_log(log: Path, name: str, error: BaseException) -> None:
 
 
 def log_beside(board: Path) -> Path:
-    """Return the path of a board's log of tracebacks.
-
-    Examples
-    --------
-    >>> log_beside(Path("out/boards/mine")).name
-    'mine.failures.log'
-    """
+    """Return the path of a board's log of tracebacks, next to its folder."""
     return board.with_name(f"{board.name}.{LOG}")
 
 
 class Failures:
-    """Failed entries by name, and the cause of each as one line.
+    """Failed entries by name, with the cause of each as one line; tracebacks are appended to `log`.
 
-    Parameters
-    ----------
-    log : Path
-        Where tracebacks go; it is made when there is one.
-    tell : callable
-        Gets each line.
-
-    Examples
-    --------
     >>> failures = Failures(Path("failures.log"), tell=print)
-    >>> with failures.of("mine"):
+    >>> with failures.of("graph"):
     ...     raise SasgeoError("it has no card")
-    mine failed: it has no card
+    graph failed: it has no card
     >>> failures.found
-    {'mine': 'it has no card'}
+    {'graph': 'it has no card'}
     """
 
     def __init__(self, log: Path, *, tell: Callable[[str], None]) -> None:
@@ -80,12 +59,12 @@ class Failures:
 
     @property
     def first(self) -> Exception | None:
-        """Return the error that was raised first."""
+        """Return the first error."""
         return next(iter(self.errors.values()), None)
 
     @contextmanager
     def of(self, name: str, *, but: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-        """Note any error but some, and go on after the block; a disk's refusal is raised."""
+        """Record an error of the block and continue after it; raise those in `but` and refusals of the disk."""
         try:
             yield
         except Exception as error:
@@ -94,13 +73,10 @@ class Failures:
             self.note(name, error)
 
     def note(self, name: str, error: Exception) -> None:
-        """Note a failure; of an error that nobody has put in words the log keeps where it was raised."""
-        line = (
-            one_line(str(error))
-            if isinstance(error, SasgeoError)
-            else f"{message_of(error)} ({self.log.name} says where)"
-        )
+        """Record a failure; log the traceback of an error that is not a `SasgeoError`."""
+        line = one_line(str(error))
         if not isinstance(error, SasgeoError):
+            line = f"{message_of(error)} ({self.log.name} says where)"
             write_log(self.log, name, error)
         self.errors.setdefault(name, error)
         line = line.removeprefix(f"{name}: ")
@@ -108,7 +84,7 @@ class Failures:
             self._tell(f"{name} failed: {line}")
 
     def blame(self, items: Mapping[str, Item], work: Callable[[Mapping[str, Item]], object]) -> bool:
-        """Note those with which alone some work fails that failed with all; whether there is any."""
+        """Record the items with which some work fails alone, after it failed with all; return whether there are any."""
         before = len(self.found)
         for name in items:
             with self.of(name):

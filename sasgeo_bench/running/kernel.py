@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of the Linux kernel that Python has no name for; Landlock, and a seccomp filter in classic BPF."""
+"""System calls of Linux without a name in Python: Landlock, and a seccomp filter in classic BPF."""
 
 import ctypes
 import errno
@@ -21,13 +21,13 @@ def libc() -> ctypes.CDLL:
 
 
 def last_error() -> OSError:
-    """Error of the last call that failed."""
+    """Return the error of the last call that failed."""
     number = ctypes.get_errno()
     return OSError(number, os.strerror(number))
 
 
 def syscall(number: int, *arguments: object) -> int:
-    """Call the kernel by number; the negative error number where it refuses."""
+    """Call the kernel by number; return the negative error number if it refuses."""
     library = libc()
     library.syscall.restype = ctypes.c_long
     result = int(library.syscall(ctypes.c_long(number), *arguments))
@@ -35,18 +35,12 @@ def syscall(number: int, *arguments: object) -> int:
 
 
 def prctl(option: int, value: int) -> bool:
-    """Set a property of this process; False where the system does not know it."""
+    """Set a property of this process; return False where the system does not know it."""
     return sys.platform == "linux" and int(libc().prctl(option, value, 0, 0, 0)) == 0
 
 
 def mount(source: str, target: str, kind: str | None, flags: int, data: str = "") -> None:
-    """Mount something, or change what is mounted.
-
-    Raises
-    ------
-    OSError
-        If the kernel refuses.
-    """
+    """Mount something, or change a mount; raise `OSError` if the kernel refuses."""
     given = (os.fsencode(source), os.fsencode(target), kind.encode() if kind else None)
     if libc().mount(*given, ctypes.c_ulong(flags), data.encode() or None) != 0:
         raise last_error()
@@ -73,30 +67,17 @@ _SCOPES: Final = 0b11  # abstract sockets and signals leave the domain
 
 
 def landlock_version() -> int:
-    """Version of Landlock that the kernel offers; 0 where it has none.
-
-    Examples
-    --------
-    >>> landlock_version() >= 0
-    True
-    """
+    """Return the version of Landlock that the kernel offers, 0 without Landlock."""
     if sys.platform != "linux":
         return 0
-    found = syscall(LANDLOCK_CREATE, None, 0, LANDLOCK_VERSION)
-    return max(0, found)
+    return max(0, syscall(LANDLOCK_CREATE, None, 0, LANDLOCK_VERSION))
 
 
 def restrict(allowed: Sequence[tuple[str, int]], writable: Sequence[str], version: int) -> None:
-    """Refuse every file that is not allowed; there is no way back for this process and its children.
+    """Refuse access to all files that are not allowed, for good, to this process and its children.
 
-    Parameters
-    ----------
-    allowed : sequence of (str, int)
-        Files and folders, and the rights to them and all within.
-    writable : sequence of str
-        Folders with all rights.
-    version : int
-        Of Landlock, at least 1.
+    `allowed` gives paths, and the rights to them and their contents; `writable` folders have all rights. `version` is
+    that of Landlock, at least 1.
     """
     rights = _FIRST_RIGHTS
     for since, later in _LATER_RIGHTS.items():
@@ -118,13 +99,13 @@ def restrict(allowed: Sequence[tuple[str, int]], writable: Sequence[str], versio
 
 
 def _allow(ruleset: int, path: str, rights: int) -> None:
-    """Add a rule for a folder or a file; one that is not there is passed over."""
+    """Add a rule for a folder or file, if it exists."""
     try:
         descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
     except OSError:
         return
     try:
-        if not os.path.isdir(path):  # noqa: PTH112 - no pathlib before the door is shut
+        if not os.path.isdir(path):  # noqa: PTH112 - no pathlib before the sandbox is closed
             rights &= _FILE_RIGHTS
         rule = struct.pack("=Qi", rights, descriptor)
         added = syscall(LANDLOCK_ADD, ruleset, RULE_PATH, ctypes.c_char_p(rule), 0)
@@ -135,10 +116,8 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
 
 
 def outermost(paths: Sequence[str]) -> list[str]:
-    """Resolve paths that exist, and drop those inside another one: a covered folder needs no second cover.
+    """Resolve paths that exist, and drop those inside another one.
 
-    Examples
-    --------
     >>> outermost(["/usr/lib", "/usr", "/usr/../usr", "/nowhere"])
     ['/usr']
     """
@@ -150,15 +129,11 @@ def outermost(paths: Sequence[str]) -> list[str]:
 
 
 def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
-    """A path with the right to read it; where something hidden lies within, all else that lies there now.
+    """Yield a path with the right to read it or, if it contains hidden paths, everything else in it.
 
-    Of a folder that holds something hidden the names can be listed, or nothing in it could be imported. Links in it
-    are passed over: what they lead to is read where it lies, if that is in reach, and nobody looked through it else.
+    The names in a folder that contains something hidden can be listed, or nothing in it could be imported. Links in it
+    are skipped: their targets are read where they lie, if they are readable.
 
-    Examples
-    --------
-    >>> [name for name, _ in around("/usr", ["/home/me/truth"])]
-    ['/usr']
     >>> list(around("/home/me/truth/vaduz", ["/home/me/truth"]))
     []
     """
@@ -170,19 +145,19 @@ def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
         yield path, READ_RIGHTS
         return
     try:
-        names = sorted(os.listdir(real))  # noqa: PTH208 - no pathlib before the door is shut
+        names = sorted(os.listdir(real))  # noqa: PTH208 - no pathlib before the sandbox is closed
     except OSError:
         return
     yield real, LIST_RIGHT
     for name in names:
         inner = f"{real.rstrip('/')}/{name}"
-        if not os.path.islink(inner):  # noqa: PTH114 - no pathlib before the door is shut
+        if not os.path.islink(inner):  # noqa: PTH114 - no pathlib before the sandbox is closed
             yield from around(inner, hidden)
 
 
 _SECCOMP: Final = {"x86_64": 317, "aarch64": 277}
 _ARCHITECTURE: Final = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}  # AUDIT_ARCH_..., of linux/audit.h
-_SET_FILTER, _SPEC_ALLOW = 1, 1 << 2  # the second one: no slower memory for the sake of a filter
+_SET_FILTER, _SPEC_ALLOW = 1, 1 << 2  # the second one: do not slow down memory because of a filter
 _X32: Final = 0x40000000  # calls of x86_64 with short pointers have numbers of their own
 _ALLOW, _REFUSE = 0x7FFF0000, 0x00050000
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _AND, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x54, 0x06
@@ -190,19 +165,19 @@ _NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
 
 # Names, and numbers on x86_64 and aarch64 as in asm/unistd_64.h and asm-generic/unistd.h; 0 where there is no call.
 DANGEROUS: Final = (
-    # Mounts, namespaces and roots: whoever changes them looks behind what is hidden.
+    # Mounts, namespaces and roots, which could uncover hidden files.
     "mount 165 40, umount2 166 39, pivot_root 155 41, chroot 161 51, unshare 272 97, setns 308 268",
     "open_tree 428 428, move_mount 429 429, fsopen 430 430, fsconfig 431 431, fsmount 432 432, fspick 433 433",
     "mount_setattr 442 442, open_tree_attr 467 467, open_by_handle_at 304 265",
     # Memory and files of other processes.
     "ptrace 101 117, process_vm_readv 310 270, process_vm_writev 311 271, process_madvise 440 440",
     "pidfd_getfd 438 438, kcmp 312 272",
-    # Keys, programs in the kernel, rings of calls that no filter sees, what faults and counters tell.
+    # Keys, programs in the kernel, rings of calls that no filter sees, faults and counters that reveal others.
     "add_key 248 217, request_key 249 218, keyctl 250 219, bpf 321 280",
     "io_uring_setup 425 425, userfaultfd 323 282, perf_event_open 298 241",
-    # Sockets: no namespace parts those that have a path. Connected pairs remain.
+    # Sockets: no namespace separates those that have a path. Connected pairs remain.
     "socket 41 198, connect 42 203",
-    # Memory and queues that outlive their process, or that nobody can count from outside.
+    # Memory and queues that outlive their process, or that cannot be counted from outside.
     "memfd_secret 447 447, shmget 29 194, semget 64 190, msgget 68 186, mq_open 240 180",
 )
 # What Landlock does not refuse: modes, owners, times and attributes, and before version 3 the length of a file by path.
@@ -221,24 +196,21 @@ _SOCKETPAIR: Final = {"x86_64": 53, "aarch64": 199}
 _KIND, _DATAGRAM = 0xF, 2
 _PRCTL: Final = {"x86_64": 157, "aarch64": 167}
 _FCNTL: Final = {"x86_64": 72, "aarch64": 25}
-_LEASES: Final = (1024, 1026)  # F_SETLEASE and F_NOTIFY: the first has all others wait who open a file
+_LEASES: Final = (1024, 1026)  # F_SETLEASE and F_NOTIFY: a lease blocks all others who open the file
 _CLONE: Final = {"x86_64": 56, "aarch64": 220}
 _NEW_SPACES: Final = 0x7E020000  # all CLONE_NEW... that clone takes
 _CLONE3: Final = 435
 
 
 def is_offered() -> bool:
-    """True if the system call numbers of this processor are known here."""
+    """Return whether the system call numbers of this processor are known here."""
     return os.uname().sysname == "Linux" and os.uname().machine in _ARCHITECTURE and struct.calcsize("P") == 8  # noqa: PLR2004 - bytes of a pointer
 
 
 def refuse(*, metadata: bool) -> bool:
-    """Refuse dangerous calls to this process and all its children, for good; False where the kernel cannot.
+    """Refuse dangerous calls, for good, to this process and its children; return False where the kernel cannot.
 
-    Parameters
-    ----------
-    metadata : bool
-        Refuse changes of modes, owners, times and attributes, too, of whatever file.
+    With `metadata`, refuse changes of modes, owners, times and attributes of all files, too.
     """
     if not is_offered():
         return False
@@ -251,18 +223,12 @@ def refuse(*, metadata: bool) -> bool:
 
 
 def program(machine: str, *, metadata: bool) -> bytes:
-    """Filter for a kind of processor: eight bytes for each step.
-
-    Examples
-    --------
-    >>> len(program("aarch64", metadata=True)) > len(program("aarch64", metadata=False))
-    True
-    """
+    """Return the filter for a kind of processor, eight bytes for each step."""
     refused = ", ".join((*DANGEROUS, *(METADATA if metadata else ()))).split(", ")
     numbers = [int(call.split()[1 + list(_ARCHITECTURE).index(machine)]) for call in refused]
     steps = [_step(_LOAD, _ARCHITECTURE_AT), _step(_EQUAL, _ARCHITECTURE[machine], yes=1), _answer(errno.EPERM)]
     steps += [_step(_LOAD, _NUMBER_AT), _step(_AT_LEAST, _X32, no=1), _answer(errno.ENOSYS)]
-    # What clone3 wants stands in memory, where no filter sees it: libraries then use clone.
+    # The arguments of clone3 lie in memory, where no filter sees them: libraries then use clone.
     steps += [_step(_EQUAL, _CLONE3, no=1), _answer(errno.ENOSYS)]
     for number in filter(None, numbers):
         steps += [_step(_EQUAL, number, no=1), _answer(errno.EPERM)]
@@ -270,7 +236,7 @@ def program(machine: str, *, metadata: bool) -> bytes:
     # A pair of datagram sockets can be connected anew, to a path; one of streams cannot.
     kinds = [_step(_AND, _KIND), _step(_EQUAL, _DATAGRAM, no=1), _answer(errno.EPERM)]
     steps += _by_argument(_SOCKETPAIR[machine], 1, kinds)
-    # A process that cannot be looked into hides its memory from whoever watches it.
+    # A process that is not dumpable would hide its memory from the runner.
     dumpable = [_step(_EQUAL, PR_SET_DUMPABLE, no=1), _answer(errno.EPERM)]
     steps += _by_argument(_PRCTL[machine], 0, dumpable)
     leases = [step for command in _LEASES for step in (_step(_EQUAL, command, no=1), _answer(errno.EPERM))]
@@ -282,7 +248,7 @@ def program(machine: str, *, metadata: bool) -> bytes:
 
 
 def _by_argument(number: int, argument: int, steps: list[bytes]) -> Iterator[bytes]:
-    """Steps on the low half of an argument of one call, which is let through if none of them refuses it."""
+    """Yield steps on the low half of an argument of one call, which passes if none of them refuses it."""
     yield _step(_EQUAL, number, no=len(steps) + 2)
     yield _step(_LOAD, _ARGUMENTS_AT + 8 * argument)
     yield from steps

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find files beside the code that reveal answers: queries, truths, results, boards, releases, other maps.
+"""Find files next to the code that reveal answers: queries, truths, results, boards, releases, other maps.
 
-A matcher reads the folders that it is imported from. They are walked here, no links followed, so that whatever in them
-tells where a query was taken can be hidden; how far the walk came is part of what it finds.
+A matcher reads the folders that it is imported from. Walk them here, without following links, so that files which
+reveal where a query was taken can be hidden; report how far the walk came.
 """
 
 import os
@@ -10,7 +10,7 @@ import sys
 import sysconfig
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,11 +19,11 @@ from typing import Final
 from sasgeo_bench.running.root import SYSTEM
 from sasgeo_bench.tasks.private_seed import SUFFIX as SEED
 
-MOST_ENTRIES: Final = 200_000  # names that are looked at: about a second of a disk that is awake
+MOST_ENTRIES: Final = 200_000  # names: about a second of a fast disk
 MOST_DEPTH: Final = 12
-_FRESH_S: Final = 60.0  # a walk counts so long; a run starts many processes, and others store results meanwhile
+_FRESH_S: Final = 60.0  # a walk is valid so long: a run starts many processes, and others store results meanwhile
 
-# A folder that holds all names of one of these tells answers.
+# A folder that holds all names of one of these reveals answers.
 _SIGNS: Final = tuple(
     frozenset(names)
     for names in (
@@ -40,7 +40,7 @@ _SIGNS: Final = tuple(
     )
 )
 _SIGN_STARTS: Final = ("truth-", "part-")  # truths of one part of a task in a release; answers of a run
-# What of it is hidden where it holds code or the map that is asked about, too, and cannot go as a whole.
+# Parts that are hidden of a folder that holds code or the map in question, too, and cannot be hidden as a whole.
 _TELLING: Final = frozenset(
     {
         *("pack.json", "truths.parquet", "truth.parquet", "truth.json", "scores.parquet", "submission.json"),
@@ -50,14 +50,14 @@ _TELLING: Final = frozenset(
 )
 _OUT: Final = frozenset({"tasks", "truth"})
 _OF_OUT: Final = ("tasks", "truth", "runs", "boards", "release", "results", "sheets")
-_HISTORY: Final = frozenset({".git", ".hg"})  # results that were ever committed are in there
-_PASSED_OVER: Final = frozenset({"site-packages", "dist-packages", "node_modules", "__pycache__"})
+_HISTORY: Final = frozenset({".git", ".hg"})  # they hold all results that were ever committed
+_SKIPPED: Final = frozenset({"site-packages", "dist-packages", "node_modules", "__pycache__"})
 _INTERPRETER: Final = frozenset({"pyvenv.cfg", "conda-meta"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Telling:
-    """A folder that tells answers, what of it does, and whether it holds code of its own."""
+    """A folder that reveals answers, the parts of it that do, and whether it holds code of its own."""
 
     folder: str
     parts: tuple[str, ...] = ()
@@ -66,16 +66,14 @@ class Telling:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Walk:
-    """Folders that tell answers, outer ones first, and in words what was not looked at; empty where all was."""
+    """Folders that reveal answers, outer ones first, and a description of unsearched files, empty if there are none."""
 
     found: tuple[Telling, ...]
     unsearched: str = ""
 
     def hidden(self, kept: Sequence[Path]) -> list[str]:
-        """Paths to hide: folders as a whole, or what tells of those that hold code or something that is kept.
+        """Return the paths to hide: whole folders, or the revealing parts of those that hold code or a kept path.
 
-        Examples
-        --------
         >>> walk = Walk(found=(Telling(folder="/a/release", parts=("/a/release/truth",)),))
         >>> walk.hidden([]), walk.hidden([Path("/a/release/regions/vaduz")])
         (['/a/release'], ['/a/release/truth'])
@@ -91,15 +89,9 @@ class Walk:
 
 
 def walk_code(code: Iterable[Path]) -> Walk:
-    """Look through the folders that code is imported from, all but those of the interpreter; again after a minute.
-
-    Examples
-    --------
-    >>> walk_code([]).found
-    ()
-    """
+    """Walk the folders that code is imported from, except those of the interpreter; walk again after a minute."""
     roots = dict.fromkeys(os.path.realpath(path) for path in code)
-    own = tuple(root for root in roots if os.path.isdir(root) and not _is_interpreters(root))  # noqa: PTH112 - text
+    own = tuple(root for root in roots if os.path.isdir(root) and not _is_installed(root))  # noqa: PTH112 - text
     return _walked(own, int(time.monotonic() // _FRESH_S))
 
 
@@ -110,33 +102,15 @@ def _walked(roots: tuple[str, ...], minute: int) -> Walk:
 
 
 def walk(roots: Sequence[str], *, most_entries: int = MOST_ENTRIES, most_depth: int = MOST_DEPTH) -> Walk:
-    """Look through folders, the upper ones first.
-
-    Parameters
-    ----------
-    roots : sequence of str
-        Resolved folders.
-    most_entries, most_depth : int
-        Names that are looked at in all, and how many folders deep.
-
-    Returns
-    -------
-    Walk
-        What tells answers.
-
-    Examples
-    --------
-    >>> walk(["/nowhere"]).found
-    ()
-    """
+    """Walk resolved folders, upper ones first: at most so many names in all, and so many folders deep."""
     found: list[Telling] = []
     queue, seen, entries, is_deep = deque((root, 0) for root in roots), set(roots), 0, False
     while queue and entries < most_entries:
         folder, depth = queue.popleft()
         held = _listed(folder, most_entries - entries)
         entries += len(held)
-        tells, inside = _look(folder, held)
-        found += tells
+        revealing, inside = _look(folder, held)
+        found += revealing
         inside = [path for path in inside if path not in seen]
         is_deep |= bool(inside) and depth >= most_depth
         if depth < most_depth:
@@ -148,15 +122,15 @@ def walk(roots: Sequence[str], *, most_entries: int = MOST_ENTRIES, most_depth: 
     return Walk(found=tuple(found), unsearched=words)
 
 
-def _is_interpreters(folder: str) -> bool:
-    """True if a folder is the interpreter's own, or holds installed packages."""
+def _is_installed(folder: str) -> bool:
+    """Return whether a folder is the interpreter's own, or holds installed packages."""
     prefixes = {os.path.realpath(path) for path in (sys.prefix, sys.base_prefix)}
     installed = {os.path.realpath(path) for path in sysconfig.get_paths().values()} - prefixes
     return folder in prefixes or any(Path(folder).is_relative_to(path) for path in installed)
 
 
 def _listed(folder: str, most: int) -> dict[str, bool]:
-    """Names in a folder, so many at most, and whether each is a folder itself; none where it cannot be read."""
+    """List at most so many names in a folder, and whether each is a folder; none if it cannot be read."""
     held: dict[str, bool] = {}
     try:
         with os.scandir(folder) as entries:
@@ -170,28 +144,24 @@ def _listed(folder: str, most: int) -> dict[str, bool]:
 
 
 def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]:
-    """Return what reveals answers in a folder, and its subfolders still to scan."""
+    """Return the revealing files in a folder, and its subfolders still to scan."""
     names = held.keys()
     if names & _INTERPRETER or folder in {*SYSTEM, "/dev"}:
         return [], []
     base = folder.rstrip("/")
-    telling = {name for name in names if name in _HISTORY or name.endswith(SEED)}  # a private seed draws the truths
-    tells = [Telling(folder=f"{base}/{name}") for name in sorted(telling)]
-    passed = {*_HISTORY, *_PASSED_OVER}
+    telling = {name for name in names if name in _HISTORY or name.endswith(SEED)}  # truths are drawn by the seed
+    found = [Telling(folder=f"{base}/{name}") for name in sorted(telling)]
+    skipped = {*_HISTORY, *_SKIPPED}
     if names >= _OUT:
-        tells += [Telling(folder=f"{base}/{name}") for name in _OF_OUT]
-        passed |= {"tasks", "truth", "runs", "boards"}
+        found += [Telling(folder=f"{base}/{name}") for name in _OF_OUT]
+        skipped |= {"tasks", "truth", "runs", "boards"}
     if any(names >= sign for sign in _SIGNS) or any(_is_table(name) for name in names):
         parts = [name for name in sorted(names) if name in _TELLING or _is_table(name)]
         is_code = any(name.endswith(".py") for name in names)
-        tells.insert(0, Telling(folder=folder, parts=tuple(f"{base}/{name}" for name in parts), is_code=is_code))
-        passed.update(parts)
-    return tells, list(_inside(base, held, passed))
+        found.insert(0, Telling(folder=folder, parts=tuple(f"{base}/{name}" for name in parts), is_code=is_code))
+        skipped.update(parts)
+    return found, [f"{base}/{name}" for name in sorted(names) if held[name] and name not in skipped]
 
 
 def _is_table(name: str) -> bool:
     return name.startswith(_SIGN_STARTS) and name.endswith(".parquet")
-
-
-def _inside(base: str, held: dict[str, bool], passed: set[str]) -> Iterator[str]:
-    return (f"{base}/{name}" for name, is_folder in sorted(held.items()) if is_folder and name not in passed)

@@ -22,20 +22,13 @@ _PREFIX: Final = "sasgeo-bench-"
 _NEEDED: Final = ("memory", "pids")
 _MOUNTS: Final = Path("/proc/self/mountinfo")
 _OWN: Final = Path("/proc/self/cgroup")
-_ROUNDS, _ROUND_S = 400, 0.005  # how often and how far apart we look whether killed processes are gone
+_ROUNDS, _ROUND_S = 400, 0.005  # how often and at which interval we check that killed processes are gone
 _numbers = itertools.count()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """A control group: one folder with both controllers (version 2), or one for each (version 1).
-
-    Examples
-    --------
-    >>> group = Group(version=2, memory=Path("/sys/fs/cgroup/a"), pids=Path("/sys/fs/cgroup/a"))
-    >>> group.folders
-    (PosixPath('/sys/fs/cgroup/a'),)
-    """
+    """A control group: one folder with both controllers (version 2), or one for each (version 1)."""
 
     version: int
     memory: Path
@@ -43,19 +36,15 @@ class Group:
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """Its folders, each once."""
+        """Return its folders, each once."""
         return tuple(dict.fromkeys((self.memory, self.pids)))
 
     @classmethod
     def make(cls, *, memory_bytes: int, processes: int) -> Self | None:
-        """Make a group with these limits, after removing those whose runner was killed; None where we may not.
+        """Make a group with these limits, after removing those whose runner was killed; return None if refused.
 
-        Parameters
-        ----------
-        memory_bytes : int
-            Of all its processes together, files in memory and buffers of the kernel among it.
-        processes : int
-            Processes and threads at once.
+        The limits hold for all its processes together: memory with in-memory files and kernel buffers, and the number
+        of processes and threads.
         """
         for version, parents in _places():
             name = f"{_PREFIX}{_runner()}-{next(_numbers)}"
@@ -74,46 +63,40 @@ class Group:
         for folder in self.folders:
             folder.mkdir()
         limits: Mapping[str, int] = {"memory.max": memory_bytes}
-        more = {"memory.swap.max": 0, "memory.oom.group": 1}
+        optional = {"memory.swap.max": 0, "memory.oom.group": 1}
         if self.version == 1:
-            limits, more = {"memory.limit_in_bytes": memory_bytes}, {"memory.memsw.limit_in_bytes": memory_bytes}
+            limits, optional = {"memory.limit_in_bytes": memory_bytes}, {"memory.memsw.limit_in_bytes": memory_bytes}
         for name, value in limits.items():
             (self.memory / name).write_text(str(value), encoding="utf-8")
         (self.pids / "pids.max").write_text(str(processes), encoding="utf-8")
-        for name, value in more.items():  # not every kernel has these
+        for name, value in optional.items():  # not every kernel has these
             with contextlib.suppress(OSError):
                 (self.memory / name).write_text(str(value), encoding="utf-8")
 
     def add(self, number: int) -> None:
-        """Put a process into it; what it starts from then on is in it, too.
-
-        Raises
-        ------
-        OSError
-            If we may not.
-        """
+        """Put a process into it, with all that it starts from then on; raise `OSError` if refused."""
         for folder in self.folders:
             (folder / "cgroup.procs").write_text(str(number), encoding="utf-8")
 
     def peak_bytes(self) -> int:
-        """Most memory its processes held at once, as the kernel counted it; that of now where it keeps no peak."""
+        """Return the peak memory of its processes by the kernel's count, or the current one if there is no peak."""
         names = ("memory.max_usage_in_bytes",) if self.version == 1 else ("memory.peak", "memory.current")
         return next(filter(None, (_number(self.memory / name) for name in names)), 0)
 
     def is_full(self) -> bool:
-        """True if the kernel killed one of its processes for its memory."""
+        """Return whether the kernel killed one of its processes for its memory."""
         name = "memory.oom_control" if self.version == 1 else "memory.events"
         found = dict(line.split() for line in _lines(self.memory / name))
         return int(found.get("oom_kill", 0)) > 0
 
     def remove(self) -> None:
-        """Kill whatever is in it, and remove it; what is left because it would not die is swept by a later run."""
+        """Kill its processes, and remove it; a group whose processes do not die is removed by a later run."""
         for folder in self.folders:
             _remove(folder)
 
 
 def _places() -> Iterator[tuple[int, Sequence[Path]]]:
-    """Versions, and the folders for memory and for processes in which a group may be made, best first."""
+    """Yield versions and folders (for memory, for processes) in which a group may be made, best first."""
     own = {names: path for _, names, path in (line.split(":", 2) for line in _lines(_OWN))}
     mounts = [
         (before.split()[3:5], after.split()) for before, _, after in (x.partition(" - ") for x in _lines(_MOUNTS))
@@ -121,7 +104,7 @@ def _places() -> Iterator[tuple[int, Sequence[Path]]]:
     for (root, where), (kind, *_) in mounts:
         folder = _folder(root, where, own.get("")) if kind == "cgroup2" else None
         if folder is not None:
-            # A folder with processes of its own gives no controllers to those within: then beside it, or further up.
+            # A folder with processes of its own gives no controllers to its children: try its parents, too.
             for place in (folder, *folder.parents):
                 if place.is_relative_to(where) and _offers(place):
                     yield 2, (place, place)
@@ -137,7 +120,7 @@ def _places() -> Iterator[tuple[int, Sequence[Path]]]:
 
 
 def _folder(root: str, where: str, path: str | None) -> Path | None:
-    """Place of a group below a mount of groups, whose own root may be one of them; None if it lies elsewhere."""
+    """Return the folder of a group below a mount, which may show one group as its root; None if it lies elsewhere."""
     root = root.rstrip("/")
     if path is None or not f"{path}/".startswith(f"{root}/"):
         return None
@@ -145,13 +128,13 @@ def _folder(root: str, where: str, path: str | None) -> Path | None:
 
 
 def _offers(folder: Path) -> bool:
-    """True if groups in a version 2 folder have the controllers that are needed."""
+    """Return whether groups in a version 2 folder have the controllers that are needed."""
     names = " ".join(_lines(folder / "cgroup.subtree_control")).split()
     return set(_NEEDED) <= set(names) and os.access(folder, os.W_OK)
 
 
 def _runner() -> str:
-    """Name of this process that no later one has: namespace, number, and when it began."""
+    """Return a name of this process that no later one has: namespace, number, and start."""
     return f"{_namespace()}-{os.getpid()}-{_begun(os.getpid())}"
 
 
@@ -166,7 +149,7 @@ def _begun(number: int) -> str:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove groups that runs left here because they were killed; those of other process namespaces are not ours."""
+    """Remove groups of killed runs; those of other process namespaces are not ours."""
     with contextlib.suppress(OSError):
         for path in folder.glob(f"{_PREFIX}{_namespace()}-*"):
             _, number, begun, _ = path.name.removeprefix(_PREFIX).split("-")
@@ -204,12 +187,12 @@ def _lines(path: Path) -> list[str]:
         return []
 
 
-WATCH_S: Final = 0.05  # how often memory is looked at
-_TRIES: Final = 3  # what ends while it is looked at may look odd once
+WATCH_S: Final = 0.05  # interval of measurements
+_TRIES: Final = 3  # a process that ends meanwhile may look odd once
 _AGAIN_S: Final = 0.01
-_SHARED: Final = ("/memfd:", "/dev/shm/")  # noqa: S108 - what open files are called that lie in memory
-_USUAL: Final = 3  # processes: two that keep the matcher's, and its own
-_GROWN: Final = 1.02  # by so much has an estimate grown before it is looked at closely again
+_SHARED: Final = ("/memfd:", "/dev/shm/")  # noqa: S108 - how names of open files in memory begin
+_USUAL: Final = 3  # processes: two keepers, and the matcher's own
+_GROWN: Final = 1.02  # growth of an estimate before it is measured exactly again
 _MAPPING: Final = re.compile(
     rb"[0-9a-f]+-[0-9a-f]+ \S{4} [0-9a-f]+ (?P<major>[0-9a-f]+):(?P<minor>[0-9a-f]+) (?P<inode>\d+)"
 )
@@ -220,20 +203,10 @@ _BLOCK: Final = 512
 
 @dataclass(kw_only=True)
 class MemoryWatch:
-    """Looks at the memory of a process, and ends it when it takes more than it may.
+    """Measures the memory of a process, and ends it above a limit.
 
-    Parameters
-    ----------
-    process : subprocess.Popen
-        The outermost process.
-    most_bytes : int
-        What it may take.
-    kill : callable
-        Ends it and all that came from it.
-    scratch : Path
-        Its scratch folder, which may lie in memory.
-    group : Group, optional
-        Where the kernel counts, too.
+    `process` is the outermost one, `kill` ends it with all its descendants, `scratch` is its scratch folder, which may
+    lie in memory, and `group` the control group in which the kernel counts, too.
     """
 
     process: subprocess.Popen[bytes]
@@ -261,15 +234,15 @@ class MemoryWatch:
 
     @property
     def peak_bytes(self) -> int:
-        """Most memory that was found at once, by looking or by the kernel's own count."""
+        """Return the peak memory, measured or counted by the kernel."""
         return max(self._sampled, self.group.peak_bytes() if self.group else 0)
 
     def look(self) -> bool:
-        """Measure once; true if the memory exceeds the limit, or cannot be measured."""
+        """Measure once; return whether the memory exceeds the limit, or cannot be measured."""
         for _ in range(_TRIES):
             try:
                 return self._measure()
-            except Exception as error:  # noqa: BLE001 - what a process shows of itself is its own making
+            except Exception as error:  # noqa: BLE001 - a process controls what it shows of itself
                 fault = message_of(error)
                 time.sleep(_AGAIN_S)
         self.fault, self.is_over = fault, True
@@ -277,7 +250,7 @@ class MemoryWatch:
 
     @property
     def why(self) -> str:
-        """Return why the process was ended."""
+        """Return the reason for ending the process."""
         if self.fault:
             return f"its memory could not be looked at ({self.fault})"
         return f"takes more than the {self.most_bytes / 1e6:.0f} MB of memory that are allowed"
@@ -286,7 +259,7 @@ class MemoryWatch:
         family = _family(self.process.pid)
         shared = _shared(family, self.scratch)
         estimate = _resident_bytes(family) + shared.bytes
-        # Exact only where pages may count twice, and the sum says something new: it takes longer to find out.
+        # Exact, which takes longer, only where pages may count twice and the estimate has grown.
         if len(family) > _USUAL or shared.bytes or estimate > self.most_bytes:
             if estimate > max(self._estimated * _GROWN, self._sampled) or estimate > self.most_bytes:
                 self._estimated = estimate
@@ -307,7 +280,7 @@ class MemoryWatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Shared:
-    """A file in memory, mapped or not: its size, and its key in a list of mappings."""
+    """Files in memory by device and inode, with their sizes, and a scratch folder in memory."""
 
     sizes: Mapping[tuple[int, int], int]
     scratch_bytes: int = 0
@@ -315,7 +288,7 @@ class _Shared:
 
     @property
     def bytes(self) -> int:
-        """All of it, each once."""
+        """Return the size of all of it, each file once."""
         return sum(self.sizes.values()) + self.scratch_bytes
 
 
@@ -338,13 +311,13 @@ def _resident_bytes(family: Iterable[int]) -> int:
 
 
 def _shared(family: Sequence[int], scratch: Path) -> _Shared:
-    """Files in memory that some processes hold open, and their scratch folder if it lies in memory."""
+    """Find in-memory files that some processes hold open, and their scratch folder if it lies in memory."""
     sizes: dict[tuple[int, int], int] = {}
     used, device = 0, -1
     for number in family:
         try:
             for entry in os.scandir(f"/proc/{number}/fd"):
-                if os.readlink(entry.path).startswith(_SHARED):  # noqa: PTH115 - no file
+                if os.readlink(entry.path).startswith(_SHARED):  # noqa: PTH115 - not a path
                     found = entry.stat()
                     sizes[found.st_dev, found.st_ino] = found.st_blocks * _BLOCK
         except OSError:
@@ -359,8 +332,7 @@ def _shared(family: Sequence[int], scratch: Path) -> _Shared:
 def _scratch_in_memory(number: int, scratch: Path) -> tuple[int, int]:
     """Return device and used bytes of a process's scratch folder if it lies in memory, or else -1 and 0.
 
-    The path is looked up once: while a process enters its own root, it leads to the system's disk for a moment, whose
-    used space is nobody's memory.
+    Resolve the path once: while a process enters its root, it leads to the system's disk for a moment.
     """
     inside = os.open(f"/proc/{number}/root{scratch}", os.O_PATH | os.O_CLOEXEC)
     try:
@@ -374,7 +346,7 @@ def _scratch_in_memory(number: int, scratch: Path) -> tuple[int, int]:
 
 
 def _exact_bytes(family: Iterable[int], shared: _Shared) -> int:
-    """Memory of some processes; pages that several of them map, or that lie in a file in memory, count once."""
+    """Measure the memory of processes; pages that several map, or that lie in an in-memory file, count once."""
     total = shared.bytes
     for number in family:
         try:
@@ -385,7 +357,7 @@ def _exact_bytes(family: Iterable[int], shared: _Shared) -> int:
 
 
 def _mapped_bytes(smaps: bytes, shared: _Shared) -> int:
-    """Memory that a process maps by its `smaps`, but for what is shared; names of files may look like other lines."""
+    """Sum the memory that a process maps by its `smaps`, without shared files; names may look like other lines."""
     total, is_counted = 0, False
     for line in smaps.split(b"\n"):  # the kernel writes this one break in a name as \012, and no other
         if found := _MAPPING.match(line):

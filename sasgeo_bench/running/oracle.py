@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control that is given the truth, an upper bound for all matchers; no plugin can do this."""
+"""The control that is given the truth, an upper bound for all matchers; no plugin can be one."""
 
 import time
 from dataclasses import replace
@@ -28,13 +28,7 @@ _ISOLATION: Final = {"truth": "given, as this control needs it"}
 
 
 class Oracle:
-    """Answers with the truth, and withholds where the place is absent; runs where a `Worker` would.
-
-    Parameters
-    ----------
-    truth_folder : Path
-        Truths of the task whose queries are asked.
-    """
+    """Answers with the truths of a task, and withholds where the place is absent; runs in place of a `Worker`."""
 
     def __init__(self, truth_folder: Path) -> None:
         self.isolation = dict(_ISOLATION)
@@ -43,22 +37,16 @@ class Oracle:
         self._truths: dict[str, Truth] = {}
 
     def __enter__(self) -> Self:
-        """Nothing is started."""
+        """Start nothing."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing is left."""
+        """Leave nothing."""
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
-        """Read the truths.
-
-        Raises
-        ------
-        StoreError
-            If they are not here.
-        """
+        """Read the truths; raise `StoreError` if they are missing."""
         del region, learned
         if not (self._folder / task_files.TRUTH).is_file():
             message = f"{self._folder} holds no truths, and {ORACLE} answers with them: run it where they are"
@@ -82,7 +70,7 @@ class Oracle:
 
 
 def right_answer(query: Query, truth: Truth) -> Match:
-    """The one answer that is right: the true pose, the right candidate with true heading and scale, or none."""
+    """Return the right answer: the true pose, the right candidate with true heading and scale, or none."""
     if not truth.is_present or truth.pose is None:
         return WITHHELD
     pose = truth.pose

@@ -13,10 +13,9 @@ from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, rea
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.matching.results import STATUSES, Status, matcher_hash
-from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
-from sasgeo_bench.running.training_tasks import Lesson, plan_lesson
+from sasgeo_bench.running.training_tasks import TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import Split
@@ -26,8 +25,8 @@ MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
-_HIDDEN: Final = ("tasks", "truth", "runs", "boards", "release", "sheets")  # below a root: they tell truths
-_LATER_LIMITS: Final = ("scratch_bytes", "processes")  # they make another run only where somebody changes them
+_HIDDEN: Final = ("tasks", "truth", "runs", "boards", "release", "sheets")  # below a root: they reveal truths
+_LATER_LIMITS: Final = ("scratch_bytes", "processes")  # hashed only where they differ from the default
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 
 
@@ -35,41 +34,16 @@ _LEAST_MB, _MOST_MB = 64, 4_000_000
 class RunRequest:
     """Request for a run.
 
-    Parameters
-    ----------
-    spec : str
-        A matcher's name, or module:Class.
-    tasks : sequence of Path
-        Task folders, out/tasks/<suite>/<region>.
-    out : Path
-        Root; rows go to out/runs/<matcher>/<hash>/<suite>/<region>.
-    top_k : int
-        Poses asked of each query.
-    limits : Limits
-        What the matcher may take.
-    jobs : int
-        Processes at once.
-    dask : str, optional
-        Address of a dask scheduler, or local:N for N processes of this machine; then `jobs` is 1.
-    shard : tuple of int
-        (i, n), from 1: this run answers the i-th of n parts of the queries.
-    limit : int, optional
-        Queries of each task at most.
-    again : sequence of str
-        Statuses whose rows are asked again.
-    is_shut_in : bool
-        False runs code that is trusted without isolation, and says so.
-    train : sequence of Path
-        Task folders, with their truths beside them, that a matcher with a `learn` learns from before it is asked; of
-        places that are not asked.
-    most_trained : int
-        Queries to learn from at most: evenly over places, then suites, then sites.
-    split : Split, optional
-        Says what is one place, and how far from each other places to learn from and places that are asked must lie.
-    is_oracle : bool
-        Lets it learn from what it is asked, and be named as an oracle: a yardstick, never ranked.
-    hidden : sequence of Path
-        Files that the matcher must not see besides truths and the like, as that of a private seed.
+    `spec` is a matcher's name or module:Class; `tasks` are folders out/tasks/<suite>/<region>, whose rows go to
+    out/runs/<matcher>/<hash>/<suite>/<region> below `out`. `jobs` counts processes at once; `dask` is the address of a
+    scheduler, or local:N for N processes on this machine, with `jobs` 1. `shard` is (i, n), from 1: the i-th of n parts
+    of the queries; `limit` bounds the queries of each task. Rows with a status in `again` are asked again. Without
+    `is_shut_in`, trusted code runs without isolation, and `run.json` says so.
+
+    `train` are tasks with truths, of places that are not asked, for a matcher with a `learn`; `most_trained` bounds
+    their queries, evenly over places, then suites, then sites. `split` defines places and how far apart training and
+    test places must lie. An oracle (`is_oracle`) may train on what it is asked, and is never ranked. `hidden` are
+    files that the matcher must not see besides truths and the like, such as that of a private seed.
     """
 
     spec: str
@@ -92,11 +66,10 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunPart:
-    """One task of a run: its folder of rows, its map, its truths, and the queries that are left to ask.
+    """One task of a run: its folder of rows, its map, its truths, and its pending queries.
 
-    `about` is what `task.json` says, `asked` the hash of what each query that is left asks (`task_files.read_asked`)
-    and of what was learnt, and `aside` how many rows of the folder answer other queries than the task holds now, or
-    come of other learning.
+    `about` is the content of `task.json`; `asked` gives the hash that the row of each pending query carries
+    (`task_rows.asked_under`); `aside` counts rows of earlier queries or of other training.
     """
 
     task: Path
@@ -111,7 +84,7 @@ class RunPart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Learned:
+class TrainingResult:
     """Result of training: a text, or the status and one line of cause where there is none."""
 
     text: str | None = None
@@ -123,7 +96,7 @@ class Learned:
 class RunPlan:
     """Plan of a run, made after the plugin's card was read in its own process.
 
-    `lesson` is what a matcher that learns is to learn from, `learned` what came of it, None until it was tried.
+    `training_result` is None before training.
     """
 
     request: RunRequest
@@ -131,8 +104,8 @@ class RunPlan:
     hash: str
     parts: tuple[RunPart, ...]
     learns: bool = False
-    lesson: Lesson | None = None
-    learned: Learned | None = None
+    training_set: TrainingSet | None = None
+    training_result: TrainingResult | None = None
 
     @property
     def run_folder(self) -> Path:
@@ -142,33 +115,35 @@ class RunPlan:
     @property
     def key(self) -> str | None:
         """Hash that ties rows to the training result; None without training."""
-        return None if self.lesson is None else _key(self.lesson, self.learned)
+        return None if self.training_set is None else _key(self.training_set, self.training_result)
 
     @property
     def learned_file(self) -> Path | None:
         """Path of the learned text, which may not exist yet."""
-        return None if self.lesson is None else learned_path(self.run_folder, self.lesson.sha256)
+        return None if self.training_set is None else learned_path(self.run_folder, self.training_set.sha256)
 
     @property
-    def said(self) -> TrainingRecord | None:
+    def training_record(self) -> TrainingRecord | None:
         """Record of the training for `run.json`."""
-        if self.lesson is None or self.key is None or self.learned_file is None:
+        given, path = self.training_set, self.learned_file
+        if given is None or path is None:
             return None
-        has_text = self.learned is not None and self.learned.text is not None
-        file = self.learned_file.relative_to(self.run_folder).as_posix() if has_text else None
-        return TrainingRecord(key=self.key, file=file, trained_on=self.lesson.places, pairs=self.lesson.count)
+        has_text = self.training_result is not None and self.training_result.text is not None
+        file = path.relative_to(self.run_folder).as_posix() if has_text else None
+        key = _key(given, self.training_result)
+        return TrainingRecord(key=key, file=file, trained_on=given.places, pairs=given.count)
 
-    def lesson_lines(self) -> list[str]:
+    def training_lines(self) -> list[str]:
         """Describe the training in a line; no line if none was requested."""
-        if self.lesson is not None:
-            state = "to be learnt from" if self.learned is None else "has learnt from"
-            return [f"{state} {self.lesson.to_text()}"]
-        return ["does not learn: what there is to learn from is passed over"] if self.request.train else []
+        if self.training_set is not None:
+            state = "to be trained on" if self.training_result is None else "trained on"
+            return [f"{state} {self.training_set.to_text()}"]
+        return ["has no learn(): training data are ignored"] if self.request.train else []
 
     def to_text(self) -> str:
         """Describe the training, the pending and finished queries, and each of the first tasks in a line."""
         lines = [f"{self.card.name} {self.card.version} ({self.hash}), top {self.request.top_k}"]
-        lines += [f"  {line}" for line in self.lesson_lines()]
+        lines += [f"  {line}" for line in self.training_lines()]
         lines += [f"  {part.folder}: {_state((part,))}" for part in self.parts[:MOST_LINES]]
         if len(self.parts) > MOST_LINES:
             lines.append(f"  {len(self.parts) - MOST_LINES} more tasks: {_state(self.parts[MOST_LINES:])}")
@@ -192,7 +167,7 @@ def plan_run(request: RunRequest) -> RunPlan:
     MatchError
         If the plugin cannot be loaded or its card is not sound.
     ConfigError
-        If the shard or a number makes no sense, or there is nothing to learn from but what is asked (`plan_lesson`).
+        If the shard or a number is out of range, or the training set is refused (`plan_training`).
     StoreError
         If a task is missing, of another version, or its map is.
     """
@@ -201,47 +176,41 @@ def plan_run(request: RunRequest) -> RunPlan:
         tasks, train = ([task.resolve() for task in folders] for folders in (request.tasks, request.train))
         request = replace(request, out=request.out.resolve(), tasks=tasks, train=train)
     if ":" not in request.spec:
-        list_entry_points()  # a clash of names is told here: what the plugin's own process prints is not shown
+        list_entry_points()  # warns of a clash of names: what the plugin's own process prints is not shown
     abouts = {folder: task_files.read_task(folder) for folder in request.tasks}
     card, code, learns = _card(request)
     limits = _hashed(request.limits, learns=learns)
-    said = {"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}
-    settings = json.dumps(said, sort_keys=True)
+    settings = json.dumps({"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    lesson = learned = None
+    training_set = result = None
     if learns and request.train:
-        apart = () if request.is_oracle else request.tasks
-        lesson = plan_lesson(request.train, asked=apart, split=request.split, most=request.most_trained)
-        text = read_learned(learned_path(_run_folder(request, card, found), lesson.sha256))
-        learned = None if text is None else Learned(text=text)
-    key = None if lesson is None else _key(lesson, learned)
+        asked = () if request.is_oracle else request.tasks
+        training_set = plan_training(request.train, asked=asked, split=request.split, most=request.most_trained)
+        text = read_learned(learned_path(_run_folder(request, card, found), training_set.sha256))
+        result = None if text is None else TrainingResult(text=text)
+    key = None if training_set is None else _key(training_set, result)
     parts = tuple(_part(request, card, found, key, *item) for item in abouts.items())
-    return RunPlan(request=request, card=card, hash=found, parts=parts, learns=learns, lesson=lesson, learned=learned)
+    return RunPlan(
+        request=request,
+        card=card,
+        hash=found,
+        parts=parts,
+        learns=learns,
+        training_set=training_set,
+        training_result=result,
+    )
 
 
 def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
-    """Limits that make a run another one."""
-    passed = {name for name in _LATER_LIMITS if getattr(limits, name) == getattr(Limits(), name)}
-    passed |= set() if learns else {"learn_s"}
-    return {name: value for name, value in asdict(limits).items() if name not in passed}
+    """Return the limits that are part of a run's hash."""
+    left_out = {name for name in _LATER_LIMITS if getattr(limits, name) == getattr(Limits(), name)}
+    left_out |= set() if learns else {"learn_s"}
+    return {name: value for name, value in asdict(limits).items() if name not in left_out}
 
 
-def with_learned(plan: RunPlan, learned: Learned) -> RunPlan:
-    """The same plan with what came of learning: only answers under it are done.
-
-    Parameters
-    ----------
-    plan : RunPlan
-        One with a lesson.
-    learned : Learned
-        What came of it.
-
-    Raises
-    ------
-    StoreError
-        As `plan_run` does.
-    """
-    plan = replace(plan, learned=learned)
+def with_training_result(plan: RunPlan, result: TrainingResult) -> RunPlan:
+    """Return the plan with a training result: only answers given under it count as done. Raise as `plan_run` does."""
+    plan = replace(plan, training_result=result)
     parts = tuple(_part(plan.request, plan.card, plan.hash, plan.key, part.task, part.about) for part in plan.parts)
     return replace(plan, parts=parts)
 
@@ -250,11 +219,11 @@ def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
     return request.out / "runs" / card.name / found
 
 
-def _key(lesson: Lesson, learned: Learned | None) -> str:
-    """Hash of the text that was learnt; where there is none, of what it was to be learnt from."""
-    text = None if learned is None else learned.text
-    said = f"nothing yet from {lesson.sha256}" if text is None else text
-    return hashlib.sha256(said.encode()).hexdigest()
+def _key(training_set: TrainingSet, result: TrainingResult | None) -> str:
+    """Return the hash of the learned text or, where there is none, of the training set."""
+    text = None if result is None else result.text
+    hashed = f"nothing yet from {training_set.sha256}" if text is None else text
+    return hashlib.sha256(hashed.encode()).hexdigest()
 
 
 def _check(request: RunRequest) -> None:
@@ -283,7 +252,7 @@ def _check(request: RunRequest) -> None:
         message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"
         raise ConfigError(message)
     if request.dask is not None and request.jobs != 1:
-        message = "--jobs and --dask both say how many processes there are: leave one of them out"
+        message = "--jobs and --dask both set the number of processes: leave one of them out"
         raise ConfigError(message)
 
 
@@ -296,36 +265,35 @@ def _check_sizes(limits: Limits) -> None:
 
 
 def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
-    """A plugin's card, the hash of its code, and whether it learns, told by its own process."""
+    """Return a plugin's card, the hash of its code, and whether it learns, as its own process reports them."""
     if request.spec == ORACLE:
         return CARD, "", False
     with Worker(spec=request.spec, reach=reach_of(request, ()), limits=request.limits) as worker:
         reply = worker.load()
     if reply.status != "ok" or reply.card is None:
-        said = reply.message or "the plugin says nothing of itself"
-        raise MatchError(said if request.spec in said else f"{request.spec}: cannot be made ({said})")
+        cause = reply.message or "the plugin has no card"
+        raise MatchError(cause if request.spec in cause else f"{request.spec}: cannot be made ({cause})")
     check_card_name(request.spec, reply.card.name, is_oracle=request.is_oracle)
     return reply.card, reply.code, reply.learns
 
 
 def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
-    """Some maps may be read; other maps, all queries, truths, and whatever other runs wrote, may not."""
-    folders = (*request.tasks, *request.train)
-    roots = {folder.resolve().parent.parent.parent for folder in folders} | {request.out.resolve()}
+    """Let a matcher read some maps; hide other maps, all queries and truths, and the output of other runs."""
+    roots = {root_of(folder) for folder in (*request.tasks, *request.train)} | {request.out.resolve()}
     readable = [region.resolve() for region in regions]
     hidden = [root / name for root in sorted(roots) for name in _HIDDEN]
-    # A release that lies where others are written is hidden too, unless it is itself what is run on.
+    # A release next to other output is hidden too, unless its own map is the one in question.
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
-    # Other dates of a place, and the map that a twin was edited from, would give the world away.
+    # Other dates of a place, and the map that a twin was edited from, would reveal the changes.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
     hidden += [*(path for path in maps if path not in readable), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
 
 
 def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
-    """Tasks in groups that one process may answer: those on the same map, and no other date or edit of its place.
+    """Group tasks that one process may answer: those on the same map, and no other date or edit of its place.
 
-    The control that is given the truth is given that of one task at a time.
+    The control that is given the truth gets that of one task at a time.
     """
     groups: dict[Path, list[RunPart]] = {}
     for part in parts:
@@ -336,56 +304,41 @@ def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
 def _part(
     request: RunRequest, card: MatcherCard, found: str, key: str | None, task: Path, about: Mapping[str, Any]
 ) -> RunPart:
+    """Find the pending queries of a task; refuse folders that hold other answers, and a map built anew since."""
     folder = _run_folder(request, card, found) / about["suite"] / about["region"]
     before = prediction_files.read_run(folder)
     if before is not None and before.get("hash") != found:
         message = f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away"
         raise StoreError(message)
     task_files.check_queries(task)
-    root = task.resolve().parent.parent.parent
-    if task_files.PRIVATE in about and request.out.resolve() != root:
+    if task_files.PRIVATE in about and request.out.resolve() != root_of(task):
         message = f"{task} is of a private seed, whose answers stay beside it: say --out {task.parent.parent.parent}"
         raise ConfigError(message)
-    region = root / "regions" / about["region"]
-    if not task_files.is_of_map(about, read_manifest(region)):
-        message = f"{region} was built anew since the queries of {task} were made: make them again"
-        raise StoreError(message)
-    asked = {name: asked_under(said, key) for name, said in task_files.read_asked(task).items()}
+    region = map_of(task, about)
+    asked = {name: asked_under(one, key) for name, one in task_files.read_asked(task).items()}
     ties = prediction_files.read_ties(folder) if folder.is_dir() else []
-    _check_old(folder, ties, before, task, about)
-    index, count = request.shard
-    mine = [name for name in asked if _shard_of(name, count) == index - 1]
-    mine = mine if request.limit is None else mine[: request.limit]
-    done = {tie.query_id for tie in ties if tie.status not in request.again and tie.answers(asked)}
-    left = tuple(name for name in mine if name not in done)
-    return RunPart(
-        task=task,
-        about=about,
-        folder=folder,
-        region=region,
-        truth=root / "truth" / about["suite"] / about["region"],
-        left=left,
-        asked={name: asked[name] for name in left},
-        done=len(mine) - len(left),
-        aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
-    )
-
-
-def _check_old(
-    folder: Path,
-    ties: Sequence[prediction_files.Tie],
-    before: Mapping[str, Any] | None,
-    task: Path,
-    about: Mapping[str, Any],
-) -> None:
-    """Refuse rows that do not say what they answer, unless `run.json` says that it is this very task."""
-    is_said = all(tie.asked for tie in ties)
-    if not is_said and (before or {}).get("queries_sha256") != about["files"][task_files.QUERIES]["sha256"]:
+    is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
+    if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
         message = (
             f"{folder} holds answers of an older version, and not to the queries that {task} holds now: "
             "move it away and run again"
         )
         raise StoreError(message)
+    index, count = request.shard
+    own = [name for name in asked if _shard_of(name, count) == index - 1][: request.limit]
+    done = {tie.query_id for tie in ties if tie.status not in request.again and tie.answers(asked)}
+    left = tuple(name for name in own if name not in done)
+    return RunPart(
+        task=task,
+        about=about,
+        folder=folder,
+        region=region,
+        truth=truth_of(task, about),
+        left=left,
+        asked={name: asked[name] for name in left},
+        done=len(own) - len(left),
+        aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
+    )
 
 
 def _shard_of(query_id: str, count: int) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of `part-*.parquet`: their schema, predictions to and from it, and what is wrong with rows of others."""
+"""Rows of `part-*.parquet`: their schema, conversion to and from predictions, and faults of untrusted rows."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,17 +44,11 @@ PART_SCHEMA: Final = RUN_SCHEMA.append(pa.field(MATCHER_S, pa.float64()))  # of 
 
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
-    """One prediction as a row of `PREDICTION_SCHEMA`."""
+    """Return a prediction as a row of `PREDICTION_SCHEMA`."""
     return {
         "query_id": prediction.query_id,
         "candidates": [
-            {
-                "easting_m": pose.easting_m,
-                "northing_m": pose.northing_m,
-                "yaw_deg": pose.yaw_deg,
-                "scale": pose.scale,
-                "score": score,
-            }
+            {**{name: getattr(pose, name) for name in POSE_FIELDS}, "score": score}
             for pose, score in prediction.candidates
         ],
         "confidence": prediction.confidence,
@@ -67,7 +61,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
 
 
 def prediction_of(row: Mapping[str, Any]) -> Prediction:
-    """Inverse of `prediction_row`; whatever else a candidate holds is passed over."""
+    """Invert `prediction_row`; ignore further fields of a candidate."""
     poses = tuple(
         (Pose(**{name: item[name] for name in POSE_FIELDS}), item["score"]) for item in row["candidates"] or ()
     )
@@ -75,7 +69,7 @@ def prediction_of(row: Mapping[str, Any]) -> Prediction:
 
 
 def predictions_of(table: pa.Table) -> list[Prediction]:
-    """Predictions of a table in which `row_faults` finds nothing, last first; by columns, which is faster."""
+    """Return the predictions of a table without `row_faults`, last first; by columns, which is faster."""
     column = table["candidates"].combine_chunks()
     if not len(table):
         return []
@@ -102,12 +96,10 @@ def _with_candidates(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float
 
 
 def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
-    """Columns that a table of predictions must hold and this one does not: their names, what is found, and expected.
+    """Return the columns that a table of predictions lacks or has of another type: name, found and expected type.
 
-    More columns, in any order, do no harm.
+    Further columns, in any order, are no difference.
 
-    Examples
-    --------
     >>> differing_columns(PREDICTION_SCHEMA.empty_table().drop_columns(["message"]))
     [('message', 'nothing', 'string')]
     """
@@ -121,7 +113,7 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
     ]
 
 
-# --- rows that anybody may have written -------------------------------------------------------------------------------
+# --- untrusted rows ---------------------------------------------------------------------------------------------------
 
 Mask = NDArray[np.bool_]
 _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
@@ -138,22 +130,9 @@ class RowFault:
 
 
 def row_faults(table: pa.Table) -> Iterator[RowFault]:
-    """Hold every number, name and text of some rows to the bounds of an answer (`bounds`).
+    """Check every number, name and text of rows against the bounds of an answer (`bounds`).
 
-    Parameters
-    ----------
-    table : pyarrow.Table
-        With all columns of predictions (`differing_columns` finds nothing).
-
-    Yields
-    ------
-    RowFault
-        By column, then by row.
-
-    Examples
-    --------
-    >>> list(row_faults(PREDICTION_SCHEMA.empty_table()))
-    []
+    The table must have all columns of predictions. Faults come by column, then by row.
     """
     if not len(table):
         return
@@ -173,7 +152,7 @@ def _faults(column: str, is_wrong: Mask, shown: Sequence[object], expected: str)
 
 
 def _numbers(column: pa.ChunkedArray | pa.Array) -> NDArray[np.float64]:
-    """Values of a column; NaN for null."""
+    """Return the values of a column; NaN for null."""
     return np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
 
 
@@ -183,7 +162,7 @@ def _is_within(name: str, values: NDArray[np.float64]) -> Mask:
 
 
 def _of_texts(table: pa.Table) -> Iterator[RowFault]:
-    """Names and statuses that are there and known; messages that are lines."""
+    """Check that names and statuses are known, and messages are lines."""
     for name, is_sound, expected in (
         ("query_id", bool, "the id of a query"),
         ("status", STATUSES.__contains__, ", ".join(STATUSES)),
@@ -196,14 +175,14 @@ def _of_texts(table: pa.Table) -> Iterator[RowFault]:
 
 
 def _texts(column: pa.ChunkedArray | pa.Array) -> tuple[list[str], NDArray[np.int64]]:
-    """Each text once, and which of them stands in each row; -1 for null."""
+    """Return each text once, and the index of the text of each row; -1 for null."""
     whole = column.cast(pa.string())
     coded = (whole.combine_chunks() if isinstance(whole, pa.ChunkedArray) else whole).dictionary_encode()
     return coded.dictionary.to_pylist(), coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
-    """A list in every row, of at most so many, each with all its numbers."""
+    """Check that every row has a list, not too long, of complete candidates."""
     whole = column.combine_chunks()
     is_null = np.asarray(whole.is_null())
     yield from _faults("candidates", is_null, ["null"] * len(whole), "a list, empty where there is no pose")
@@ -224,7 +203,7 @@ def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
 
 
 def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
-    """At most so many in a row, each name a line and there once, each number within its bounds."""
+    """Check the number of diagnostics of each row, their names, each a line that is there once, and their numbers."""
     whole = column.cast(_PAIRS).combine_chunks()
     rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
     counts = np.bincount(rows, minlength=len(whole))
@@ -248,6 +227,6 @@ def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
 
 
 def _firsts(column: str, rows: NDArray[np.int64], shown: Sequence[str], expected: str) -> Iterator[RowFault]:
-    """The first fault of each row among those of its items."""
+    """Yield the first fault of each row among those of its items."""
     for row, at in zip(*np.unique(rows, return_index=True), strict=True):
         yield RowFault(row=int(row), column=column, found=shown[at][: 2 * MOST_NAME], expected=expected)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers of a matcher's process, held to one schema before anything is made of them: the process is not trusted."""
+"""Parse the answers of a matcher's process against one schema: the process is not trusted."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,10 +30,10 @@ _SHOWN: Final = 60  # characters of where a fault is
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """Reply to a question: status, cause as one line, seconds by the runner's clock, answer.
+    """Reply to a question, with its status, and its cause in one line.
 
-    Of the process itself: seconds by its own clock, and of its processors. Of a plugin that was loaded: its card, a
-    hash of its code, and whether it has a `learn`; of a map: by how much memory grew; of a lesson: what was learnt.
+    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns `card`,
+    the hash `code` and whether the plugin `learns`; preparing, by how much memory grew; training, the `learned` text.
     """
 
     status: Status
@@ -56,7 +56,7 @@ def _line(text: str) -> str:
     return text
 
 
-def _bounded(name: str) -> Any:  # noqa: ANN401 - what pydantic knows a number by
+def _bounded(name: str) -> Any:  # noqa: ANN401 - a field of pydantic
     least, most = BOUNDS[name]
     return Field(ge=least, le=most)
 
@@ -119,11 +119,11 @@ class _Loaded(_Strict):
 
     def reply(self) -> Reply:
         """Return the reply for the runner."""
-        said: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
-        return Reply(status="ok", card=MatcherCard(**said), code=self.code, learns=self.learns)
+        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
+        return Reply(status="ok", card=MatcherCard(**fields), code=self.code, learns=self.learns)
 
 
-class _Learnt(_Strict):
+class _Trained(_Strict):
     status: Literal["ok"]
     seconds: Seconds
     learned: str
@@ -167,42 +167,25 @@ class _Matched(_Strict):
         return Reply(status="ok", own_s=self.seconds, cpu_s=self.cpu_s, match=match)
 
 
-_KINDS: Final[Mapping[str, type[_Loaded | _Learnt | _Prepared | _Matched]]] = {
+_KINDS: Final[Mapping[str, type[_Loaded | _Trained | _Prepared | _Matched]]] = {
     "load": _Loaded,
-    "learn": _Learnt,
+    "learn": _Trained,
     "prepare": _Prepared,
     "match": _Matched,
 }
 
 
-def read_reply(kind: str, said: Mapping[str, Any], *, nonce: str) -> Reply:
-    """Read a message as the reply to a question.
+def read_reply(kind: str, given: Mapping[str, Any], *, nonce: str) -> Reply:
+    """Read a JSON message as the reply to a question of a kind: "load", "learn", "prepare" or "match".
 
-    Parameters
-    ----------
-    kind : {"load", "learn", "prepare", "match"}
-        Of the question.
-    said : mapping
-        The message, out of JSON.
-    nonce : str
-        Of the question: only an answer that was made after it can have it.
+    `nonce` is that of the question, so that no answer can be made before it. Raise `MatchError`, in one line, if the
+    message is no answer to the question.
 
-    Raises
-    ------
-    MatchError
-        If it is no answer to the question; in one line.
-
-    Examples
-    --------
-    >>> said = {"nonce": "7", "status": "crash", "message": "ValueError: no index today"}
-    >>> read_reply("match", said, nonce="7").message
+    >>> given = {"nonce": "7", "status": "crash", "message": "ValueError: no index today"}
+    >>> read_reply("match", given, nonce="7").message
     'ValueError: no index today'
-    >>> read_reply("match", said, nonce="8")
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.MatchError: it was not made for this question
     """
-    content = dict(said)
+    content = dict(given)
     if content.pop("nonce", None) != nonce:
         message = "it was not made for this question"
         raise MatchError(message)

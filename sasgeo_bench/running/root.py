@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: PTH102, PTH103, PTH110, PTH112, PTH114, PTH115, PTH120, PTH123, PTH208, PTH211
-# No pathlib before the door is shut: it takes its time to load.
-"""A root of its own for a matcher's process: what it needs, read only, and one folder of limited size to write in.
+# Without pathlib, which is slow to load: this runs before the sandbox is closed.
+"""A private root for a matcher's process: the files it needs, read only, and one scratch folder of limited size.
 
 Everything here happens in a mount namespace of its own; the system's mounts stay as they are.
 """
@@ -21,45 +21,27 @@ MS_REMOUNT: Final = 0x20
 MS_BIND: Final = 0x1000
 MS_REC: Final = 0x4000
 MS_UNBINDABLE: Final = 0x20000
-_DETACH: Final = 2  # umount2: now, whoever uses it
+_DETACH: Final = 2  # umount2: at once, even if in use
 _MOST_LINKS: Final = 40  # as the kernel follows
 
 SYSTEM: Final = (
     *("/usr", "/lib", "/lib64", "/lib32", "/bin", "/sbin", "/etc", "/opt", "/nix"),
-    *(
-        "/proc",
-        "/sys/devices/system",
-    ),  # processors and memory, which libraries look up; nothing of the network or discs
+    *("/proc", "/sys/devices/system"),  # of /sys processors and memory, which libraries read; no network, no disks
 )
 DEVICES: Final = ("/dev/null", "/dev/zero", "/dev/random", "/dev/urandom", "/dev/full")
 SHARED_MEMORY: Final = "/dev/shm"  # noqa: S108 - a name for the scratch folder, where shared memory and semaphores go
 _STREAMS: Final = {"fd": "fd", "stdin": "fd/0", "stdout": "fd/1", "stderr": "fd/2"}
-# Of an import path that is the root of all folders: what is not code, and other people's.
+# Folders of the system's root that hold no code, or other users' files, where the import path includes that root.
 _NOT_CODE: Final = frozenset(
-    {
-        *("dev", "proc", "sys", "run", "tmp", "var", "home", "root", "mnt", "media", "srv", "boot", "lost+found"),
-    }
+    ("dev", "proc", "sys", "run", "tmp", "var", "home", "root", "mnt", "media", "srv", "boot", "lost+found")
 )
 
 
 def enter_root(scratch: str, *, shown: Iterable[str], hidden: Sequence[str], scratch_bytes: int) -> bool:
-    """Leave the system's root for one that holds the system's programs and what is shown, all of it read only.
+    """Enter a private root with the system's programs and the `shown` paths, read only; return False if refused.
 
-    Parameters
-    ----------
-    scratch : str
-        An empty folder, resolved: at its path lies the only folder that can be written, in memory.
-    shown : iterable of str
-        Folders and files besides the system's.
-    hidden : sequence of str
-        Resolved folders and files within them that are covered by nothing.
-    scratch_bytes : int
-        What the scratch folder can hold.
-
-    Returns
-    -------
-    bool
-        False where the kernel refuses; then all is as it was.
+    At the path of `scratch`, an empty resolved folder, lies the only writable folder: in memory, of `scratch_bytes`.
+    The resolved `hidden` paths are covered by empty mounts. If the kernel refuses, everything stays as it was.
     """
     try:
         kernel.mount("none", scratch, "tmpfs", MS_NOSUID | MS_NODEV, "size=1m,nr_inodes=8k,mode=755")
@@ -82,13 +64,13 @@ def enter_root(scratch: str, *, shown: Iterable[str], hidden: Sequence[str], scr
 
 
 def has_own_proc() -> bool:
-    """True if /proc shows our own process namespace."""
+    """Return whether /proc shows our own process namespace."""
     return os.readlink("/proc/self") == str(os.getpid())
 
 
 def _fill(new: str, *, shown: Iterable[str], hidden: Sequence[str]) -> None:
-    """Bind the system and what is shown, cover what is hidden in them, and add devices and processes."""
-    # Whatever is bound that holds the new root must not hold it a second time.
+    """Bind the system and the shown paths, cover the hidden ones, and add devices and processes."""
+    # A bind that contains the new root must not contain it a second time.
     kernel.mount("none", new, None, MS_UNBINDABLE)
     links: dict[str, str] = {}
     real = [_resolve(path, links) for path in [*SYSTEM, *shown] if os.path.exists(path) and path != "/proc"]

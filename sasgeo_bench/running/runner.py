@@ -14,9 +14,9 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files, prediction_rows
-from sasgeo_bench.running.answers import Cost, Watch, answer, pool_costs
+from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map
-from sasgeo_bench.running.training import taught
+from sasgeo_bench.running.training import trained
 from sasgeo_bench.tasks import task_files
 
 if TYPE_CHECKING:
@@ -24,25 +24,17 @@ if TYPE_CHECKING:
 
 _CONNECT_S: Final = 10.0
 _CHUNKS_PER_THREAD: Final = 4  # so that the last ones end at about the same time
-_LEAST_QUERIES, _MOST_QUERIES = 8, 256  # of a chunk: each begins by preparing the map
+_MOST_QUERIES: Final = 256  # of a chunk, which has `LEAST_ITEMS` at least
 
 
 @contextmanager
 def connected(address: str) -> Iterator["Client"]:
-    """A client of a scheduler, or of one with N processes on this machine for local:N.
+    """Yield a client of a dask scheduler at tcp://host:port, or of N processes on this machine for local:N.
 
-    Parameters
-    ----------
-    address : str
-        As in tcp://10.0.0.5:8786, or local:4.
-
-    Raises
-    ------
-    ConfigError
-        If dask is not installed, the address makes no sense, or nobody answers there.
+    Raise `ConfigError` if dask is not installed, the address is wrong, or no scheduler answers there.
     """
     try:
-        from distributed import Client, LocalCluster  # noqa: PLC0415 - an extra: only whoever asks for it needs it
+        from distributed import Client, LocalCluster  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
         message = "--dask needs the package distributed: pip install 'sasgeo-bench[dask]'"
         raise ConfigError(message) from error
@@ -52,7 +44,7 @@ def connected(address: str) -> Iterator["Client"]:
             message = f"--dask must be local:N with N >= 1, or a scheduler's address, got {address!r}"
             raise ConfigError(message)
         with (
-            # One thread each: a chunk waits for one matcher's process. No dashboard: nobody asked for an open port.
+            # One thread each: a chunk waits for one matcher's process. No dashboard: it would open a port.
             LocalCluster(
                 n_workers=int(count),
                 threads_per_worker=1,
@@ -74,27 +66,11 @@ def connected(address: str) -> Iterator["Client"]:
 
 
 def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iterator[tuple[int, int, Cost]]:
-    """Ask everything that is left on a cluster.
+    """Ask all pending queries on a cluster whose workers all reach the same folders and have the plugin.
 
-    Parameters
-    ----------
-    client : distributed.Client
-        From `connected`. All its workers must reach the same folders, and have the plugin installed.
-    plan : RunPlan
-        From `plan_run`.
-    parts : sequence of RunPart
-        Tasks with queries left.
-
-    Yields
-    ------
-    tuple of int, int, Cost
-        As each chunk is done: the number of its part, its queries, and what it took. A chunk whose dask worker dies is
-        given to another, which asks only what has no row yet.
-
-    Raises
-    ------
-    StoreError
-        If a chunk's dask workers died again and again; the rows that were written stay.
+    Yields for each chunk that is done the number of its part, its queries, and its cost. A chunk whose dask worker
+    dies is given to another, which asks only queries without a row. Raises `StoreError` if the workers of a chunk die
+    again and again; written rows stay.
     """
     from distributed import KilledWorker, as_completed  # noqa: PLC0415
 
@@ -116,27 +92,25 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
 
 
 def _chunks(ids: Sequence[str], threads: int) -> Iterator[tuple[str, ...]]:
-    """Ids in chunks, several for each thread."""
+    """Split ids into chunks, several for each thread."""
     size = -(-len(ids) // (threads * _CHUNKS_PER_THREAD))
-    size = min(max(size, _LEAST_QUERIES), _MOST_QUERIES)
+    size = min(max(size, LEAST_ITEMS), _MOST_QUERIES)
     for start in range(0, len(ids), size):
         yield tuple(ids[start : start + size])
 
 
 def _answer_chunk(plan: RunPlan, part: RunPart) -> Cost:
-    """Ask one chunk in the process of a dask worker; what an earlier try of it has written is not asked again."""
-    done = prediction_files.ids_done(part.folder, part.asked, again=plan.request.again)
-    left = tuple(name for name in part.left if name not in done)
-    return answer(plan, [replace(part, left=left)], jobs=1, watch=Watch())
+    """Ask one chunk in the process of a dask worker, except queries that an earlier try of it has answered."""
+    return answer(plan, _still_left(plan, [part]), jobs=1, watch=Watch())
 
 
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
-_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # what earlier runs took, as run.json says it
+_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # of earlier runs, in run.json
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunReport:
-    """Rows that a run has added by status, the first message of each status without an answer, and the folders."""
+    """Rows that a run has added by status, the first message of each other status than ok, and the folders."""
 
     counts: dict[str, int]
     messages: dict[str, str]
@@ -144,53 +118,37 @@ class RunReport:
 
 
 def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunReport:
-    """Ask every pending query.
-
-    Parameters
-    ----------
-    plan : RunPlan
-        From `plan_run`.
-    tell : callable
-        Gets a line now and then.
-    progress : Progress, optional
-        Is told of every row; lines by `tell` unless given.
-
-    Returns
-    -------
-    RunReport
-        What was added.
+    """Ask every pending query of a plan; `tell` gets the progress as lines unless `progress` is given.
 
     Raises
     ------
     StoreError
-        If rows cannot be written; those that were stay, and a second run goes on there.
+        If rows cannot be written; those that were stay, and a second run continues there.
     ConfigError
-        If a cluster was named that is not there.
+        If a named cluster is not there.
     """
     progress = progress or Lines(tell)
-    for line in plan.lesson_lines() if plan.lesson is None else ():
+    for line in plan.training_lines() if plan.training_set is None else ():
         tell(f"{plan.card.name}: {line}")
-    plan = taught(plan, tell=tell)
+    plan = trained(plan, tell=tell)
     _tell_state(plan, tell)
     for part in plan.parts:
         if not part.left and part.done and prediction_files.read_key(part.folder) != plan.key:
             with locked(part.folder, tell=tell):
-                _begin(plan, part)  # answers under what was learnt before count again: `run.json` says which
+                _begin(plan, part)  # answers under an earlier training count again: `run.json` says which
     parts = [part for part in plan.parts if part.left]
     if parts:
         progress.begin(plan.card.name, sum(len(part.left) for part in parts))
-    costs: list[Cost] = []
     if plan.request.dask is not None and parts:
-        costs += _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
+        costs = _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
     else:
-        costs += _run_here(plan, parts, tell, progress)
+        costs = _run_here(plan, parts, tell, progress)
     pooled = pool_costs(costs)
-    folders = tuple(part.folder for part in plan.parts)
-    return RunReport(counts=pooled.counts, messages=pooled.messages, folders=folders)
+    return RunReport(counts=pooled.counts, messages=pooled.messages, folders=tuple(part.folder for part in plan.parts))
 
 
 def _tell_state(plan: RunPlan, tell: Tell) -> None:
-    """Say what is done already: of a few tasks which, of many how many; and what of the rows is not asked for."""
+    """Tell the finished tasks, by name if they are few, and how many rows answer other queries."""
     whole = [part for part in plan.parts if not part.left]
     if len(whole) > MOST_LINES:
         tell(f"{plan.card.name}: nothing left in {len(whole)} of {len(plan.parts)} tasks")
@@ -199,9 +157,9 @@ def _tell_state(plan: RunPlan, tell: Tell) -> None:
             tell(f"{part.folder}: nothing left, {part.done} done")
     aside = sum(part.aside for part in plan.parts)
     if aside:
-        others = "" if plan.lesson is None else ", or of other learning"
-        said = f"{counted(aside, 'answer')} to queries that these tasks do not hold now{others}, set aside"
-        tell(f"{plan.card.name}: {said}")
+        others = "" if plan.training_set is None else ", or of other learning"
+        rows = counted(aside, "answer")
+        tell(f"{plan.card.name}: {rows} to queries that these tasks do not hold now{others}, set aside")
 
 
 def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
@@ -217,7 +175,7 @@ def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progres
 
 
 def _batches(groups: Sequence[Sequence[RunPart]]) -> Iterator[list[RunPart]]:
-    """Tasks that are locked together: those of some maps, never of half a one."""
+    """Group tasks that are locked together: those of some maps, all tasks of a map in one group."""
     batch: list[RunPart] = []
     for group in groups:
         if batch and len(batch) + len(group) > MOST_LOCKED:
@@ -246,7 +204,7 @@ def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
 
 
 class _Notes(Watch):
-    """Keeps `run.json` of each task, and tells of each row; progress is told by one thread at a time."""
+    """Keeps `run.json` of each task, and reports each row to `progress`, by one thread at a time."""
 
     def __init__(self, plan: RunPlan, progress: Progress) -> None:
         self._plan, self._progress = plan, progress
@@ -254,19 +212,19 @@ class _Notes(Watch):
         self._before: dict[Path, Cost] = {}
 
     def begin(self, part: RunPart) -> None:
-        """Say that a task begins."""
+        """Write `run.json` as a task begins."""
         with self._lock:
             self._before[part.folder] = _begin(self._plan, part)
 
     def advance(self, part: RunPart) -> None:
-        """Tell of a row."""
-        del part  # progress is told of the whole matcher: a task may be too short for a pace
+        """Report a row of the matcher as a whole: a task may be too short for a pace."""
+        del part
         with self._lock:
             self._progress.advance(self._plan.card.name, 1)
 
     def end(self, part: RunPart, cost: Cost) -> None:
-        """Write what it took."""
-        _say(self._plan, part, cost, self._before[part.folder])
+        """Write the cost of the task."""
+        _write_run(self._plan, part, cost, self._before[part.folder])
 
 
 def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
@@ -283,34 +241,34 @@ def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tel
             left[number] -= count
             progress.advance(plan.card.name, count)
             if not left[number]:
-                _say(plan, parts[number], pool_costs(costs[number]), before[number])
+                _write_run(plan, parts[number], pool_costs(costs[number]), before[number])
     return [pool_costs(items) for items in costs]
 
 
 def _begin(plan: RunPlan, part: RunPart) -> Cost:
-    """Say that a task begins; what earlier runs of it took."""
-    said = prediction_files.read_run(part.folder) or {}
-    wrong = next((name for name in _COSTS if not isinstance(said.get(name), int | float | None)), None)
+    """Write `run.json` as a task begins; return the cost of earlier runs of it."""
+    recorded = prediction_files.read_run(part.folder) or {}
+    wrong = next((name for name in _COSTS if not isinstance(recorded.get(name), int | float | None)), None)
     if wrong is not None:
         path = part.folder / prediction_files.RUN
         message = f"{path} is damaged ({wrong} is no number): remove it and run again, the parts beside it are kept"
         raise StoreError(message)
     before = Cost(
-        prepare_s=said.get("prepare_s"),
-        index_bytes=said.get("index_bytes"),
-        cpu_s=said.get("cpu_s", 0.0),
-        peak_bytes=said.get("peak_bytes", 0),
-        isolation=said.get("isolation", {}),
+        prepare_s=recorded.get("prepare_s"),
+        index_bytes=recorded.get("index_bytes"),
+        cpu_s=recorded.get("cpu_s", 0.0),
+        peak_bytes=recorded.get("peak_bytes", 0),
+        isolation=recorded.get("isolation", {}),
     )
-    _say(plan, part, before, Cost())
+    _write_run(plan, part, before, Cost())
     return before
 
 
-def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
+def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: the run, and its cost together with that of earlier runs."""
     about = part.about
-    told: dict[str, Any] = asdict(pool_costs([before, cost]))
-    del told["counts"], told["messages"]
+    cost_fields: dict[str, Any] = asdict(pool_costs([before, cost]))
+    del cost_fields["counts"], cost_fields["messages"]
     prediction_files.write_run(
         part.folder,
         {
@@ -326,9 +284,9 @@ def _say(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
             "top_k": plan.request.top_k,
             "limits": asdict(plan.request.limits),
             "warm_up": "one query of each process is asked twice and timed the second time",
-            "learned": None if plan.said is None else asdict(plan.said),
+            "learned": None if plan.training_record is None else asdict(plan.training_record),
             "map_bytes": sum(path.stat().st_size for path in part.region.iterdir() if path.is_file()),
-            **told,
+            **cost_fields,
             "licence": LICENCE,
             "attribution": ATTRIBUTION,
         },

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shut a matcher's process in: namespaces, Landlock and seccomp where the system has them; what it lacks is said.
+"""Isolate a matcher's process by namespaces, Landlock and seccomp where the system has them; report what it lacks.
 
-Only the standard library, and no thread, may be loaded before `enter`: a namespace of users cannot be entered with more
-than one thread. Whoever enters then starts a program anew, for the old one still holds files of the system's root.
+Only the standard library, and no thread, may be loaded before `enter`: a user namespace cannot be entered with more
+than one thread. Afterwards start a new program: the old one still holds files of the system's root.
 """
 
 import os
@@ -25,13 +25,13 @@ CLONE_NEWUSER: Final = 0x10000000
 CLONE_NEWPID: Final = 0x20000000
 CLONE_NEWNET: Final = 0x40000000
 MS_REC_PRIVATE: Final = 0x4000 | 0x40000
-_BY_SIGNAL: Final = 128  # an exit status beyond this says which signal, as shells have it
+_BY_SIGNAL: Final = 128  # an exit status beyond this states the signal, as in shells
 _NO_TRUTH: Final = "not in its root"
 _REFUSED: Final = "refused by Landlock"
-_AND: Final = " | "  # between ways in which processes of one run were shut in
-_CAPABILITIES: Final = 0x20080522  # version of the structures that say which powers a process has
+_AND: Final = " | "  # between the isolations of several processes of one run
+_CAPABILITIES: Final = 0x20080522  # version of the structures of capset
 
-# What Python, psutil and libraries of linear algebra read of a /proc that shows other processes, too.
+# Files that Python, psutil and libraries of linear algebra read in a /proc that shows other processes, too.
 OWN_PROC: Final = (
     *("/proc/self", "/proc/sys", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/filesystems"),
     *("/proc/version", "/proc/uptime", "/proc/loadavg"),
@@ -40,20 +40,11 @@ OWN_PROC: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Policy:
-    """Permissions of a process.
+    """Permissions of a process: paths it may read besides the system's, and limits.
 
-    Parameters
-    ----------
-    readable : sequence of str
-        Folders and files besides the system's that it may read.
-    scratch : str
-        An empty folder, resolved, the only one it may write.
-    hidden : sequence of str
-        Folders and files it must not see, wherever they lie.
-    memory_bytes, file_bytes, scratch_bytes : int
-        Address space of each of its processes, the largest file it may write, and all files together.
-    unsearched : str
-        Where nobody looked for what is to be hidden, in words.
+    `scratch` is an empty resolved folder, the only writable one; `hidden` paths stay hidden wherever they lie. The
+    limits hold for the address space of each process, the largest file, and all files together. `unsearched` describes
+    where nobody searched for paths to hide.
     """
 
     readable: Sequence[str]
@@ -77,16 +68,16 @@ class Isolation:
     scratch: str
 
     def to_dict(self) -> dict[str, str]:
-        """For `run.json`."""
+        """Return the words for `run.json`."""
         return asdict(self)
 
 
-PROMISES: Final = (*Isolation.__dataclass_fields__, "memory")  # the last one is kept from outside
+PROMISES: Final = (*Isolation.__dataclass_fields__, "memory")  # the last one is enforced from outside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Walls:
-    """Which walls stand around a process: flags of namespaces, version of Landlock, the others yes or no."""
+    """Protections around a process: flags of namespaces, version of Landlock, the others yes or no."""
 
     spaces: int
     has_root: bool
@@ -96,18 +87,7 @@ class _Walls:
 
 
 def enter(policy: Policy) -> Isolation:
-    """Shut the process in; it returns in a child, in a process namespace of its own where that is possible.
-
-    Parameters
-    ----------
-    policy : Policy
-        What may be reached.
-
-    Returns
-    -------
-    Isolation
-        What the system offered.
-    """
+    """Isolate the process; return in a child, in its own process namespace where the system allows one."""
     if os.path.realpath(policy.scratch) != policy.scratch:  # mounts are known by their resolved paths
         message = f"{policy.scratch} leads elsewhere, expected a resolved folder"
         raise OSError(message)
@@ -119,9 +99,9 @@ def enter(policy: Policy) -> Isolation:
         policy.scratch, shown=policy.readable, hidden=hidden, scratch_bytes=policy.scratch_bytes
     )
     has_proc = is_apart and has_root and has_own_proc()
-    if is_apart:  # not as the first in it: what that one sends to itself does not reach it, and orphans are its own
+    if is_apart:  # not the first process in it, which gets no signals from itself and must adopt orphans
         _fork(_Keeper(is_apart=True, can_die=False))
-    if has_root:  # what came along from the system's root could be changed through its descriptor
+    if has_root:  # an inherited descriptor would give access to the system's root
         nothing = os.open("/dev/null", os.O_RDONLY)
         os.dup2(nothing, 0)
         os.close(nothing)
@@ -141,10 +121,10 @@ def enter(policy: Policy) -> Isolation:
         landlock=version,
         has_filter=kernel.refuse(metadata=not has_root),
     )
-    return _said(walls, policy)
+    return _described(walls, policy)
 
 
-def _said(walls: _Walls, policy: Policy) -> Isolation:
+def _described(walls: _Walls, policy: Policy) -> Isolation:
     return Isolation(
         files_read=_joined(
             "a root of its own with what is needed" if walls.has_root else "",
@@ -177,26 +157,22 @@ def _changed_words(walls: _Walls) -> str:
     return f"{kept}{emptied}; modes, owners, times and attributes {metadata}"
 
 
-def joined(said: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """Isolation of several processes as one: each way in which one of them was shut in, once.
+def joined(isolations: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Join the isolations of several processes, each text once.
 
-    Examples
-    --------
     >>> joined([{"truth": "not in its root"}, {"truth": "not protected"}, {"truth": "not protected"}])
     {'truth': 'not in its root | not protected'}
     """
     words: dict[str, list[str]] = {}
-    for one in said:
-        for name, text in one.items():
+    for isolation in isolations:
+        for name, text in isolation.items():
             words.setdefault(name, []).extend(text.split(_AND))
     return {name: _AND.join(dict.fromkeys(texts)) for name, texts in words.items()}
 
 
 def keeps_truth(isolation: Mapping[str, str]) -> bool:
-    """True if a record says that truths were kept from all processes of a run.
+    """Return whether truths were kept from all processes of a run.
 
-    Examples
-    --------
     >>> [keeps_truth({"truth": words}) for words in ("not in its root, refused by Landlock", "not protected")]
     [True, False]
     """
@@ -204,20 +180,15 @@ def keeps_truth(isolation: Mapping[str, str]) -> bool:
 
 
 def _truth_words(walls: _Walls, unsearched: str) -> str:
-    ways = _joined(
-        _NO_TRUTH if walls.has_root else "",
-        _REFUSED if walls.landlock > 0 else "",
-        otherwise="",
-    )
+    ways = _joined(_NO_TRUTH if walls.has_root else "", _REFUSED if walls.landlock > 0 else "", otherwise="")
     return "; ".join(filter(None, (ways, unsearched))) if ways else "not protected"
 
 
 def _network_words(walls: _Walls) -> str:
-    """Say what of the network is cut, local sockets among it."""
+    """Describe how the network is cut, local sockets included."""
     if walls.has_filter:
-        return "none, no socket can be made (seccomp)" + (
-            ", a namespace of its own" if walls.spaces & CLONE_NEWNET else ""
-        )
+        space = ", a namespace of its own" if walls.spaces & CLONE_NEWNET else ""
+        return f"none, no socket can be made (seccomp){space}"
     if walls.spaces & CLONE_NEWNET:
         where = "in folders that it may read" if walls.has_root else "anywhere"
         return f"no way out (a namespace of its own); local sockets with a path {where} can be reached"
@@ -239,7 +210,7 @@ def _process_words(walls: _Walls) -> str:
 
 
 def _enter_namespaces() -> int:
-    """Enter as many new namespaces as the system allows; the flags of those entered."""
+    """Enter as many new namespaces as the system allows; return the flags of those entered."""
     if sys.platform != "linux":
         return 0
     user, group = os.getuid(), os.getgid()
@@ -271,7 +242,7 @@ def _write(path: str, text: str) -> bool:
 
 
 def _drop_powers() -> None:
-    """Give back what root or a namespace of users brought: whoever may mount could take covers off again."""
+    """Drop the privileges of root or of a user namespace: a process that may mount could uncover hidden files."""
     if not kernel.prctl(kernel.PR_SET_NO_NEW_PRIVS, 1):
         return  # no Linux
     header, none = struct.pack("Ii", _CAPABILITIES, 0), bytes(24)
@@ -280,7 +251,7 @@ def _drop_powers() -> None:
 
 
 def _fork(keeper: "_Keeper") -> None:
-    """Go on in a child; this process keeps it, and ends as it does."""
+    """Continue in a child; this process keeps it, and ends as it does."""
     keeper.prepare()
     parent = os.getpid()
     child = os.fork()
@@ -295,17 +266,17 @@ def _fork(keeper: "_Keeper") -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Keeper:
-    """A process that waits for its child, buries orphans meanwhile, and leaves nothing behind when either ends.
+    """A process that waits for its child, reaps orphans meanwhile, and leaves no process behind when either ends.
 
-    `is_apart` says that the child has a process namespace: then all in it end with its first process. Otherwise whoever
-    leaves its parents becomes a child of the keeper.
+    If the child has a process namespace (`is_apart`), all in it end with its first process. Otherwise processes that
+    leave their parents become children of the keeper.
     """
 
     is_apart: bool
     can_die: bool
 
     def prepare(self) -> None:
-        """Have orphans come here, and end the child before the keeper itself is ended."""
+        """Adopt orphans where no namespace holds them."""
         if not self.is_apart:
             kernel.prctl(kernel.PR_SET_CHILD_SUBREAPER, 1)
 
@@ -313,7 +284,7 @@ class _Keeper:
         """Wait for a child and end as it did; by its signal, or by its signal's number and 128."""
 
         def end(number: int, frame: FrameType | None) -> NoReturn:
-            """Kill first, then end as a shell says it."""
+            """Kill first, then end with the status of a shell."""
             del frame
             self._kill(child)
             os._exit(_BY_SIGNAL + number)
@@ -321,12 +292,12 @@ class _Keeper:
         if self.can_die:
             signal.signal(signal.SIGTERM, end)
             kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGTERM)
-        kernel.prctl(kernel.PR_SET_DUMPABLE, 0)  # nobody looks into it: it still has the system's root
+        kernel.prctl(kernel.PR_SET_DUMPABLE, 0)  # it still has the system's root: refuse looks into it
         _drop_powers()
         status = None
         while status is None:
-            found, said = os.wait()
-            status = said if found == child else None
+            found, ended = os.wait()
+            status = ended if found == child else None
         code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else _BY_SIGNAL + os.WTERMSIG(status)
         self._kill(0)
         if self.can_die and code > _BY_SIGNAL:
@@ -338,7 +309,7 @@ class _Keeper:
         os._exit(code)
 
     def _kill(self, child: int) -> None:
-        """Kill a child, if there is one, and in no namespace all that came from it; wait until they are gone."""
+        """Kill a child, if given, and without a namespace all descendants; wait until they are gone."""
         while True:
             for number in [child] if self.is_apart else _below(os.getpid()):
                 if number:
@@ -359,7 +330,7 @@ def _kill(number: int) -> None:
 
 
 def _below(root: int) -> list[int]:
-    """Numbers of the processes that came from one, as /proc shows them."""
+    """Return the numbers of a process's descendants, as /proc shows them."""
     parents: dict[int, int] = {}
     names = os.listdir("/proc") if os.path.isdir("/proc") else []  # noqa: PTH112, PTH208 - no pathlib yet
     for name in names:

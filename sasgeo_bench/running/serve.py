@@ -24,14 +24,14 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
 from sasgeo_bench.tasks.task_rows import pairs_from, query_from
 
-MOST_MAPS: Final = 2  # in memory while a matcher learns, as long as it keeps none itself
-# What of this package answers are made with: a change there may change them, so they are asked for anew.
+MOST_MAPS: Final = 2  # cached while a matcher trains
+# Modules of this package that answers depend on: after a change there, queries are asked anew.
 TOOLS: Final = ("matching.controls", "regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
 class Server:
-    """Answers messages until the runner has gone."""
+    """Answers messages until the runner closes its end."""
 
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         self.channel = channel
@@ -45,18 +45,11 @@ class Server:
                 message, blob = wire.receive(self.channel)
             except wire.Closed:
                 return
-            said = {"nonce": message["nonce"]}
+            head = {"nonce": message["nonce"]}
             try:
-                answer = wire.packed(said | self._answer(message, blob))
-            except MatchError as error:
-                answer = wire.packed(said | {"status": "invalid", "message": one_line(str(error))})
-            except MemoryError:
-                answer = wire.packed(said | {"status": "crash", "message": "out of memory"})
-            except OSError as error:
-                status = "refused" if error.errno in _REFUSED else "crash"
-                answer = wire.packed(said | {"status": status, "message": message_of(error)})
-            except Exception as error:  # noqa: BLE001 - whatever a plugin raises costs its own row
-                answer = wire.packed(said | {"status": "crash", "message": message_of(error)})
+                answer = wire.packed(head | self._answer(message, blob))
+            except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
+                answer = wire.packed(head | _failure(error))
             try:
                 wire.put(self.channel, answer)
             except wire.Closed:  # the runner waited no longer
@@ -65,13 +58,8 @@ class Server:
     def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
         if message["kind"] == "load":
             self.matcher = load_matcher(self.spec)
-            learns = isinstance(self.matcher, Learner)
-            return {
-                "status": "ok",
-                "card": asdict(self.matcher.card),
-                "code": code_hash(self.matcher),
-                "learns": learns,
-            }
+            about = {"card": asdict(self.matcher.card), "code": code_hash(self.matcher)}
+            return {"status": "ok", **about, "learns": isinstance(self.matcher, Learner)}
         if self.matcher is None:
             self.matcher = load_matcher(self.spec)
         if message["kind"] == "learn":
@@ -87,16 +75,22 @@ class Server:
         start, start_cpu = time.perf_counter(), time.process_time()
         found = self.matcher.match(query, top_k=message["top_k"])
         seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
-        return {
-            "status": "ok",
-            "seconds": seconds,
-            "cpu_s": cpu_s,
-            "match": match_row(check_match(found, query, top_k=message["top_k"])),
-        }
+        row = match_row(check_match(found, query, top_k=message["top_k"]))
+        return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
+
+
+def _failure(error: Exception) -> dict[str, Any]:
+    """Describe an error as an answer."""
+    if isinstance(error, MatchError):
+        return {"status": "invalid", "message": one_line(str(error))}
+    if isinstance(error, MemoryError):
+        return {"status": "crash", "message": "out of memory"}
+    is_refused = isinstance(error, OSError) and error.errno in _REFUSED
+    return {"status": "refused" if is_refused else "crash", "message": message_of(error)}
 
 
 class _Cost:
-    """Seconds by the clock, and resident bytes that this process has grown by, while it is entered."""
+    """Seconds by the clock, and growth of the resident memory, while it is entered."""
 
     def __init__(self) -> None:
         self.seconds, self.grown_bytes = 0.0, 0
@@ -107,7 +101,7 @@ class _Cost:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Add what it took."""
+        """Add the cost of the block."""
         self.seconds += time.perf_counter() - self._start
         self.grown_bytes += _resident_bytes() - self._before
 
@@ -124,13 +118,7 @@ def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, 
 
 
 class Maps(Mapping[str, Region]):
-    """Regions read on demand: all of a split at once would not fit into memory.
-
-    Examples
-    --------
-    >>> list(Maps({"vaduz": Path("out/regions/vaduz")}))
-    ['vaduz']
-    """
+    """Regions read on demand: all of a split at once would not fit into memory."""
 
     def __init__(self, folders: Mapping[str, Path]) -> None:
         self._folders = dict(folders)
@@ -160,15 +148,9 @@ class Maps(Mapping[str, Region]):
 
 
 def code_hash(matcher: Matcher) -> str:
-    """SHA-256 of the code answers come from: a plugin's own, and what it has loaded of `TOOLS`.
+    """Return the SHA-256 of the code that makes answers: the plugin's own, and the `TOOLS` that it has loaded.
 
-    Its own is the file its class is in or, in a package, all Python files beside and below it, by their names.
-
-    Examples
-    --------
-    >>> class Mine: ...
-    >>> len(code_hash(Mine()))
-    64
+    Its own is the file of its class or, in a package, all Python files next to and below it, by name.
     """
     module = sys.modules.get(type(matcher).__module__)
     name = getattr(module, "__file__", None)
@@ -189,7 +171,7 @@ def code_hash(matcher: Matcher) -> str:
 
 
 def _resident_bytes() -> int:
-    """Resident memory of this process, by its number in /proc: in a namespace its own number differs."""
+    """Return the resident memory of this process by its number in /proc, which differs in a namespace."""
     try:
         number = int(os.readlink("/proc/self"))  # noqa: PTH115 - no file, a number
     except OSError:
@@ -198,7 +180,7 @@ def _resident_bytes() -> int:
 
 
 def match_row(match: Match) -> dict[str, Any]:
-    """Turn a checked answer into plain numbers."""
+    """Return a checked answer as plain numbers."""
     return {
         "candidates": [
             [pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale, score]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The conformance kit: what every matcher keeps to, tried on a tiny place under the limits of a run."""
+"""The conformance kit: the rules that every matcher keeps, checked on a tiny place under the limits of a run."""
 
 import hashlib
 import tempfile
@@ -49,18 +49,10 @@ class Check:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TinyPlace:
-    """A made-up place of 1 km2: its map, questions about it, and their answers. Made by `tiny_place`.
+    """A synthetic place of 1 km2, made by `tiny_place`: its map, queries, and their truths in the same order.
 
-    Parameters
-    ----------
-    folder : Path
-        Root with regions/, tasks/ and truth/, as `make-queries` writes them.
-    region : Region
-        The map, as `prepare` gets it.
-    queries : tuple of Query
-        As `match` gets them: both tracks, some with vectors, some without any prior.
-    truths : tuple of Truth
-        Answers, in the order of the queries.
+    `folder` holds regions/, tasks/ and truth/, as `make-queries` writes them. The queries are of both tracks, some with
+    vectors, some without any prior.
     """
 
     folder: Path
@@ -70,30 +62,15 @@ class TinyPlace:
 
     @property
     def map_folder(self) -> Path:
-        """Folder of the map."""
+        """Return the folder of the map."""
         return self.folder / "regions" / self.region.manifest.id
 
 
 def tiny_place(folder: Path) -> TinyPlace:
-    """Make a small place to try a matcher on, in about a second; no file need be downloaded.
+    """Make a small place to try a matcher on, in about a second, the same on every machine; nothing is downloaded.
 
-    Parameters
-    ----------
-    folder : Path
-        Where the map, the queries and the truths are written; what was made there before is made anew.
+    Map, queries and truths go to `folder`, in place of earlier ones. Raise `StoreError` if it cannot be written.
 
-    Returns
-    -------
-    TinyPlace
-        The same on every machine.
-
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written.
-
-    Examples
-    --------
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     place = tiny_place(Path(folder))
     >>> place.region.grid.shape, sorted({query.track for query in place.queries})
@@ -118,24 +95,11 @@ def _silent(line: str) -> None:
 def check_matcher(
     spec: str, *, limits: Limits | None = None, place: TinyPlace | None = None, is_shut_in: bool = True
 ) -> Iterator[Check]:
-    """Try a matcher on a tiny place.
+    """Try a matcher, given by name or module:Class, on a tiny place; yield a row for each rule.
 
-    Parameters
-    ----------
-    spec : str
-        Its name, or module:Class.
-    limits : Limits, optional
-        Those of a run unless given.
-    place : TinyPlace, optional
-        One that was made before; several matchers can share it.
-    is_shut_in : bool
-        False tries code that is trusted without isolation, as `run --trusted` does.
-
-    Yields
-    ------
-    Check
-        A row for each thing that a matcher keeps to; what its card says it cannot do is not applicable. A query without
-        a sound answer counts in the first row alone.
+    `place` can be shared by several matchers. Without `is_shut_in`, trusted code runs without isolation, as in
+    `run --trusted`. Rules about what the card excludes are not applicable. A query without a sound answer counts in the
+    first row only.
     """
     with ExitStack() as stack:
         if place is None:
@@ -175,7 +139,7 @@ def check_matcher(
 
 @dataclass(frozen=True, kw_only=True)
 class _Taught:
-    """Return what a matcher learnt of the tiny place, which accesses were refused, and the row of the table."""
+    """The text that a matcher learned from the tiny place, refused accesses, and the row of the table."""
 
     text: str | None
     refused: str
@@ -183,7 +147,7 @@ class _Taught:
 
 
 def _taught(worker: Worker, place: TinyPlace) -> _Taught:
-    """Have a matcher learn twice, each time in a process of its own."""
+    """Train a matcher twice, each time in a process of its own."""
     maps = {place.region.manifest.id: place.map_folder}
     blobs = [task_rows.query_bytes(query) for query in place.queries]
     replies = []
@@ -202,7 +166,7 @@ def _taught(worker: Worker, place: TinyPlace) -> _Taught:
 
 
 def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
-    """Check that a matcher that learns also answers untrained, unless its card says that it cannot."""
+    """Check that a matcher with a `learn` also answers untrained, unless its card excludes that."""
     name = "answers without training"
     if "training" in card.needs:
         return Check(name=name, outcome="not applicable", found="the card needs training")
@@ -217,7 +181,7 @@ def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
 
 
 def _listing(folder: Path) -> dict[str, tuple[int, int]]:
-    """List everything below a folder; for files with size and time of writing."""
+    """List everything below a folder, files with size and time of writing."""
     found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
     status = {name: path.stat() for name, path in found.items() if path.is_file()}
     return {name: (status[name].st_size, status[name].st_mtime_ns) if name in status else (0, 0) for name in found}
@@ -239,7 +203,7 @@ def _kept(refused: str, before: dict[str, tuple[int, int]], after: dict[str, tup
 
 
 def _chosen(queries: Iterable[Query]) -> list[Query]:
-    """A few of each kind: those with a prior, and the smallest views, first."""
+    """Choose a few queries of each kind: first those with a prior, and the smallest views."""
     kinds: dict[tuple[str, bool], list[Query]] = {}
     for query in sorted(queries, key=lambda item: (item.prior.yaw_deg is None, item.evidence.shape, item.query_id)):
         kinds.setdefault((query.track, query.vectors is not None), []).append(query)
@@ -247,14 +211,13 @@ def _chosen(queries: Iterable[Query]) -> list[Query]:
 
 
 def _one_of_each_track(queries: Sequence[Query]) -> list[Query]:
-    """The smallest view of each."""
-    return list(
-        {query.track: query for query in sorted(queries, key=lambda item: item.evidence.shape, reverse=True)}.values()
-    )
+    """Choose the smallest view of each track."""
+    ordered = sorted(queries, key=lambda item: item.evidence.shape, reverse=True)
+    return list({query.track: query for query in ordered}.values())
 
 
 def _changed(query: Query, what: str, **changes: Any) -> Query:  # noqa: ANN401 - any field of a query
-    """Another query with an id of its own: a matcher may remember what it answered to an id."""
+    """Change a query, and its id: a matcher may remember its answer to an id."""
     name = hashlib.sha256(f"{query.query_id} {what}".encode()).hexdigest()[: len(query.query_id)]
     return replace(query, query_id=name, **changes)
 
@@ -315,7 +278,7 @@ class _Kit:
         return Check(name=name, outcome="pass", found=f"{tried} queries")
 
     def _answers(self, queries: Sequence[Query]) -> Check:
-        """Ask every query twice in a row, and keep the answers; where the first is not sound, that is told once."""
+        """Ask every query twice in a row, and keep the answers; report an unsound first answer once."""
         faults = []
         for query in queries:
             self.first[query.query_id] = self._ask(query)
@@ -335,7 +298,7 @@ class _Kit:
         return _fault(self._ask(_changed(query, "top_k"), top_k=1), query, top_k=1)
 
     def _less(self, query: Query) -> str | None:
-        """Ask without the disc, or without the heading, where the card does not say that it needs one."""
+        """Ask without the disc, or without the heading, where the card does not need it."""
         prior = query.prior
         bare = {
             "a disc": replace(prior, center_m=None, radius_m=None),
@@ -386,7 +349,7 @@ class _Kit:
     def _ties(self, query: Query) -> str | None:
         if query.track != "retrieval":
             raise _NotApplicable
-        # The same place twice: a scorer that looks at the map alone cannot tell one from the other.
+        # The same place twice: a scorer that looks at the map alone cannot separate them.
         one, other = query.candidates[:2]
         reply = self._ask(_changed(query, "ties", candidates=(one, other, one)))
         if reply.match is None:
@@ -396,7 +359,7 @@ class _Kit:
         return None if len(scores) <= 1 else f"two scores for one place: {sorted(scores)}"
 
     def _order(self, queries: Sequence[Query]) -> Check:
-        """An answer depends on its own query alone: not on those before it, nor on when the process began."""
+        """Check that an answer depends neither on earlier queries nor on the start of the process."""
         name = "the same answers in any order"
         if not queries:
             return Check(name=name, outcome="not applicable", found="no query to try it with")
@@ -409,7 +372,7 @@ class _Kit:
         return Check(name=name, outcome="pass", found=f"{len(queries)} queries both ways, in two processes")
 
     def _cost(self, queries: Sequence[Query]) -> Check:
-        """The second answers tell: in the first ones libraries may have been loaded."""
+        """Measure the second answers: the first ones may load libraries."""
         name = "time and memory"
         seconds = [self.second[query.query_id].seconds or 0.0 for query in queries]
         if not seconds:

@@ -10,60 +10,51 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.learned_file import read_learned, write_learned
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.running.failures import LOG, stops_all, write_log
-from sasgeo_bench.running.plan import Learned, RunPlan, reach_of, with_learned
+from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_training_result
 from sasgeo_bench.running.replies import Reply
-from sasgeo_bench.running.training_tasks import Lesson, read_pairs
+from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import Worker
 
 
-def taught(plan: RunPlan, *, tell: Tell) -> RunPlan:
-    """Have a matcher learn, if there is anything to learn and to ask, and nothing was learnt from it before.
+def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:
+    """Train a matcher, if there is a training set, a pending query, and no earlier result. Tell its outcome.
 
-    Parameters
-    ----------
-    plan : RunPlan
-        From `plan_run`.
-    tell : callable
-        Gets a line.
-
-    Returns
-    -------
-    RunPlan
-        With what was learnt, or why nothing was; then every query gets that for an answer.
+    After a failed training, every query gets its cause for an answer.
 
     Raises
     ------
     StoreError
-        If a task was made anew meanwhile, or what was learnt cannot be kept.
+        If a task was made anew meanwhile, or the learned text cannot be stored.
     """
-    lesson, path = plan.lesson, plan.learned_file
-    if lesson is None or path is None or plan.learned is not None or not any(part.left for part in plan.parts):
+    given, path = plan.training_set, plan.learned_file
+    is_pending = plan.training_result is None and any(part.left for part in plan.parts)
+    if given is None or path is None or not is_pending:
         return plan
     with locked(path, tell=tell):
         text = read_learned(path)
         if text is None:
-            reply = _learn(plan, lesson)
+            reply = _learn(plan, given)
             if reply.status != "ok" or reply.learned is None:
                 failed = _failed(reply)
-                tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {lesson.to_text()}")
-                return with_learned(plan, failed)
+                tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {given.to_text()}")
+                return with_training_result(plan, failed)
             write_learned(path, reply.learned)
             text = reply.learned
-            tell(f"{plan.card.name}: learnt from {lesson.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
-    return with_learned(plan, Learned(text=text))
+            tell(f"{plan.card.name}: trained on {given.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
+    return with_training_result(plan, TrainingResult(text=text))
 
 
-def _learn(plan: RunPlan, lesson: Lesson) -> Reply:
-    """Ask a process of its own, which may read the maps and is sent the truths."""
-    request, regions = plan.request, lesson.regions
-    pairs = read_pairs(lesson)
+def _learn(plan: RunPlan, training_set: TrainingSet) -> Reply:
+    """Train in a process of its own, which may read the maps and is sent the truths."""
+    request, regions = plan.request, training_set.regions
+    pairs = read_pairs(training_set)
     reach = reach_of(request, tuple(regions.values()))
     with Worker(spec=request.spec, reach=reach, limits=request.limits) as worker:
         return guarded(plan, partial(worker.learn, regions, pairs))
 
 
 def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
-    """The reply to a question; whatever is raised about it is one, too, unless our own disk or folders are at fault."""
+    """Return the reply to a question; an error counts as one, unless our own disk or folders are at fault."""
     try:
         return ask()
     except StoreError:
@@ -76,15 +67,14 @@ def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
 
 
 def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
-    """Return the reply to a query where our own code failed; the log beside the run has the traceback."""
+    """Log the traceback of an error of our own code, and return the reply to its query."""
     write_log(plan.run_folder / LOG, plan.card.name, error)
-    return Reply(
-        status="crash", message=one_line(f"not its own process failed, but ours: {message_of(error)} (see {LOG})")
-    )
+    message = one_line(f"not its own process failed, but ours: {message_of(error)} (see {LOG})")
+    return Reply(status="crash", message=message)
 
 
-def _failed(reply: Reply) -> Learned:
-    """Return the message of all rows after a failed training."""
+def _failed(reply: Reply) -> TrainingResult:
+    """Return the result of a failed training, whose message all rows get."""
     if reply.status == "ok":
-        return Learned(status="invalid", message="while learning: no text in an answer")
-    return Learned(status=reply.status, message=one_line(f"while learning: {reply.message}"))
+        return TrainingResult(status="invalid", message="while learning: no text in an answer")
+    return TrainingResult(status=reply.status, message=one_line(f"while learning: {reply.message}"))

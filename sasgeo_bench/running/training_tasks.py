@@ -19,7 +19,7 @@ from sasgeo_bench.tasks.task_rows import truth_sha256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Taken:
-    """A task that is learnt from: its folder, its truths, its map, and the ids of the queries that are taken."""
+    """A training task: its folder, its truths, its map, and the ids of the queries that are used."""
 
     task: Path
     truth: Path
@@ -28,7 +28,7 @@ class Taken:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lesson:
+class TrainingSet:
     """A training set; `sha256` is the hash of its queries, maps and truths."""
 
     taken: tuple[Taken, ...]
@@ -52,88 +52,63 @@ class Lesson:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
-    """A query that could be taken, and all that decides whether it is."""
+    """A query that may be used, by what decides whether it is; `hashes` are those of the query and its truth."""
 
     place: str
     suite: str
     site: str
     query_id: str
     task: Path
-    said: tuple[str, str]
+    hashes: tuple[str, str]
 
 
-def plan_lesson(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> Lesson:
-    """Choose the training set; reads nothing twice and writes nothing.
+def plan_training(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> TrainingSet:
+    """Choose at most `most` pairs, evenly over places, then suites, then sites, by a hash of their names.
 
-    Parameters
-    ----------
-    train, asked : sequence of Path
-        Task folders to learn from, and those that will be asked.
-    split : Split, optional
-        Says what is one place, and how far apart places must lie; without one, regions are places.
-    most : int
-        Pairs at most: evenly over places, then suites, then sites, by a hash of their names.
+    `train` and `asked` are task folders. `split` defines places and how far apart they must lie; without one, regions
+    are places.
 
     Raises
     ------
     ConfigError
-        If there is nothing to learn from, a place is asked too or comes too near to one that is, or two different maps
+        If there are no queries, a training place is asked too or lies too near to one that is, or two different maps
         have one name.
     StoreError
         If a task, its map or its truths are missing, damaged or do not belong together.
-
-    Examples
-    --------
-    >>> plan_lesson([Path("nowhere")], asked=[], split=None, most=200)
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: nowhere holds no task.json: make the queries first
     """
     tasks = {folder.resolve(): folder for folder in train}
     abouts = {folder: task_files.read_task(folder) for folder in tasks.values()}
     regions = {base_of(about["region"]): folder for folder, about in abouts.items()}
     others = {base_of(task_files.read_task(folder)["region"]): folder for folder in asked}
     check_apart(regions, others, split)
-    maps = {folder: _map_of(folder, about) for folder, about in abouts.items()}
+    maps = {folder: map_of(folder, about) for folder, about in abouts.items()}
     _check_names(maps)
     pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split)]
     if not pairs:
         message = f"--train {next(iter(tasks.values()))} holds no queries: there is nothing to learn from"
         raise ConfigError(message)
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
-    order = sorted(
-        {pair.task for pair in chosen}, key=lambda folder: (abouts[folder]["region"], abouts[folder]["suite"])
-    )
+    order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))
     ids = {folder: tuple(sorted(pair.query_id for pair in chosen if pair.task == folder)) for folder in order}
-    said = {pair.query_id: pair.said for pair in chosen}
-    return Lesson(
+    hashes = {pair.query_id: pair.hashes for pair in chosen}
+    return TrainingSet(
         taken=tuple(
-            Taken(task=folder, truth=_truth_of(folder, abouts[folder]), region=maps[folder], ids=ids[folder])
+            Taken(task=folder, truth=truth_of(folder, abouts[folder]), region=maps[folder], ids=ids[folder])
             for folder in order
         ),
         places=tuple(sorted({pair.place for pair in chosen})),
-        sha256=_hash_of([said[name] for folder in order for name in ids[folder]]),
+        sha256=_hash_of([hashes[name] for folder in order for name in ids[folder]]),
     )
 
 
-def _hash_of(said: Sequence[tuple[str, str]]) -> str:
-    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+def _hash_of(hashes: Sequence[tuple[str, str]]) -> str:
+    return hashlib.sha256(json.dumps(hashes).encode()).hexdigest()
 
 
 def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Split | None) -> None:
-    """Refuse to learn from what is asked, or from what lies beside it.
+    """Raise `ConfigError` if regions share a name or place, or have blocks nearer than the buffer of the split.
 
-    Parameters
-    ----------
-    train, asked : mapping of str to Path
-        Regions, each with a task on it that an error can name.
-    split : Split, optional
-        Says what is one place, and how far apart places must lie.
-
-    Raises
-    ------
-    ConfigError
-        If both hold a region or place, or blocks that come nearer than the buffer of the split.
+    `train` and `asked` give for each region a task on it that an error can name.
     """
     both = next((name for name in train if name in asked), None)
     if both is not None:
@@ -153,8 +128,8 @@ def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Spl
     near = nearest_blocks(parts, within_m=least_m)
     if near is not None and near.gap_m < least_m:
         message = (
-            f"--train: blocks {near.first} and {near.second}, of which one is learnt from and one is asked, are "
-            f"{near.gap_m:.0f} m apart, split {split.spec.id!r} wants {least_m:.0f} m: leave one of the regions out"
+            f"--train: blocks {near.first} and {near.second}, one for training and one that is asked, are "
+            f"{near.gap_m:.0f} m apart, split {split.spec.id!r} needs {least_m:.0f} m: leave one of the regions out"
         )
         raise ConfigError(message)
 
@@ -163,17 +138,19 @@ def _blocks_of(regions: Mapping[str, Path], split: Split) -> list[Block]:
     return [block for name in regions for block in split.blocks_in(name)]
 
 
-def _root_of(task: Path) -> Path:
+def root_of(task: Path) -> Path:
+    """Return the output folder that holds a task."""
     return task.resolve().parent.parent.parent
 
 
-def _truth_of(task: Path, about: Mapping[str, Any]) -> Path:
-    return _root_of(task) / "truth" / str(about["suite"]) / str(about["region"])
+def truth_of(task: Path, about: Mapping[str, Any]) -> Path:
+    """Return the folder of a task's truths."""
+    return root_of(task) / "truth" / str(about["suite"]) / str(about["region"])
 
 
-def _map_of(task: Path, about: Mapping[str, Any]) -> Path:
-    """The map of a task, after a look whether it is the one that the task was made on."""
-    region: Path = _root_of(task) / "regions" / str(about["region"])
+def map_of(task: Path, about: Mapping[str, Any]) -> Path:
+    """Return the map of a task; refuse one that was built anew since."""
+    region: Path = root_of(task) / "regions" / str(about["region"])
     if not task_files.is_of_map(about, read_manifest(region)):
         message = f"{region} was built anew since the queries of {task} were made: make them again"
         raise StoreError(message)
@@ -181,21 +158,19 @@ def _map_of(task: Path, about: Mapping[str, Any]) -> Path:
 
 
 def _check_names(maps: Mapping[Path, Path]) -> None:
-    """Refuse two maps of one name: queries say the name alone."""
+    """Refuse two maps of one name: queries hold the name alone."""
     seen: dict[str, Path] = {}
     for task, region in maps.items():
         if seen.setdefault(region.name, region) != region:
-            message = (
-                f"--train {task} is searched in {region}, another task in {seen[region.name]}: leave one of them out"
-            )
+            message = f"--train {task} lies on {region}, another task on {seen[region.name]}: leave one of them out"
             raise ConfigError(message)
 
 
 def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None) -> Iterator[_Pair]:
-    """Every query of a task with its truth, by what decides whether it is taken."""
-    truth = _truth_of(task, about)
+    """Yield every query of a task, with what decides whether it is used."""
+    truth = truth_of(task, about)
     if not (truth / task_files.TRUTH).is_file():
-        message = f"{truth} holds no truths of {task}, and they are learnt from: make the queries here, or leave it out"
+        message = f"{truth} holds no truths of {task}, which training needs: make the queries here, or leave it out"
         raise StoreError(message)
     task_files.check_queries(task)
     task_files.check_truths(task, truth)
@@ -207,15 +182,12 @@ def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None) -> Iter
             site=item.pair_id,
             query_id=item.query_id,
             task=task,
-            said=(asked[item.query_id], truth_sha256(item)),
+            hashes=(asked[item.query_id], truth_sha256(item)),
         )
 
 
 def spread(pairs: Sequence[_Pair], by: Sequence[Callable[[_Pair], str]]) -> list[_Pair]:
-    """Put pairs in an order of which every beginning is spread evenly, first by the first of some keys.
-
-    What comes first among equals is decided by a hash of its name, never by where it stood.
-    """
+    """Order pairs so that every beginning is spread evenly, first by the first key; hashes of names break ties."""
     if not by:
         return sorted(pairs, key=lambda pair: _rank(pair.query_id))
     groups: dict[str, list[_Pair]] = {}
@@ -229,23 +201,20 @@ def _rank(name: str) -> bytes:
     return hashlib.sha256(name.encode()).digest()
 
 
-def read_pairs(lesson: Lesson) -> list[tuple[bytes, Truth]]:
-    """Queries as they travel, with their truths, in the order of maps, suites and ids.
+def read_pairs(training_set: TrainingSet) -> list[tuple[bytes, Truth]]:
+    """Read queries as they are sent, with their truths, in the order of maps, suites and ids.
 
-    Raises
-    ------
-    StoreError
-        If a task was made anew since the lesson was planned.
+    Raise `StoreError` if a task was made anew since the training set was planned.
     """
     found: list[tuple[bytes, Truth]] = []
-    said: list[tuple[str, str]] = []
-    for item in lesson.taken:
+    hashes: list[tuple[str, str]] = []
+    for item in training_set.taken:
         truths = {truth.query_id: truth for truth in task_files.read_truths(item.truth)}
         for query, blob, asked in task_files.read_some(item.task, frozenset(item.ids)):
             if query.query_id in truths:
                 found.append((blob, truths[query.query_id]))
-                said.append((asked, truth_sha256(truths[query.query_id])))
-    if _hash_of(said) != lesson.sha256:
-        message = f"{lesson.taken[0].task} or another task of --train was made anew meanwhile: run again"
+                hashes.append((asked, truth_sha256(truths[query.query_id])))
+    if _hash_of(hashes) != training_set.sha256:
+        message = f"{training_set.taken[0].task} or another task of --train was made anew meanwhile: run again"
         raise StoreError(message)
     return found

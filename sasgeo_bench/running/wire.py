@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages between a runner and a matcher's process: a length, JSON, and bytes; nothing that is executed when read."""
+"""Exchange messages between a runner and a matcher's process: a length, JSON, and bytes; nothing is executed."""
 
 import json
 import select
@@ -8,22 +8,22 @@ import struct
 import time
 from typing import Any, Final
 
-MOST_BYTES: Final = 2**20  # of a message from a matcher's process; what it sends is not trusted
-MOST_LEARNT_BYTES: Final = 8 * 2**20  # of one with what was learnt: JSON may write a byte of it as six
+MOST_BYTES: Final = 2**20  # of a message from a matcher's process, which is not trusted
+MOST_LEARN_BYTES: Final = 8 * 2**20  # of one with a learned text: JSON may write one byte of it as six
 _HEAD: Final = struct.Struct("!II")
-_LEAST_S: Final = 1e-3  # no time at all would be taken for a socket that never waits
+_LEAST_S: Final = 1e-3  # zero would make the socket non-blocking
 
 
 class Closed(Exception):  # noqa: N818 - it is no error: the other side has gone
-    """The other side has gone, or sent what is no message."""
+    """The other side has gone, or sent no message."""
 
 
 class TooLong(Closed):
-    """The other side is there, and sends more than is read."""
+    """The other side sends more than is read."""
 
 
 class Late(Exception):  # noqa: N818
-    """Nothing came in time, or nobody read what was sent."""
+    """Nothing came in time, or the other side does not read."""
 
 
 class Garbled(Exception):  # noqa: N818
@@ -36,7 +36,7 @@ def send(channel: socket.socket, message: dict[str, Any], blob: bytes = b"", *, 
 
 
 def packed(message: dict[str, Any], blob: bytes = b"") -> bytes:
-    """A message as it is sent."""
+    """Return a message as it is sent."""
     text = json.dumps(message).encode()
     return _HEAD.pack(len(text), len(blob)) + text + blob
 
@@ -56,23 +56,14 @@ def put(channel: socket.socket, data: bytes, *, deadline: float | None = None) -
 def receive(
     channel: socket.socket, *, deadline: float | None = None, most_bytes: int | None = None
 ) -> tuple[dict[str, Any], bytes]:
-    """Wait for a message.
-
-    Parameters
-    ----------
-    channel : socket
-        Its end of a pair.
-    deadline : float, optional
-        Of `time.monotonic`; `Late` when it has passed.
-    most_bytes : int, optional
-        A longer message is not read.
+    """Wait for a message until `deadline`, by `time.monotonic`; do not read one longer than `most_bytes`.
 
     Raises
     ------
     Closed
         If the other side has gone; `TooLong` if the message is.
     Garbled
-        If it is no JSON object; one that has a name twice, or a number that is none, is none.
+        If it is no JSON object, repeats a name, or holds a number that is not finite.
     Late
         If it did not come in time.
     """
@@ -94,7 +85,7 @@ def receive(
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object, each name in it once: of two readers one might take the first value and one the last."""
+    """Return an object without repeated names: two readers might take different values."""
     found = dict(pairs)
     if len(found) != len(pairs):
         message = "a name is there twice"
@@ -103,7 +94,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _refused(name: str) -> float:
-    """Refuse NaN and Infinity, which Python reads and JSON does not know."""
+    """Refuse NaN and Infinity, which Python reads and JSON does not have."""
     message = f"{name} is no number"
     raise ValueError(message)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A matcher's process, seen from outside: start it, ask it, watch it, and end it."""
+"""Start, ask, watch and end a matcher's process."""
 
 import contextlib
 import os
@@ -33,29 +33,22 @@ from sasgeo_bench.running.replies import Reply, read_reply
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_rows import pairs_bytes
 
-_KEEPER_S: Final = 5.0  # for the process that keeps a matcher's to end all that came from it
+_KEEPER_S: Final = 5.0  # for the keeper of a matcher's process to end all its descendants
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
-_KEPT_BYTES: Final = 4000  # of what a matcher prints
+_KEPT_BYTES: Final = 4000  # of a matcher's output
 _START_S: Final = 120.0
-_DRAIN_S: Final = 10.0  # for the rest of what a process printed, once it is dead
+_DRAIN_S: Final = 10.0  # for the rest of its output, once it is dead
 _SLACK_S: Final = 0.1  # of processor seconds beyond those of all processors: clocks tick
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of a matcher: time, memory, files, processes.
+    """Limits of a matcher.
 
-    Parameters
-    ----------
-    match_s, prepare_s, learn_s : float
-        Seconds by the clock for one query, for one map, and for whatever is learnt at once.
-    memory_bytes : int
-        Of all its processes together, resident; and of the address space of each.
-    file_bytes, scratch_bytes : int
-        Of one file in its scratch folder, and of all together where the system has a way.
-    processes : int
-        Processes and threads of it at once, where the system has a way.
+    Seconds for one query, for one map, and for all training at once. `memory_bytes` bounds the resident memory of all
+    its processes together, and the address space of each. `file_bytes` bounds one file in its scratch folder; where the
+    system offers a way, `scratch_bytes` bounds all of them and `processes` the processes and threads at once.
     """
 
     match_s: float = 30.0
@@ -80,12 +73,7 @@ class Reach:
 class Worker:
     """A matcher's process; a new one is started whenever the last one has ended.
 
-    Use it in a `with` block: at its end nothing of it is left, neither processes nor files.
-
-    Examples
-    --------
-    >>> Limits().match_s
-    30.0
+    Use it in a `with` block: at its end no process or file of it is left.
     """
 
     spec: str
@@ -119,14 +107,14 @@ class Worker:
         return self._ask({"kind": "load"}, timeout_s=self.limits.prepare_s)
 
     def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
-        """Learn from queries, each a row in Arrow's stream format, and their truths, on maps by their names."""
+        """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
         message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
-        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARNT_BYTES)
+        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARN_BYTES)
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
-        """Index a map, with what was learnt before."""
+        """Index a map, given the learned text."""
         self._region, self._learned = region, learned
         message = {"kind": "prepare", "region": str(region.resolve()), "learned": learned}
         reply = self._ask(message, timeout_s=self.limits.prepare_s)
@@ -151,7 +139,7 @@ class Worker:
     def _ask(
         self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float, most_bytes: int = wire.MOST_BYTES
     ) -> Reply:
-        nonce = secrets.token_hex(16)  # nobody can have answered before it was asked
+        nonce = secrets.token_hex(16)  # so that no answer can be made in advance
         try:
             channel = self._started()
             asked = time.perf_counter()
@@ -204,15 +192,15 @@ class Worker:
         self.starts += 1
         if self.reach.is_shut_in:
             wire.send(ours, self._policy(str(self._scratch)))
-            said, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
-            self.isolation = {str(name): one_line(str(words)) for name, words in dict(said["isolation"]).items()}
+            started, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
+            self.isolation = {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
         self.isolation["memory"] = _memory_words(self.limits, self._group)
         paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
         wire.send(ours, {"spec": self.spec, "scratch": str(self._scratch), "paths": paths})
         return ours
 
     def _begin_watch(self, process: subprocess.Popen[bytes], scratch: Path) -> None:
-        """Have the kernel count its memory where it does, and look at it ourselves in any case."""
+        """Put the process into a control group if possible, and measure its memory in any case."""
         memory_bytes, processes = self.limits.memory_bytes, self.limits.processes
         self._group = Group.make(memory_bytes=memory_bytes, processes=processes)
         try:
@@ -220,14 +208,17 @@ class Worker:
                 self._group.add(process.pid)
         except OSError:
             self._end_watch()
-        kill = partial(_kill_family, process)
         self._memory = MemoryWatch(
-            process=process, most_bytes=memory_bytes, kill=kill, scratch=scratch, group=self._group
+            process=process,
+            most_bytes=memory_bytes,
+            kill=partial(_kill_family, process),
+            scratch=scratch,
+            group=self._group,
         )
         self._memory.start()
 
     def _end_watch(self) -> None:
-        """Stop looking, and remove what the kernel counted in with all that is left in it."""
+        """Stop measuring, and remove the control group with its processes."""
         if self._memory is not None:
             self._memory.stop()
             self._peak_bytes = max(self._peak_bytes, self._memory.peak_bytes)
@@ -237,19 +228,19 @@ class Worker:
 
     @property
     def peak_bytes(self) -> int:
-        """Most memory that a process of this matcher and all that came from it have held at once."""
+        """Return the peak memory of this matcher's process and all its descendants."""
         return max(self._peak_bytes, self._memory.peak_bytes if self._memory else 0)
 
     def _policy(self, scratch: str) -> dict[str, Any]:
-        """Arguments of `sandbox.Policy`."""
+        """Return the arguments of `sandbox.Policy`."""
         code = _code()
-        beside = walk_code(code)
-        hidden = [*map(str, self.reach.hidden), *beside.hidden([*code, *self.reach.readable])]
+        scan = walk_code(code)
+        hidden = [*map(str, self.reach.hidden), *scan.hidden([*code, *self.reach.readable])]
         return {
             "readable": [str(path) for path in (*code, *self.reach.readable)],
             "scratch": scratch,
             "hidden": list(dict.fromkeys(hidden)),
-            "unsearched": beside.unsearched,
+            "unsearched": scan.unsearched,
             "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
             "file_bytes": self.limits.file_bytes,
             "scratch_bytes": self.limits.scratch_bytes,
@@ -258,18 +249,15 @@ class Worker:
     def _last_words(self, closed: str) -> str:
         """Describe how a process ended, with the last line it printed."""
         code = None
-        if self._process is not None:
-            try:
-                code = self._process.wait(timeout=10)  # on a busy machine an end takes its time
-            except subprocess.TimeoutExpired:
-                code = None
+        with contextlib.suppress(subprocess.TimeoutExpired):  # on a busy machine an end takes its time
+            code = None if self._process is None else self._process.wait(timeout=10)
         if self._memory is not None and self._memory.look():
             return self._memory.why
         how = closed
         if code is not None:
             how = f"died by {_signal_name(-code)}" if code < 0 else f"ended with exit status {code}"
         if self._process is not None and self._drain is not None:
-            _kill_family(self._process)  # nobody is left who could keep what it printed from ending
+            _kill_family(self._process)  # no descendant keeps its output open
             self._drain.join(timeout=_DRAIN_S)
         lines = b"".join(self._printed).decode(errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "")
@@ -288,13 +276,13 @@ class Worker:
 
 
 def _signal_name(number: int) -> str:
-    """Name of a signal; those of real time have a number alone."""
+    """Return the name of a signal, or its number if it has none."""
     known = {item.value: item.name for item in signal.Signals}
     return known.get(number, f"signal {number}")
 
 
 def _environment(scratch: Path) -> dict[str, str]:
-    """Next to nothing: no folder of ours, no key, no proxy; one thread, so that latencies can be compared."""
+    """Return a minimal environment: none of our folders, keys or proxies; one thread, for comparable latencies."""
     kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
     own = {"PATH": "/usr/bin:/bin", "HOME": str(scratch), "TMPDIR": str(scratch), "PYTHONHASHSEED": "0"}
@@ -302,7 +290,7 @@ def _environment(scratch: Path) -> dict[str, str]:
 
 
 def _command(channel: int, *, is_shut_in: bool) -> list[str]:
-    """Start the program that answers, at once or by way of the one that shuts it in."""
+    """Return the command that starts the process, directly or through the sandbox."""
     if not is_shut_in:
         return [sys.executable, *_ANSWERS, str(channel)]
     package = str(Path(sasgeo_bench.running.child.__file__).parents[2])
@@ -310,7 +298,7 @@ def _command(channel: int, *, is_shut_in: bool) -> list[str]:
 
 
 def _code() -> list[Path]:
-    """Folders of the interpreter and of everything importable."""
+    """Return the folders of the interpreter and of everything importable."""
     found = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.executable), Path(os.getcwd())]  # noqa: PTH109
     found += [Path(entry) for entry in sys.path if entry]
     found.append(Path(sasgeo_bench.running.child.__file__).parents[2] / "sasgeo_bench")
@@ -318,7 +306,7 @@ def _code() -> list[Path]:
 
 
 def _drain(stream: IO[bytes] | None, printed: deque[bytes]) -> None:
-    """Read what a process prints, so that it never waits for us, and keep the end of it."""
+    """Read the output of a process, so that it never blocks, and keep the end of it."""
     if stream is None:
         return
     while part := stream.read1(65536):  # type: ignore[attr-defined]
@@ -328,7 +316,7 @@ def _drain(stream: IO[bytes] | None, printed: deque[bytes]) -> None:
 
 
 def _memory_words(limits: Limits, group: Group | None) -> str:
-    """Say how memory and processes are counted."""
+    """Describe how memory and processes are limited."""
     most = f"{limits.memory_bytes / 1e6:.0f} MB at most"
     if group is not None:
         return f"{most}, and {limits.processes} processes and threads, held by the kernel (cgroup v{group.version})"
@@ -336,12 +324,12 @@ def _memory_words(limits: Limits, group: Group | None) -> str:
 
 
 def _kill_family(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process, its session, and whatever it started elsewhere."""
+    """Kill a process, its session, and descendants elsewhere."""
     try:
         family = psutil.Process(process.pid).children(recursive=True)
     except psutil.Error:
         family = []
-    process.terminate()  # the one that keeps the others kills them first
+    process.terminate()  # the keeper first kills the others
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=_KEEPER_S)
     try:

@@ -310,7 +310,7 @@ def test_a_matcher_that_does_not_learn_says_so(program, out) -> None:
     del out
     code, told, err = program(*ORACLE, "--train", TASK, "--dry-run")
     assert (code, err) == (0, "")
-    assert told.splitlines()[1] == "  does not learn: what there is to learn from is passed over"
+    assert told.splitlines()[1] == "  has no learn(): training data are ignored"
 
 
 @pytest.mark.parametrize(
@@ -380,13 +380,13 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     assert told.endswith("move it away and run again")
     about.mkdir()
     part.unlink()
-    assert f"{run_folder} cannot be written (" in mistake(*ORACLE)
+    assert f"{run_folder}/run.json cannot be written (" in mistake(*ORACLE)
 
 
 def test_a_file_where_rows_would_go_gets_one_line(mistake, run_folder) -> None:
     shutil.rmtree(run_folder)
     run_folder.write_text("mine")
-    assert f"{run_folder} cannot be written (" in mistake(*ORACLE)
+    assert f"{run_folder}/run.json cannot be written (" in mistake(*ORACLE)
     assert run_folder.read_text() == "mine"
 
 

@@ -352,8 +352,8 @@ def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_its
     told = plan.to_text().splitlines()
     assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in told
     assert "    learners:Oracle: from the half itself, never ranked" in told
-    assert "      half a: has learnt from 5 queries of 1 place (town-agricultural)" in told
-    assert "      half b: has learnt from 5 queries of 1 place (town-suburb)" in told
+    assert "      half a: trained on 5 queries of 1 place (town-agricultural)" in told
+    assert "      half b: trained on 5 queries of 1 place (town-suburb)" in told
 
 
 @pytest.mark.parametrize(

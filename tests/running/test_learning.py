@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matchers that learn: once for a lesson, from far places alone; what was learnt belongs to what was asked."""
+"""Matchers that learn: once for a training set, from far places alone; the result belongs to what was asked."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from sasgeo_bench.matching.matcher import check_learned
 from sasgeo_bench.running import prediction_files, sandbox, training
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.running.training_tasks import _Pair, check_apart, plan_lesson, spread
+from sasgeo_bench.running.training_tasks import _Pair, check_apart, plan_training, spread
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.validate import set_aside, validate
 from sasgeo_bench.tasks import task_files
@@ -73,15 +73,15 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     request = request_of()
     lines = plan_run(request).to_text().splitlines()
     plan, report, folder = carry_out(request)
-    count = plan.lesson.count
-    assert lines[1] == f"  to be learnt from {count} queries of 1 place (town-grid)"
+    count = plan.training_set.count
+    assert lines[1] == f"  to be trained on {count} queries of 1 place (town-grid)"
     assert report.counts == {"ok": 2}
     assert told(request, folder) == {float(count)}
     said = prediction_files.read_run(folder)["learned"]
     assert (said["trained_on"], said["pairs"]) == (["town-grid"], count)
     text = (plan.run_folder / said["file"]).read_text(encoding="utf-8")
     assert json.loads(text)["suites"] == ["alias"]
-    assert plan_run(request).to_text().splitlines()[1].startswith("  has learnt from ")
+    assert plan_run(request).to_text().splitlines()[1].startswith("  trained on ")
     assert next(validate(folder, request.tasks)).is_missing_row  # the rest was not asked, and no row is strange
     assert set_aside(folder, request.tasks) == 0
     merged = prediction_files.merge_runs(
@@ -102,14 +102,14 @@ def test_what_was_learnt_is_used_again_and_learnt_anew_from_something_else(reque
     other = replace(request, most_trained=3, limit=3)
     assert plan_run(other).parts[0].aside == 3
     second, report, same = carry_out(other)
-    assert (same, report.counts, second.lesson.count) == (folder, {"ok": 3}, 3)
-    assert first.lesson.sha256 != second.lesson.sha256
+    assert (same, report.counts, second.training_set.count) == (folder, {"ok": 3}, 3)
+    assert first.training_set.sha256 != second.training_set.sha256
     assert told(request, folder) == {3.0}
     assert set_aside(folder, request.tasks) == 3
-    # Back again, nothing is asked, and the answers under the first lesson are those that count.
+    # Back again, nothing is asked, and the answers under the first training are those that count.
     monkeypatch.setattr(training, "_learn", None)
     assert carry_out(replace(request, limit=3))[1].counts == {}
-    assert told(request, folder) == {float(first.lesson.count)}
+    assert told(request, folder) == {float(first.training_set.count)}
     untaught = replace(request, train=())
     assert carry_out(untaught)[1].counts == {"ok": 2}
     assert told(request, folder) == {-1.0}
@@ -140,7 +140,7 @@ def test_a_card_that_needs_training_is_not_applicable_without(request_of):
     request = request_of("NeedsTraining")
     plan, report, folder = carry_out(request)
     assert report.counts == {"ok": 2}
-    assert told(request, folder) == {float(plan.lesson.count)}
+    assert told(request, folder) == {float(plan.training_set.count)}
     _, report, _ = carry_out(replace(request, train=()))
     assert (report.counts, report.messages) == ({"not applicable": 2}, {"not applicable": "no training"})
 
@@ -148,7 +148,7 @@ def test_a_card_that_needs_training_is_not_applicable_without(request_of):
 @pytest.mark.usefixtures("in_threads")
 def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
     plan, report, folder = carry_out(request_of(spec="hostile:Plain"))
-    assert (plan.lesson, report.counts) == (None, {"ok": 2})
+    assert (plan.training_set, report.counts) == (None, {"ok": 2})
     assert "does not learn" in plan.to_text()
     assert prediction_files.read_run(folder)["learned"] is None
 
@@ -180,7 +180,7 @@ def test_what_cannot_be_kept_is_nothing_that_was_learnt(learned, fault):
         check_learned(learned)
 
 
-# --- the lesson -----------------------------------------------------------------------------------------------------
+# --- the training set -----------------------------------------------------------------------------------------------
 
 
 def test_nobody_learns_from_what_is_asked(request_of, tasks):
@@ -196,23 +196,23 @@ def test_a_task_without_truths_or_queries_teaches_nothing(tasks, tmp_path):
     for kind in ("tasks", "regions"):
         shutil.copytree(tasks / kind, out / kind)
     with pytest.raises(StoreError, match=r"holds no truths of .*: make the queries here, or leave it out"):
-        plan_lesson([out / "tasks" / CLEAN], asked=[], split=None, most=5)
+        plan_training([out / "tasks" / CLEAN], asked=[], split=None, most=5)
 
 
 def test_two_maps_of_one_name_are_refused(tasks, tmp_path):
     out = Path(shutil.copytree(tasks, tmp_path / "other"))
     train = [tasks / "tasks" / CLEAN, out / "tasks" / "absent" / "town-riverside"]
     with pytest.raises(ConfigError, match=r"another task in .*: leave one of them out"):
-        plan_lesson(train, asked=[], split=None, most=5)
+        plan_training(train, asked=[], split=None, most=5)
 
 
-def test_a_lesson_is_the_same_whatever_order_its_tasks_are_named_in(tasks):
+def test_a_training_set_is_the_same_whatever_order_its_tasks_are_named_in(tasks):
     train = sorted((tasks / "tasks").glob("*/town*"))
-    lessons = [plan_lesson(order, asked=[], split=None, most=7) for order in (train, train[::-1], [*train, *train])]
-    assert len({(lesson.sha256, lesson.places, lesson.taken) for lesson in lessons}) == 1
-    assert lessons[0].count == 7
-    assert lessons[0].places == ("town-grid", "town-riverside")
-    assert plan_lesson(train, asked=[], split=None, most=8).sha256 != lessons[0].sha256
+    found = [plan_training(order, asked=[], split=None, most=7) for order in (train, train[::-1], [*train, *train])]
+    assert len({(one.sha256, one.places, one.taken) for one in found}) == 1
+    assert found[0].count == 7
+    assert found[0].places == ("town-grid", "town-riverside")
+    assert plan_training(train, asked=[], split=None, most=8).sha256 != found[0].sha256
 
 
 @given(st.lists(st.tuples(*(st.sampled_from("abc") for _ in range(3))), min_size=1, max_size=40), st.randoms())

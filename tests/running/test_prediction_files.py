@@ -175,8 +175,8 @@ def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):
 def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file", tmp_path / "file" / "deep"):
-        assert f"{folder} cannot be written (" in refusal(prediction_files.write_run, folder, {})
-        assert f"{folder} cannot be written (" in refusal(prediction_files.write_part, folder, [FULL])
+        assert f"{folder}/run.json cannot be written (" in refusal(prediction_files.write_run, folder, {})
+        assert f"{folder}/part-" in refusal(prediction_files.write_part, folder, [FULL])
     assert (tmp_path / "file").read_text() == "mine"
 
 

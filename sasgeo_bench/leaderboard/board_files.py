@@ -75,6 +75,9 @@ def write_board(
 ) -> None:
     """Write a board, whole or not at all.
 
+    Raise StoreError if the folder holds a board of another scorer version, or something that is no part of a board, or
+    cannot be written; an older board is then as it was.
+
     Parameters
     ----------
     folder : Path
@@ -87,12 +90,6 @@ def write_board(
         What `board.json` says: versions, hashes, what was scored.
     extras : sequence of Extra
         Files besides.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds a board of another scorer version, or something that is no part of a board, or cannot be
-        written; an older board is then as it was.
     """
     versions = {name: str(about[name]) for name in _VERSIONS if name in about}
     said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
@@ -134,10 +131,7 @@ def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
 def check_board(folder: Path, *, scorer_version: int) -> None:
     """Refuse a folder that a board of this scorer version cannot replace.
 
-    Raises
-    ------
-    StoreError
-        If it holds a board of another scorer version, or something that is no part of a board.
+    Raise StoreError if it holds a board of another scorer version, or something that is no part of a board.
     """
     if folder.exists() and not folder.is_dir():
         message = f"{folder} is a file: move it away, a board goes there"
@@ -170,10 +164,7 @@ def _version(path: Path) -> str:
 def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """Read `board.json` and the leaderboard.
 
-    Raises
-    ------
-    StoreError
-        If there is none, or a file is damaged.
+    Raise StoreError if there is none, or a file is damaged.
     """
     try:
         data = (folder / BOARD).read_bytes()
@@ -192,13 +183,8 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
 def read_scores(folder: Path) -> pd.DataFrame:
     """Scored rows of a board, those of all contestants.
 
-    Raises
-    ------
-    StoreError
-        If they are missing or damaged.
+    Raise StoreError if they are missing or damaged.
 
-    Examples
-    --------
     >>> read_scores(Path("nowhere"))
     Traceback (most recent call last):
         ...
@@ -225,17 +211,14 @@ _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
 def check_shape(name: str, table: pd.DataFrame) -> None:
     """Refuse a table whose columns are missing, of another type, or without a name where there must be one.
 
+    Raise StoreError naming the file and the column.
+
     Parameters
     ----------
     name : str
         Of the table, as in "leaderboard".
     table : pandas.DataFrame
         As it was read; one that no board has to have may be without columns.
-
-    Raises
-    ------
-    StoreError
-        Naming the file and the column.
 
     Examples
     --------

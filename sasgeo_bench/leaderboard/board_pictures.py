@@ -142,8 +142,6 @@ def _is_there(about: Mapping[str, Any], root: Path) -> bool:
 def base_region(name: str) -> str:
     """Return a region without the date or suite that changed it.
 
-    Examples
-    --------
     >>> base_region("vaduz@2015-07-27"), base_region("vaduz+growth")
     ('vaduz', 'vaduz')
     """
@@ -195,8 +193,6 @@ def _example(about: Mapping[str, Any], root: Path) -> bytes:
 def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
     """Return a control and the strongest stress of its site, or the strongest stress and another query.
 
-    Examples
-    --------
     >>> control_and_stress([])
     []
     """

@@ -65,8 +65,6 @@ class Look:
 def look_of(number: int) -> Look:
     """The look of the thing of a number; no two of the first 28 have colour and dash in common.
 
-    Examples
-    --------
     >>> look_of(0).colour, look_of(7).dash
     ('#000000', ':')
     """
@@ -230,8 +228,6 @@ HALVES: Final = (0.0, 0.5, 1.0)
 def those_there(rows: pd.DataFrame, shown: Sequence[str]) -> list[str]:
     """Matchers that have a row, in the order of their looks.
 
-    Examples
-    --------
     >>> those_there(pd.DataFrame({"matcher": ["b", "a"]}), ["a", "c", "b"])
     ['a', 'b']
     """
@@ -241,8 +237,6 @@ def those_there(rows: pd.DataFrame, shown: Sequence[str]) -> list[str]:
 def of_which(row: Mapping[str, Any] | pd.Series) -> str:
     """Of which queries a figure is.
 
-    Examples
-    --------
     >>> of_which({"suite": "clean", "track": "localization", "prior_group": "r500-weak-s3"})
     'clean, localization, prior r500-weak-s3'
     """
@@ -252,8 +246,6 @@ def of_which(row: Mapping[str, Any] | pd.Series) -> str:
 def panels_across(count: int) -> tuple[int, int]:
     """Rows and columns of so many panels.
 
-    Examples
-    --------
     >>> panels_across(3), panels_across(9)
     ((1, 3), (3, 4))
     """
@@ -297,8 +289,6 @@ def draw_bars_of(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
 def dodged(values: Floats, number: int, count: int, *, by: float) -> Floats:
     """Places on a logarithmic axis, set apart a little by the number of a line, so that intervals do not hide others.
 
-    Examples
-    --------
     >>> dodged(np.array([10.0]), 0, 1, by=0.1).tolist()
     [10.0]
     """

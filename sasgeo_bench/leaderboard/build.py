@@ -56,6 +56,10 @@ _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated"
 def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
     """Score everything and write the board.
 
+    Raise StoreError if predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named
+    by itself answers none of the queries; nothing is written. Raise ConfigError if there is nothing to score, or
+    rejectors are asked for without a split.
+
     Parameters
     ----------
     request : ScoreRequest
@@ -69,14 +73,6 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     -------
     Board
         What was written.
-
-    Raises
-    ------
-    StoreError
-        If predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by itself
-        answers none of the queries; nothing is written.
-    ConfigError
-        If there is nothing to score, or rejectors are asked for without a split.
     """
     progress = progress or Lines(tell)
     check_board(request.board, scorer_version=SCORER_VERSION)

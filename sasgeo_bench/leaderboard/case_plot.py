@@ -42,17 +42,14 @@ def pixels_of(figure: Figure) -> NDArray[np.uint8]:
 def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
     """Pixels as WebP, as good and then as large as fits; the same bytes for the same pixels.
 
+    Raise StoreError if even half of its size in the worst quality takes more.
+
     Parameters
     ----------
     pixels : ndarray of uint8, shape (rows, cols, 3)
         Blue first.
     most_bytes : int
         Of the file.
-
-    Raises
-    ------
-    StoreError
-        If even half of its size in the worst quality takes more.
 
     Examples
     --------
@@ -72,10 +69,7 @@ def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
 def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write pixels without loss, whole or not at all.
 
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written.
+    Raise StoreError if the folder cannot be written.
     """
     scratch = path.with_name(f".{path.name}.partial")
     try:

@@ -191,8 +191,6 @@ def _mark(matcher: str, query_id: str) -> str:
 def count_cases(cases: pd.DataFrame) -> dict[str, int]:
     """Count the failures of each class.
 
-    Examples
-    --------
     >>> count_cases(pd.DataFrame({"failure": ["aged", "aged"]}))["aged"]
     2
     """

@@ -90,12 +90,8 @@ def find_pair(windows: Windows) -> Pair:
 
     Of the tenth of places whose drawn classes are most evenly mixed (largest entropy of their shares), the one whose
     nearest other place by the shares of all classes is nearest. The other lies at least three footprint radii away, as
-    every decoy does. Shares are those of discs: turning changes nothing.
-
-    Raises
-    ------
-    ConfigError
-        If no place holds enough, or none lies far enough from it.
+    every decoy does. Shares are those of discs: turning changes nothing. Raise ConfigError if no place holds enough, or
+    none lies far enough from it.
     """
     shares = windows.shares.reshape(len(windows.points_m), -1, RINGS).mean(axis=2)
     total = shares.sum(axis=1)
@@ -133,6 +129,8 @@ def _place(point_m: NDArray[np.float64]) -> tuple[float, float]:
 def find_lookalike(mapped: Region, world: Region, learnt: ScorerModel, arm: Switches, *, side_m: float) -> Lookalike:
     """Show a place as it is on the day of `world`, and score it and its lookalike on an older map.
 
+    Raise ConfigError if the regions are of two places, the map is the younger one, or it holds no such pair of places.
+
     Parameters
     ----------
     mapped, world : Region
@@ -143,11 +141,6 @@ def find_lookalike(mapped: Region, world: Region, learnt: ScorerModel, arm: Swit
         Which scorer.
     side_m : float
         Side of the view.
-
-    Raises
-    ------
-    ConfigError
-        If the regions are of two places, the map is the younger one, or it holds no such pair of places.
     """
     check_dates(mapped, world)
     on_map, in_world = State.of(mapped), State.of(world)

@@ -260,8 +260,6 @@ def stanford_areas(told: ProtectionLevels, limit_m: float) -> dict[str, int]:
 
     Misleading ones are those within the alert limit, so that the four add up.
 
-    Examples
-    --------
     >>> levels = {"level_m": np.array([5.0, 5.0, 5.0, 99.0]), "error_m": np.array([1.0, 9.0, 60.0, 1.0])}
     >>> some = ProtectionLevels(prior_group="r", method="gauss", risk=0.01, sites=np.array(["a"] * 4), **levels)
     >>> stanford_areas(some, 25.0)

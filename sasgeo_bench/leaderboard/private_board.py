@@ -220,8 +220,6 @@ def said_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[
 def seed_lines(about: Mapping[str, Any]) -> list[str]:
     """Return whether the rows of a board were compared with a private seed, and the result of each.
 
-    Examples
-    --------
     >>> seed_lines({"entries": [{"name": "mine", "how": "run here"}]})[0][:40]
     'Seeds: the queries of this board are dra'
     """
@@ -262,13 +260,8 @@ class OnPrivate:
 def seed_of(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Commitment and bits of the private seed that tasks were drawn by; None of public tasks.
 
-    Raises
-    ------
-    ConfigError
-        If they are of several seeds, or some are public.
+    Raise ConfigError if they are of several seeds, or some are public.
 
-    Examples
-    --------
     >>> seed_of([{"suite": "clean"}]) is None
     True
     """
@@ -286,13 +279,8 @@ def seed_of(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
 def check_public(seed: Mapping[str, Any] | None, what: str) -> None:
     """Refuse to publish what is of a private seed: once its queries or truths are out, it vouches for nothing.
 
-    Raises
-    ------
-    ConfigError
-        Naming what.
+    Raise ConfigError naming what.
 
-    Examples
-    --------
     >>> check_public(None, "out/boards/mine")
     """
     if seed is not None:
@@ -315,6 +303,9 @@ def hold_private(
 ) -> OnPrivate:
     """Hold the rows of a public board against a board of a private seed.
 
+    Raise ConfigError if the folder holds no board of a private seed, or one of another pipeline or version, or the
+    public one is itself of a private seed. Raise StoreError if it holds no sound board.
+
     Parameters
     ----------
     folder : Path
@@ -327,14 +318,6 @@ def hold_private(
         Of the bootstrap.
     tell : callable
         Gets a line for what the two boards do not share.
-
-    Raises
-    ------
-    ConfigError
-        If the folder holds no board of a private seed, or one of another pipeline or version, or the public one is
-        itself of a private seed.
-    StoreError
-        If it holds no sound board.
     """
     about = read_private(folder, pipeline)
     if seed_of(tasks) is not None:
@@ -366,13 +349,8 @@ def hold_private(
 def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
     """Read the `board.json` of a private board that rows of a pipeline are compared with.
 
-    Raises
-    ------
-    ConfigError, StoreError
-        As `hold_private` does.
+    Raise ConfigError or StoreError as `hold_private` does.
 
-    Examples
-    --------
     >>> read_private(Path("nowhere"), {})
     Traceback (most recent call last):
         ...

@@ -135,6 +135,8 @@ def _plain(value: float | str) -> float | str:
 def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePicture:
     """Read the map, evidence and poses that the picture of a case shows.
 
+    Raise StoreError if the map is missing, damaged, or was built anew since the queries were drawn.
+
     Parameters
     ----------
     case : Case
@@ -143,11 +145,6 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
         Folder of the map that is searched.
     about : mapping
         What `task.json` says: the map must be that very build.
-
-    Raises
-    ------
-    StoreError
-        If the map is missing, damaged, or was built anew since the queries were drawn.
     """
     manifest = region_files.read_manifest(region)
     if not task_files.is_of_map(about, manifest):
@@ -323,8 +320,6 @@ def root_of(run: Path, out: Path) -> Path:
 def is_run(folder: Path) -> bool:
     """Return whether a folder is a run, or holds those of a matcher.
 
-    Examples
-    --------
     >>> is_run(Path("nowhere"))
     False
     """
@@ -334,6 +329,9 @@ def is_run(folder: Path) -> bool:
 
 def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequence[str] = (), tell: Tell) -> RunCases:
     """Score the answers of a run.
+
+    Raise StoreError if no task of the run is there as it was asked, or a truth is missing. Raise ConfigError if the
+    folder holds runs of several matchers.
 
     Parameters
     ----------
@@ -347,13 +345,6 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
         Names, or module:Class; the matcher's own word is always among them.
     tell : callable
         Gets a line for runs that are left out.
-
-    Raises
-    ------
-    StoreError
-        If no task of the run is there as it was asked, or a truth is missing.
-    ConfigError
-        If the folder holds runs of several matchers.
     """
     entries = find_entries([run])
     if len(entries) > 1:
@@ -417,19 +408,15 @@ def _judged(
 def picture_of(cases: RunCases, query: str) -> tuple[str, CasePicture]:
     """Id of a query and what its picture shows.
 
+    Raise ConfigError if no query, or more than one, begins so. Raise StoreError if the query was drawn anew since it
+    was asked, or its map is missing or another one.
+
     Parameters
     ----------
     cases : RunCases
         The run.
     query : str
         The beginning of an id.
-
-    Raises
-    ------
-    ConfigError
-        If no query, or more than one, begins so.
-    StoreError
-        If the query was drawn anew since it was asked, or its map is missing or another one.
     """
     query_id = _find(cases, query)
     row = cases.scores[cases.scores["query_id"] == query_id].iloc[0]

@@ -23,19 +23,10 @@ def brier(answers: Answers, weights: ArrayLike | None = None) -> float:
     """Return the Brier score of the confidences: the mean of (confidence - right)^2 over answered queries, in [0, 1].
 
     NaN without answers, and where any answer has no confidence: otherwise a method could omit unsure confidences to
-    look calibrated.
+    look calibrated. Raise MetricError if a confidence is no probability.
 
-    Raises
-    ------
-    MetricError
-        If a confidence is no probability.
-
-    Notes
-    -----
     Brier, Monthly Weather Review 1950, for two outcomes: half of his sum.
 
-    Examples
-    --------
     >>> brier(Answers(confidence=[0.5, 1.0], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1]))
     0.125
     """
@@ -51,19 +42,10 @@ def calibration_error(answers: Answers, weights: ArrayLike | None = None, *, bin
     """Return the expected calibration error over at most `bins` bins of equal mass, in [0, 1].
 
     This is the mean over answers of |mean confidence - fraction right| of their bin. NaN as for `brier`. It is biased
-    upwards for few answers.
+    upwards for few answers. Raise MetricError if a confidence is no probability, or there is no bin.
 
-    Raises
-    ------
-    MetricError
-        If a confidence is no probability, or there is no bin.
-
-    Notes
-    -----
     Nguyen and O'Connor, EMNLP 2015; for the bias see Roelofs et al., AISTATS 2022.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.9, 0.1], is_answered=[1] * 3, is_right=[1, 0, 0], is_present=[1] * 3)
     >>> round(calibration_error(some, bins=2), 3)  # (2 |0.9 - 0.5| + |0.1 - 0|) / 3
     0.3
@@ -87,8 +69,6 @@ def equal_mass_bins(confidence: Floats, mass: Floats | None = None, *, bins: int
 
     Equal confidences share the bin that holds the middle of their mass. `mass` is positive, shape (N,); 1 by default.
 
-    Examples
-    --------
     >>> equal_mass_bins(np.array([0.9, 0.1, 0.9, 0.9]), bins=2).tolist()
     [1, 0, 1, 1]
     """
@@ -126,6 +106,8 @@ class Stanford:
 def stanford(protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_limit_m: float) -> Stanford:
     """Return the area of the Stanford diagram that each query lies in.
 
+    Raise MetricError if a value is negative or NaN, or the limit is not positive and finite.
+
     Parameters
     ----------
     protection_level_m : array_like, shape (N,)
@@ -134,11 +116,6 @@ def stanford(protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_l
         Infinite for an answer where the place is absent.
     alert_limit_m : float
         Largest error that is safe to use.
-
-    Raises
-    ------
-    MetricError
-        If a value is negative or NaN, or the limit is not positive and finite.
 
     Notes
     -----

@@ -45,19 +45,10 @@ def mcnemar_exact(first: ArrayLike, second: ArrayLike) -> PairedTest:
     """Test by McNemar's exact test whether two methods are right equally often.
 
     The inputs are hits (0 or 1), shape (N,), in the same order of queries. The p-value is that of a fair coin tossed
-    once per discordant query.
+    once per discordant query. Raise MetricError if a value is neither 0 nor 1, or the numbers differ.
 
-    Raises
-    ------
-    MetricError
-        If a value is neither 0 nor 1, or the numbers differ.
-
-    Notes
-    -----
     The test assumes independent queries, which those of one block are not: compare `mcnemar_clustered`.
 
-    Examples
-    --------
     Six discordant queries, all for the first: 2 / 2^6.
 
     >>> mcnemar_exact([1, 1, 1, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0, 0])
@@ -74,19 +65,13 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
     """Test by McNemar's test for clustered queries whether two methods are right equally often.
 
     The inputs are as for `mcnemar_exact`, with the block of each query. The p-value is NaN for fewer than two blocks.
+    Raise MetricError if a value is neither 0 nor 1, or the numbers differ.
 
-    Raises
-    ------
-    MetricError
-        If a value is neither 0 nor 1, or the numbers differ.
-
-    Notes ----- Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K, (K
+    Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K, (K
     - 1) / K (sum d_k)^2 / sum d_k^2 is chi-squared with one degree of freedom. It tests the difference of the means
     over all queries, which boards print; Durkalski et al. (2003) give each block the same weight instead. With one
     query per block it is McNemar's test without correction, times (K - 1) / K.
 
-    Examples
-    --------
     Blocks differ by 2, 2 and 2: (2/3) 6^2 / 12 = 2.
 
     >>> found = mcnemar_clustered([1] * 6, [0] * 6, ["a", "a", "b", "b", "c", "c"])
@@ -110,15 +95,9 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values adjusted for the number of registered contrasts (Holm, Scandinavian Journal of Statistics 1979).
 
-    A contrast holds at level a if its adjusted value is at most a. Pass every registered contrast and no others.
+    A contrast holds at level a if its adjusted value is at most a. Pass every registered contrast and no others. Raise
+    MetricError if a value lies outside [0, 1] or is NaN: a contrast without a test has p = 1.
 
-    Raises
-    ------
-    MetricError
-        If a value lies outside [0, 1] or is NaN: a contrast without a test has p = 1.
-
-    Examples
-    --------
     >>> {name: round(value, 3) for name, value in holm({"graph": 0.01, "stability": 0.04, "unknown": 0.03}).items()}
     {'graph': 0.03, 'stability': 0.06, 'unknown': 0.06}
     """
@@ -136,6 +115,7 @@ def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["hig
     """Return which method is better than which, shape (M, M), at a level of 95 % for all pairs at once.
 
     An element is True where the method of the row is better than that of the column and the difference is significant.
+    Raise MetricError if shapes do not fit, or a number is not finite.
 
     Parameters
     ----------
@@ -143,11 +123,6 @@ def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["hig
         Metric of each of M methods.
     draws : array_like, shape (D, M)
         The same in D paired draws, as from `bootstrap_means`.
-
-    Raises
-    ------
-    MetricError
-        If shapes do not fit, or a number is not finite.
 
     Notes
     -----
@@ -207,15 +182,9 @@ class RankInterval:
 def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
     """Return the rank interval of each method from the table of `distinguishable`, shape (M, M).
 
-    The best rank is one more than the number of better methods; the worst leaves room for all known to be worse.
+    The best rank is one more than the number of better methods; the worst leaves room for all known to be worse. Raise
+    MetricError if the table is not square, or two methods are better than each other.
 
-    Raises
-    ------
-    MetricError
-        If the table is not square, or two methods are better than each other.
-
-    Examples
-    --------
     The first beats the third, nothing else is certain:
 
     >>> [rank.text for rank in rank_intervals([[0, 0, 1], [0, 0, 0], [0, 0, 0]])]
@@ -239,21 +208,13 @@ def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> f
     """Return how much more alike values of one block are than values of different blocks, at most 1.
 
     Negative where values of a block are less alike than chance. NaN for fewer than two blocks, without a block of two
-    queries, or where nothing varies. For two methods, pass the difference of their hits per query.
+    queries, or where nothing varies. For two methods, pass the difference of their hits per query. Raise MetricError if
+    a value is not finite.
 
-    Raises
-    ------
-    MetricError
-        If a value is not finite.
-
-    Notes
-    -----
     The analysis-of-variance estimator for blocks of unequal size (Donner, International Statistical Review 1986):
     (B - W) / (B + (n0 - 1) W), with B and W the mean squares between and within K blocks and
     n0 = (N - sum n_k^2 / N) / (K - 1).
 
-    Examples
-    --------
     >>> intraclass_correlation([1.0, 1.0, 0.0, 0.0], ["a", "a", "b", "b"])
     1.0
     """
@@ -276,20 +237,12 @@ def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> f
 def design_effect(sizes: ArrayLike, correlation: float) -> float:
     """Return how many times more queries blocks need than independent ones, at least 1.
 
-    `sizes`, shape (K,), are the queries of each block; a negative correlation counts as 0.
+    `sizes`, shape (K,), are the queries of each block; a negative correlation counts as 0. Raise MetricError if there
+    is no block, a block is empty, or the correlation exceeds 1.
 
-    Raises
-    ------
-    MetricError
-        If there is no block, a block is empty, or the correlation exceeds 1.
-
-    Notes
-    -----
     Kish 1965: 1 + (m - 1) rho, with m = sum n_k^2 / sum n_k the size of the block of a random query, which for equal
     blocks is their size.
 
-    Examples
-    --------
     >>> round(design_effect([50] * 36, 0.05), 2)
     3.45
     """
@@ -314,7 +267,7 @@ def detectable_difference(
 ) -> float:
     """Return the least difference of two shares that McNemar's test finds with some independent pairs.
 
-    Infinite if even a difference of `discordant_share` would be missed.
+    Infinite if even a difference of `discordant_share` would be missed. Raise MetricError if a number is out of range.
 
     Parameters
     ----------
@@ -326,11 +279,6 @@ def detectable_difference(
         Two-sided level.
     power : float
         Chance to find the difference, in [0.5, 1).
-
-    Raises
-    ------
-    MetricError
-        If a number is out of range.
 
     Notes
     -----
@@ -358,15 +306,8 @@ def sensitivity(first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Int
     """Return the minimum detectable difference of two methods on a suite; infinite if even the largest would be missed.
 
     `first` and `second` are hits in [0, 1], shape (N,), for the same queries. A correlation that cannot be estimated
-    counts as 0.
+    counts as 0. Raise MetricError if there is no query, or numbers differ.
 
-    Raises
-    ------
-    MetricError
-        If there is no query, or numbers differ.
-
-    Examples
-    --------
     >>> blocks = [str(at // 50) for at in range(1800)]
     >>> round(sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks), 4)
     0.0166

@@ -120,6 +120,8 @@ def hold_contrasts(
 ) -> tuple[Finding, ...]:
     """Test every registered contrast, in order; a contrast without queries, or with a failed side, has p = 1.
 
+    Raise ConfigError if a contrast names a method that is not on the board, and none failed.
+
     Parameters
     ----------
     contrasts : sequence of Contrast
@@ -132,11 +134,6 @@ def hold_contrasts(
         Number of bootstrap draws.
     failed : collection of str
         Matchers, and "matcher x rejector", that failed and so are not on the board.
-
-    Raises
-    ------
-    ConfigError
-        If a contrast names a method that is not on the board, and none failed.
     """
     there = scores.keys() | {" x ".join(key) for key in rejections}
     found = [
@@ -183,12 +180,8 @@ def both_on(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of both sides on a contrast's suites, track and kinds, for the same queries in the same order.
 
-    `known` holds scored rows by the names of sides; `chosen` selects the rows that count, shape (N,).
-
-    Raises
-    ------
-    ConfigError
-        If a side is not on the board.
+    `known` holds scored rows by the names of sides; `chosen` selects the rows that count, shape (N,). Raise ConfigError
+    if a side is not on the board.
     """
     frames = []
     for name in (contrast.first, contrast.second):

@@ -57,13 +57,8 @@ class Costs:
 def run_cost(about: Mapping[str, Any]) -> RunCost:
     """Read the cost of a run from the content of `run.json`, empty for a submission without code.
 
-    Raises
-    ------
-    MetricError
-        If an entry is no number.
+    Raise MetricError if an entry is no number.
 
-    Examples
-    --------
     >>> cost = run_cost({"prepare_s": 2.5, "peak_bytes": 3_000_000})
     >>> cost.prepare_s, cost.peak_rss_mb, cost.cpu_s
     (2.5, 3.0, nan)
@@ -130,15 +125,9 @@ def sent_kb_per_fix(costs: Costs) -> float:
 def per_fix(total: float, fixes: float) -> float:
     """Return the total cost of all queries, answered or not, per fix.
 
-    Infinite for a cost without fixes; NaN for no cost and no fixes, or an unknown total.
+    Infinite for a cost without fixes; NaN for no cost and no fixes, or an unknown total. Raise MetricError if a number
+    is negative.
 
-    Raises
-    ------
-    MetricError
-        If a number is negative.
-
-    Examples
-    --------
     >>> per_fix(9000.0, 3), per_fix(9000.0, 0)
     (3000.0, inf)
     """

@@ -23,6 +23,9 @@ PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
 class Answers:
     """Answers to N queries of the integrity track, present and absent places mixed; each column has shape (N,).
 
+    Raise MetricError if shapes differ, a confidence is infinite, or a fix is right without an answer or without a
+    place.
+
     Parameters
     ----------
     confidence : ndarray of float
@@ -34,11 +37,6 @@ class Answers:
         The fix is within tolerance of a present place.
     is_present : ndarray of bool
         The place is on the searched map.
-
-    Raises
-    ------
-    MetricError
-        If shapes differ, a confidence is infinite, or a fix is right without an answer or without a place.
 
     Examples
     --------
@@ -82,13 +80,8 @@ class Answers:
 def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | None = None) -> Floats:
     """Return weights, shape (N,), under which present places make up a given share of the queries; their sum is kept.
 
-    Raises
-    ------
-    MetricError
-        If the share is not in [0, 1], or a side of positive share has no query.
+    Raise MetricError if the share is not in [0, 1], or a side of positive share has no query.
 
-    Examples
-    --------
     >>> presence_weights([True, True, True, False], 0.5).round(3).tolist()
     [0.667, 0.667, 0.667, 2.0]
     """
@@ -111,8 +104,6 @@ def accept(answers: Answers, threshold: float) -> Bools:
 
     A threshold of `-inf` accepts every answer, even without a confidence; queries without an answer are never accepted.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.5, 0.4], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 1, 1])
     >>> accept(some, 0.5).tolist(), accept(some, -np.inf).tolist()
     ([True, True, False], [True, True, False])
@@ -124,19 +115,10 @@ def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
     """Return which fixes Eq. (14) accepts, shape (N,): chance of a false fix below 1 / (1 + cost ratio).
 
     The cost ratio is the cost of a false fix over that of withholding a right one: 5, 20 or 100. False without an
-    answer or without a confidence.
+    answer or without a confidence. Raise MetricError if the ratio is not positive, or a confidence is no probability.
 
-    Raises
-    ------
-    MetricError
-        If the ratio is not positive, or a confidence is no probability.
-
-    Notes
-    -----
     The SASGeo paper, Eqs. (12)-(14), with P(F=1|E) = 1 - confidence; strict, as printed there.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.8, np.nan], is_answered=[1, 1, 1], is_right=[1, 0, 0], is_present=[1, 1, 1])
     >>> accept_by_cost(some, 5.0).tolist()
     [True, False, False]
@@ -155,10 +137,7 @@ def _check_ratio(cost_ratio: float) -> None:
 def check_probabilities(answers: Answers) -> None:
     """Check that all confidences lie in [0, 1].
 
-    Raises
-    ------
-    MetricError
-        With the range found.
+    Raise MetricError with the range found.
     """
     given = answers.confidence[~np.isnan(answers.confidence)]
     if ((given < 0) | (given > 1)).any():
@@ -170,6 +149,8 @@ def cost_values(
     answers: Answers, accepted: ArrayLike, cost_ratio: float, *, charged: Literal["right fix", "place"] = "right fix"
 ) -> Floats:
     """Return the cost of each query's decision, shape (N,), in units of a wrongly withheld fix: 0, 1 or `cost_ratio`.
+
+    Raise MetricError if the ratio is not positive, or a query without an answer is accepted.
 
     Parameters
     ----------
@@ -183,11 +164,6 @@ def cost_values(
         What costs 1 when withheld. "right fix" (Eq. (13)) evaluates the decision alone: a matcher that is never right
         and withholds everything costs 0. "place" charges every present place without a fix and evaluates the whole
         method.
-
-    Raises
-    ------
-    MetricError
-        If the ratio is not positive, or a query without an answer is accepted.
 
     Examples
     --------
@@ -215,8 +191,6 @@ def decision_cost(
 ) -> float:
     """Return the mean of `cost_values` when fixes are accepted by Eq. (14); NaN for no queries.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1])
     >>> decision_cost(some, 5.0)
     0.5

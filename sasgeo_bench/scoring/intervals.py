@@ -36,6 +36,8 @@ def seed_of_text(text: str) -> int:
 class ClusterDraws:
     """Draws with replacement: first blocks, then sites within each drawn block, with all their queries.
 
+    Raise MetricError if the number of draws is not positive, or the numbers of sites and blocks differ.
+
     Parameters
     ----------
     blocks : sequence of str or ndarray of int, length N
@@ -50,12 +52,9 @@ class ClusterDraws:
     draws_within : bool
         False draws whole blocks.
 
-    Raises
-    ------
-    MetricError
-        If the number of draws is not positive, or the numbers of sites and blocks differ.
-
-    Notes ----- A block of n sites that is drawn c times gives c n sites, each drawn from its n. Sample sizes differ
+    Notes
+    -----
+    A block of n sites that is drawn c times gives c n sites, each drawn from its n. Sample sizes differ
     between draws if blocks or sites differ in size; means are ratios of sums and account for that.
 
     Examples
@@ -214,19 +213,11 @@ class Interval:
 def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval:
     """Return Wilson's score interval of a proportion; [0, 1] without trials.
 
-    `successes` and `trials` may be fractions, as for hits shared among tied poses or with weights.
+    `successes` and `trials` may be fractions, as for hits shared among tied poses or with weights. Raise MetricError if
+    not 0 <= successes <= trials, or the level is not in (0, 1).
 
-    Raises
-    ------
-    MetricError
-        If not 0 <= successes <= trials, or the level is not in (0, 1).
-
-    Notes
-    -----
     Wilson, JASA 1927, without continuity correction. The trials must be independent: across blocks use the bootstrap.
 
-    Examples
-    --------
     The SASGeo paper's Recall@1 of 0.586 in 220 trials:
 
     >>> found = wilson(129, 220)
@@ -255,15 +246,8 @@ def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Interval
     """Return Wilson's interval of a mean of values in [0, 1], shape (N,), as hits with ties.
 
     Values between 0 and 1 vary less than successes and failures, so the interval is not too narrow. Weights count as
-    (sum w)^2 / sum w^2 trials (Kish 1965).
+    (sum w)^2 / sum w^2 trials (Kish 1965). Raise MetricError if a value lies outside [0, 1].
 
-    Raises
-    ------
-    MetricError
-        If a value lies outside [0, 1].
-
-    Examples
-    --------
     >>> wilson_mean([1.0, 0.5, 0.5, 0.0]) == wilson(2, 4)
     True
     """
@@ -281,15 +265,9 @@ def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Interval
 def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Floats:
     """Return weighted means of every draw, shape (D,) or (D, M); NaN where a draw has no weight.
 
-    `values` has shape (N,), or (N, M) for M methods or metrics that share the draws.
+    `values` has shape (N,), or (N, M) for M methods or metrics that share the draws. Raise MetricError if a value is
+    not finite, or their number is not that of the queries.
 
-    Raises
-    ------
-    MetricError
-        If a value is not finite, or their number is not that of the queries.
-
-    Examples
-    --------
     >>> drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=4000)
     >>> means = bootstrap_means([[0.0, 1.0], [1.0, 0.0]], drawn)
     >>> means.shape, round(float((means[:, 0] == 1).mean()), 2)
@@ -312,8 +290,6 @@ def bootstrap_statistic(statistic: Statistic, drawn: ClusterDraws, weights: Arra
 
     `statistic` maps weights, shape (N,), to a number, as `lambda weights: aurc(answers, weights)`.
 
-    Examples
-    --------
     >>> drawn = ClusterDraws(blocks=["a", "a", "b", "b"], seed=1, draws=50)
     >>> values = np.array([1.0, 0.0, 1.0, 1.0])
     >>> slow = bootstrap_statistic(lambda weights: weighted_mean(values, weights), drawn)
@@ -327,8 +303,6 @@ def bootstrap_statistic(statistic: Statistic, drawn: ClusterDraws, weights: Arra
 def percentile_interval(value: float, draws: ArrayLike, *, level: float = LEVEL) -> Interval:
     """Return the interval between percentiles of the draws, shape (D,), without NaN; NaN where none is left.
 
-    Examples
-    --------
     >>> percentile_interval(0.5, np.linspace(0.0, 1.0, 1001))
     Interval(value=0.5, lo=0.025, hi=0.975)
     """
@@ -347,8 +321,6 @@ def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = No
 
     Groups of equal mass count 1 each; 0 for nothing.
 
-    Examples
-    --------
     >>> effective_count(["a", "a", "b", "b"]), effective_count(["a", "a", "a", "b"])
     (2.0, 1.6)
     """
@@ -373,7 +345,9 @@ def share_interval(value: float, draws: ArrayLike, trials: float) -> tuple[Inter
     trials : float
         Effective number of independent trials, as sites by `effective_count`.
 
-    Notes ----- A mean of values in [0, 1] varies at most as much as a proportion, so Wilson's interval of as many sites
+    Notes
+    -----
+    A mean of values in [0, 1] varies at most as much as a proportion, so Wilson's interval of as many sites
     is wide enough if blocks add no correlation. Draws alone are too narrow for few sites, and a point where all answers
     are right. The wider end keeps the order: a method that is right wherever another one is has both ends at least as
     high.
@@ -402,8 +376,6 @@ def difference_interval(first: Interval, second: Interval) -> Interval:
     The sides are independent, or vary against each other no more than parts of one whole. Distances to the ends are
     added in quadrature (Newcombe 1998; Zou and Donner, Statistics in Medicine 2008).
 
-    Examples
-    --------
     No query of four was won by either of two methods:
 
     >>> found = difference_interval(wilson(0, 4), wilson(0, 4))
@@ -424,8 +396,6 @@ def mean_interval(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | N
     `values`, shape (N,), are finite; the difference of two methods per query gives a paired interval. The interval is a
     point where all values are equal: compare `wilson_mean`.
 
-    Examples
-    --------
     >>> mean_interval([1.0, 0.0, 1.0, 1.0], ClusterDraws(blocks=["a", "a", "b", "b"], seed=1, draws=500))
     Interval(value=0.75, lo=0.25, hi=1.0)
     """

@@ -411,8 +411,6 @@ METRICS: Final[tuple[Metric, ...]] = (*_MEANS, *QUANTILES, *REJECTION, *THRESHOL
 def means_of(track: str) -> tuple[MeanMetric, ...]:
     """Return the metrics of a track that are means over queries.
 
-    Examples
-    --------
     >>> [metric.name for metric in means_of("retrieval")]
     ['recall_1', 'recall_5', 'chance_1', 'mrr', 'answered', 'answered_absent']
     """

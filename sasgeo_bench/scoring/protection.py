@@ -64,8 +64,6 @@ def stanford_counts(
 
     `trials` is the effective number of independent trials, N by default; NaN in [0, 1] for no queries.
 
-    Examples
-    --------
     Of six queries five have a level of 5 m and errors of 4, 4, 4, 6 and 11 m, one has neither; the limit is 10 m:
 
     >>> counts = stanford_counts([5, 5, 5, 5, 5, np.inf], [4, 4, 4, 6, 11, np.inf], 10.0)
@@ -96,8 +94,6 @@ def supported_risk(failures: float, trials: float, *, confidence: float = LEVEL)
 
     Counts need not be whole; 0 <= failures <= trials.
 
-    Examples
-    --------
     >>> supported_risk(0, 299) < 0.01 < supported_risk(0, 298), supported_risk(0, 0)
     (True, 1.0)
     """
@@ -110,17 +106,9 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     """Return which risk some counts support, in a line that claims no more than they support.
 
     The bound is Clopper-Pearson's upper end, one-sided. Without failures, the line also gives the trials that the risk
-    takes.
+    takes. Raise MetricError if the risk or the confidence is not in (0, 1). Raise ConfigError if not 0 <= failures <=
+    trials.
 
-    Raises
-    ------
-    MetricError
-        If the risk or the confidence is not in (0, 1).
-    ConfigError
-        If not 0 <= failures <= trials.
-
-    Examples
-    --------
     >>> statement(0, 299, risk=0.01)
     '0 of 299 support below 1 % (95 % confidence)'
     >>> statement(0, 100, risk=0.01)
@@ -151,20 +139,11 @@ def conformal_factor(position_error_m: ArrayLike, scale_m: ArrayLike, risk: floa
 
     It is the ceil((N + 1) (1 - risk))-th least ratio of error to scale over N calibration answers; infinite where that
     is more than N, or falls among infinite errors (absent places). The scale is each answer's estimate of its
-    uncertainty.
+    uncertainty. Raise MetricError if the risk or a number is out of range.
 
-    Raises
-    ------
-    MetricError
-        If the risk or a number is out of range.
-
-    Notes
-    -----
     Split conformal prediction (Vovk et al. 2005; Lei et al., JASA 2018). It holds on average over calibration sets, for
     answers that are exchangeable with those of calibration; it says nothing about accepted answers.
 
-    Examples
-    --------
     >>> conformal_factor([2.0, 4.0, 6.0, 8.0], [2.0, 2.0, 2.0, 2.0], 0.2), conformal_factor([1.0], [1.0], 0.2)
     (4.0, inf)
     """

@@ -170,10 +170,7 @@ class Rule:
 def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
     """Return rejectors by name from names or module:Class, after making each once.
 
-    Raises
-    ------
-    ConfigError
-        If there is no split, two share a name, or one has that of a matcher's own confidence.
+    Raise ConfigError if there is no split, two share a name, or one has that of a matcher's own confidence.
     """
     found: dict[str, Rule] = {}
     named: dict[str, str] = {}
@@ -253,8 +250,6 @@ def judge(
 def remarks_of(judged: pd.DataFrame) -> list[str]:
     """Return a rejector's remarks on its fits with the number of answers; remarks that differ in numbers are one.
 
-    Examples
-    --------
     >>> remarks_of(pd.DataFrame({"remark": ["", "2 too few", "2 too few"], "is_answered": [True, True, False]}))
     ['2 too few (1 answer judged so)']
     >>> remarks_of(pd.DataFrame({"remark": ["2 too few", "9 too few", "9 too few"], "is_answered": True}))
@@ -273,8 +268,6 @@ def remarks_of(judged: pd.DataFrame) -> list[str]:
 def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:
     """Return why `judge` has no row for a matcher; `is_taught` as there.
 
-    Examples
-    --------
     >>> why_not(pd.DataFrame({"is_answered": [False, False], "place": ["vaduz", "monaco"]}))
     'it has no answers to judge'
     """

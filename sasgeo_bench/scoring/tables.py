@@ -41,6 +41,8 @@ def leaderboard(
 ) -> pd.DataFrame:
     """Return the metrics of every matcher on every suite, track, prior group and stratum, with the columns of `Row`.
 
+    Raise MetricError if two matchers were scored on different queries.
+
     Parameters
     ----------
     scored : mapping of str to pandas.DataFrame
@@ -51,11 +53,6 @@ def leaderboard(
         Matchers without a rank, which are nobody's rivals; controls are always so.
     done : callable
         Called after each suite, track and prior group.
-
-    Raises
-    ------
-    MetricError
-        If two matchers were scored on different queries.
     """
     groups = _groups(_aligned(scored))
     unranked = frozenset({*excluded, *filter(is_unranked, scored)})

@@ -80,20 +80,15 @@ def equal_mass_bins(confidence: Floats, mass: Floats | None = None, *, bins: int
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stanford:
-    """Areas of the Stanford diagram, each of shape (N,); every query lies in exactly one.
+    """Areas of the Stanford diagram as masks, each of shape (N,); every query lies in exactly one.
 
-    Parameters
-    ----------
-    nominal : ndarray of bool
-        Available and bounded: error <= level <= limit.
-    misleading : ndarray of bool
-        Available, not bounded, harmless: level < error <= limit.
-    hazardous : ndarray of bool
-        Hazardously misleading: level <= limit < error.
-    unavailable : ndarray of bool
-        Not available, bounded: limit < level, error <= level.
-    unavailable_misleading : ndarray of bool
-        Not available, not bounded: limit < level < error.
+    Available means level <= limit, bounded error <= level.
+
+    - nominal: available and bounded
+    - misleading: available, not bounded, harmless (level < error <= limit)
+    - hazardous: hazardously misleading (level <= limit < error)
+    - unavailable: not available, bounded
+    - unavailable_misleading: not available, not bounded (limit < level < error)
     """
 
     nominal: Bools
@@ -106,23 +101,12 @@ class Stanford:
 def stanford(protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_limit_m: float) -> Stanford:
     """Return the area of the Stanford diagram that each query lies in.
 
-    Raise MetricError if a value is negative or NaN, or the limit is not positive and finite.
+    The protection level, shape (N,), is the stated upper bound of the error; infinite without a level or an answer. The
+    position error, shape (N,), is infinite for an answer where the place is absent. The alert limit is the largest
+    error that is safe to use. Raise MetricError if a value is negative or NaN, or the limit is not positive and finite.
 
-    Parameters
-    ----------
-    protection_level_m : array_like, shape (N,)
-        Stated upper bound of the error; infinite without a level or an answer.
-    position_error_m : array_like, shape (N,)
-        Infinite for an answer where the place is absent.
-    alert_limit_m : float
-        Largest error that is safe to use.
-
-    Notes
-    -----
     Tossaint et al., "The Stanford-ESA integrity diagram", NAVIGATION 2007. Equality counts as within.
 
-    Examples
-    --------
     >>> areas = stanford([5.0, 5.0, 5.0, 20.0], [4.0, 6.0, 11.0, 11.0], 10.0)
     >>> areas.misleading.tolist(), areas.hazardous.tolist()
     ([False, True, False, False], [False, False, True, False])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, check_weights, weighted_mean
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, weighted_mean
 
 COST_RATIOS: Final = (5.0, 20.0, 100.0)
 PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
@@ -23,23 +23,11 @@ PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
 class Answers:
     """Answers to N queries of the integrity track, present and absent places mixed; each column has shape (N,).
 
-    Raise MetricError if shapes differ, a confidence is infinite, or a fix is right without an answer or without a
-    place.
+    `confidence` is the probability that the fix is right, or any other number that increases with trust; NaN if
+    missing. It is ignored where `is_answered` is False: there is no fix that could be accepted. `is_right`: the fix is
+    within tolerance of a present place. `is_present`: the place is on the searched map. Raise MetricError if shapes
+    differ, a confidence is infinite, or a fix is right without an answer or without a place.
 
-    Parameters
-    ----------
-    confidence : ndarray of float
-        Probability that the fix is right, or any other number that increases with trust; NaN if missing. Ignored where
-        there is no answer.
-    is_answered : ndarray of bool
-        There is a fix that could be accepted.
-    is_right : ndarray of bool
-        The fix is within tolerance of a present place.
-    is_present : ndarray of bool
-        The place is on the searched map.
-
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.9, np.nan], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 0, 0])
     >>> some.tie.tolist()
     [0, 0, 1]
@@ -77,8 +65,8 @@ class Answers:
         return len(self.tie)
 
 
-def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | None = None) -> Floats:
-    """Return weights, shape (N,), under which present places make up a given share of the queries; their sum is kept.
+def presence_weights(is_present: ArrayLike, share: float) -> Floats:
+    """Return weights, shape (N,), under which present places make up a given share of the queries; they sum to N.
 
     Raise MetricError if the share is not in [0, 1], or a side of positive share has no query.
 
@@ -86,17 +74,16 @@ def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | N
     [0.667, 0.667, 0.667, 2.0]
     """
     present = check_column(is_present, "is_present") > 0
-    mass = check_weights(weights, len(present))
     if not 0 <= share <= 1:
         message = f"share must lie in [0, 1], got {share!r}"
         raise MetricError(message)
-    wanted = np.where(present, share, 1.0 - share)
-    there = np.where(present, mass[present].sum(), mass[~present].sum()) / max(float(mass.sum()), np.finfo(float).tiny)
-    for side, part in (("present", share), ("absent", 1.0 - share)):
-        if part > 0 and len(present) and not (mass[present == (side == "present")] > 0).any():
+    target = np.where(present, share, 1.0 - share)
+    there = np.where(present, present.sum(), (~present).sum()) / max(len(present), 1)
+    for side, part, count in (("present", share, present.sum()), ("absent", 1.0 - share, (~present).sum())):
+        if part > 0 and len(present) and not count:
             message = f"no query has its place {side}, so none can count {part:g}: draw some, or ask for another share"
             raise MetricError(message)
-    return np.asarray(mass * np.divide(wanted, there, out=np.zeros(len(mass)), where=there > 0))
+    return np.asarray(np.divide(target, there, out=np.zeros(len(present)), where=there > 0))
 
 
 def accept(answers: Answers, threshold: float) -> Bools:
@@ -150,23 +137,11 @@ def cost_values(
 ) -> Floats:
     """Return the cost of each query's decision, shape (N,), in units of a wrongly withheld fix: 0, 1 or `cost_ratio`.
 
-    Raise MetricError if the ratio is not positive, or a query without an answer is accepted.
+    `accepted`, shape (N,), are the accepted fixes; `charged` is what costs 1 when withheld. "right fix" (Eq. (13))
+    evaluates the decision alone: a matcher that is never right and withholds everything costs 0. "place" charges every
+    present place without a fix and evaluates the whole method. Raise MetricError if the ratio is not positive, or a
+    query without an answer is accepted.
 
-    Parameters
-    ----------
-    answers : Answers
-        N queries.
-    accepted : array_like of bool, shape (N,)
-        Accepted fixes.
-    cost_ratio : float
-        Cost of a false fix.
-    charged : {"right fix", "place"}
-        What costs 1 when withheld. "right fix" (Eq. (13)) evaluates the decision alone: a matcher that is never right
-        and withholds everything costs 0. "place" charges every present place without a fix and evaluates the whole
-        method.
-
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.2], is_answered=[1, 1], is_right=[0, 0], is_present=[1, 1])
     >>> cost_values(some, [True, False], 20.0).tolist()
     [20.0, 0.0]
@@ -195,6 +170,5 @@ def decision_cost(
     >>> decision_cost(some, 5.0)
     0.5
     """
-    return weighted_mean(
-        cost_values(answers, accept_by_cost(answers, cost_ratio), cost_ratio, charged=charged), weights
-    )
+    accepted = accept_by_cost(answers, cost_ratio)
+    return weighted_mean(cost_values(answers, accepted, cost_ratio, charged=charged), weights)

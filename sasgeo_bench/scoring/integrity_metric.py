@@ -186,7 +186,7 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     return float(np.interp(coverage * total, accepted, wrong) / (coverage * total))
 
 
-def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | None = None) -> float:
+def choose_threshold(calibration: Answers, risk: float) -> float:
     """Return the threshold of largest coverage whose risk on calibration blocks is at most `risk`.
 
     The result is one of the confidences; `-inf` accepts all answers, some without a confidence; `inf` means that no
@@ -200,6 +200,6 @@ def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | Non
     if not 0 <= risk <= 1:
         message = f"risk must lie in [0, 1], got {risk!r}"
         raise MetricError(message)
-    curve = risk_coverage(calibration, weights)
+    curve = risk_coverage(calibration)
     allowed = np.flatnonzero(curve.risk <= risk)
     return float(curve.threshold[allowed[-1]]) if len(allowed) else math.inf

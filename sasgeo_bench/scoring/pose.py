@@ -23,14 +23,8 @@ AUC_M: Final = 50.0
 class PoseErrors:
     """Errors of N answers, each of shape (N,) and not negative; infinite without an answer.
 
-    Parameters
-    ----------
-    position_m : ndarray of float
-        Distance on the map plane.
-    yaw_deg : ndarray of float
-        Unsigned, in [0, 180].
-    log_scale : ndarray of float
-        |ln(scale / true scale)|: twice too large and half as large are equally wrong, and 0.1 is about 10 %.
+    `position_m` is the distance on the map plane, `yaw_deg` unsigned in [0, 180], `log_scale` is |ln(scale / true
+    scale)|: twice too large and half as large are equally wrong, and 0.1 is about 10 %.
     """
 
     position_m: Floats
@@ -123,16 +117,11 @@ def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, w
     return rank_of([score for _, score in prediction.candidates], successes(errors, within_m, within_deg))
 
 
-def area_values(errors: PoseErrors, up_to_m: float = AUC_M, within_deg: float = SUCCESS_DEG) -> Floats:
-    """Return each query's part of the success AUC, shape (N,): max(0, 1 - error / up_to), 0 for a wrong heading.
-
-    Raise MetricError if `up_to_m` is not positive and finite.
+def area_values(errors: PoseErrors) -> Floats:
+    """Return each query's part of the success AUC, shape (N,): max(0, 1 - error / 50 m), 0 for a wrong heading.
 
     >>> area_values(PoseErrors(position_m=[10.0, 60.0, 0.0], yaw_deg=[0.0, 0.0, 90.0], log_scale=[0.0] * 3)).tolist()
     [0.8, 0.0, 0.0]
     """
-    if not 0 < up_to_m < math.inf:
-        message = f"up_to_m must be positive and finite, got {up_to_m!r}"
-        raise MetricError(message)
-    near = np.maximum(0.0, 1.0 - errors.position_m / up_to_m)
-    return np.where(errors.yaw_deg <= within_deg, near, 0.0)
+    near = np.maximum(0.0, 1.0 - errors.position_m / AUC_M)
+    return np.where(errors.yaw_deg <= SUCCESS_DEG, near, 0.0)

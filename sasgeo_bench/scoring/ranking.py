@@ -20,16 +20,9 @@ from sasgeo_bench.tasks.query import Truth
 class Rank:
     """Rank of the first right pose of one answer.
 
-    Raise MetricError if more are right than tied, or a number is negative.
-
-    Parameters
-    ----------
-    above : int
-        Poses with a higher score.
-    tied : int
-        Poses with the same score, including itself.
-    right : int
-        Number of right poses among the tied ones; 0 if no pose of the answer is right or there is no answer.
+    `above` counts poses with a higher score, `tied` those with the same score, including itself, and `right` the right
+    ones among the tied; 0 if no pose of the answer is right or there is no answer. Raise MetricError if more are right
+    than tied, or a number is negative.
     """
 
     above: int

@@ -71,11 +71,7 @@ class Bar:
 
     @classmethod
     def of_share(cls, row: Record) -> Self | None:
-        """Of a share with an interval; None of anything else.
-
-        >>> Bar.of_share({"value": 0.5, "lo": 0.25, "hi": 0.75, "unit": "1"})
-        Bar(lo=25.0, hi=75.0, at=50.0)
-        """
+        """Return the bar of a share with an interval; None for other figures."""
         ends = tuple(float(row[name]) for name in ("lo", "hi", "value"))
         if row.get("unit") != "1" or not all(0 <= end <= 1 for end in ends):
             return None
@@ -165,11 +161,7 @@ def sort_key(value: float) -> float | None:
 
 
 def text_cells(*texts: str) -> tuple[Cell, ...]:
-    """Return cells of plain text.
-
-    >>> [cell.text for cell in text_cells("a", "b")]
-    ['a', 'b']
-    """
+    """Return cells of plain text."""
     return tuple(Cell(text=str(text)) for text in texts)
 
 
@@ -221,7 +213,7 @@ def rank_cell(row: Record, *, ranked: int, mark: Mark | None = None) -> Cell:
 
 
 def file_stem(*parts: str) -> str:
-    """Parts as letters, digits and hyphens alone.
+    """Return parts as letters, digits and hyphens alone.
 
     >>> file_stem("matcher", "<script>alert(1)</script>")
     'matcher-script-alert-1-script'
@@ -259,24 +251,13 @@ class Tie:
     worst: int
 
     def to_text(self) -> str:
-        """In a line.
-
-        >>> Tie(names=("a", "b"), best=1, worst=2).to_text()
-        'a, b share ranks 1 to 2'
-        """
+        """Return the tie in a line."""
         return f"{', '.join(self.names)} share ranks {self.best} to {self.worst}"
 
 
 def ties_of(rows: Sequence[Record]) -> tuple[Tie, ...]:
-    """Ties among the ranked rows of one table.
+    """Return the ties among the ranked rows of one table; rows without a rank are left out.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        With `matcher`, `rank_best` and `rank_worst`; those without a rank have no part.
-
-    Examples
-    --------
     >>> ranked = [("a", 1, 2), ("b", 1, 2), ("c", 3, 3)]
     >>> ties_of([dict(zip(("matcher", "rank_best", "rank_worst"), row)) for row in ranked])
     (Tie(names=('a', 'b'), best=1, worst=2),)

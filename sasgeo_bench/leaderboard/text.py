@@ -95,18 +95,7 @@ def tables_of(
 ) -> Iterator[Table]:
     """Yield the tables of a board in the order of its pages; those without a row are left out.
 
-    Parameters
-    ----------
-    board : pandas.DataFrame
-        The leaderboard.
-    about : mapping
-        The content of `board.json`.
-    findings, falsifiers, verdicts : sequence
-        Registered contrasts, how they fare without the stress, and controls.
-    steps : pandas.DataFrame, optional
-        From `steps.steps_frame`.
-    ages : mapping, optional
-        From `plot_tables.age_names`.
+    `about` is the content of `board.json`, `steps` is from `strata.steps_frame`, `ages` from `plot_tables.age_names`.
     """
     book = Book.of(board, about)
     suites = [

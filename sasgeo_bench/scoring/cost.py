@@ -36,16 +36,9 @@ class RunCost:
 class Costs:
     """Input of the cost metrics of one matcher.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Its scored rows.
-    runs : sequence of mapping
-        Contents of each `run.json`; none for a file of predictions.
-    view_bytes : mapping of str to int
-        By query: two bits per cell and class, one byte per confidence, WKB per vector.
-    area_km2 : mapping of str to float
-        Mapped area by region, where known.
+    `scores` are its scored rows, `runs` the contents of each `run.json`; none for a file of predictions. `view_bytes`
+    are by query: two bits per cell and class, one byte per confidence, WKB per vector. `area_km2` is the mapped area by
+    region, where known.
     """
 
     scores: pd.DataFrame

@@ -56,8 +56,6 @@ class VersionRecord(_Record):
 class ArchiveRecord(_Record):
     """All of `pack.json`: how the results were scored, and the hash of every file.
 
-    Examples
-    --------
     >>> "files" in ArchiveRecord.model_fields
     True
     """
@@ -158,8 +156,6 @@ class _Task(_Record):
 class BoardRecord(_Record):
     """The fields of `board.json` that pages use.
 
-    Examples
-    --------
     >>> BoardRecord.model_validate({"remarks": ["one"]}).remarks
     ['one']
     """
@@ -202,8 +198,6 @@ class _Case(_Picture):
 class PicturesRecord(_Record):
     """The content of `pictures.json`.
 
-    Examples
-    --------
     >>> PicturesRecord.model_validate({}).cases
     []
     """
@@ -216,13 +210,8 @@ class PicturesRecord(_Record):
 def parse_record(data: bytes | str, model: type[Model]) -> Model:
     """Parse JSON from an untrusted source.
 
-    Raises
-    ------
-    ValueError
-        Naming the first fault in a line: no JSON, nested without end, or a value of another type.
+    Raise ValueError naming the first fault in a line: no JSON, nested without end, or a value of another type.
 
-    Examples
-    --------
     >>> parse_record('{"remarks": 5}', BoardRecord)
     Traceback (most recent call last):
         ...

@@ -23,48 +23,22 @@ from sasgeo_bench.tasks.split import Split
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRequest:
-    """A request for a board.
+    """A request for a board, written to the folder `board`.
 
-    Parameters
-    ----------
-    predictions : sequence of Path
-        Folders of runs (any folder with runs in it), and files of predictions.
-    tasks : sequence of Path
-        Task folders; without any, those that the runs and files answer. A matcher that was asked nothing of one of them
-        has no figures on its suite.
-    root : Path
-        Where tasks/ and truth/ are.
-    truth : Path, optional
-        Folder of the truths, where it is another one.
-    split : Split, optional
-        Says which blocks are one place, and which calibrate; needed for rejectors.
-    contrasts : sequence of Contrast
-        Those that were registered.
-    rejectors : sequence of str
-        Names, or module:Class.
-    board : Path
-        Folder to write.
-    draws : int
-        Of the bootstrap.
-    by_region : collection of str
-        Suites whose regions are resampled, not their blocks: those of which each region is a draw of its own.
-    pipeline : mapping of str to str
-        Name and hash of the pipeline that asks for it; none for a board of `score`.
-    extras : sequence of callable
-        Each makes, of the finished board, files that are written with it.
-    without : collection of str
-        Regions that are left out, on each of their maps.
-    submissions : sequence of Path
-        Folders of submissions, scored as files are, but held to more (`validate.submission_faults`).
-    jobs : int
-        Processes that fit rejectors.
-    private : Path, optional
-        A board of a private seed of the same pipeline, which the rows are held against.
-    kept : mapping, optional
-        What `board.json` of stored results says: the version of their maps is kept, and what came of a private seed
-        where no other board is named.
-    failed : mapping of str to str
-        Contestants that failed before anything was scored, and why.
+    `predictions` are folders of runs, with runs at any depth, and files of predictions; `submissions` are folders that
+    are scored as files are, with more checks (`validate.submission_faults`). `tasks` are task folders; without any,
+    those that the runs and files answer. A matcher that was asked nothing of one of them has no figures on its suite.
+    `root` holds tasks/ and truth/, `truth` is the folder of the truths where it is another one.
+
+    `split` assigns blocks to places, and names those that calibrate; rejectors (names, or module:Class) need it.
+    `contrasts` are the registered ones. `draws` counts those of the bootstrap; suites in `by_region` are resampled by
+    region, not by block. `without` are regions to leave out, with all of their maps. `jobs` processes fit rejectors.
+    `extras` make, from the finished board, files that are written with it.
+
+    `pipeline` is name and hash of the pipeline that requests the board, if one does. `private` is a board of a private
+    seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
+    of their maps, and their results on a private seed where no private board is named. `failed` names entries that
+    failed before scoring, and why.
     """
 
     predictions: Sequence[Path]
@@ -91,11 +65,11 @@ class ScoreRequest:
 class Board:
     """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
 
-    `remarks` are what rejectors said of their fits; `protection` has no row where no answer tells a protection level.
-    `judged` is what rejectors say of answers, by matcher and rejector, `measured` what was done to each query, by id,
-    `truths` all that is known of it, controls among them. `everyone` are the entries with those who were asked nothing
-    but controls; so are the predictions. `apart` says of contestants whose rows are set apart why they are,
-    `on_private` what came of the rows on a private seed, `failures` who failed and why.
+    `remarks` are those of rejectors on their fits; `protection` has no row where no answer has a protection level.
+    `judged` are the results of rejectors by matcher and rejector, `measured` the measurements of truths by query id,
+    and `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
+    does `predictions`. `apart` are the reasons for excluding entries from ranks, `on_private` the results on a private
+    seed, `failures` the entries that failed, and why.
     """
 
     entries: tuple[Entry, ...]

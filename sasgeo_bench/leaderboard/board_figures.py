@@ -52,18 +52,10 @@ _PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
 
 
 def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
-    """Figures of a board, as SVG.
+    """Return the figures of a board, as SVG.
 
-    Parameters
-    ----------
-    board : Board
-        In memory.
-    tell : callable
-        Gets a line that names the kinds of figures there are no data for, if any.
-    contrasts : sequence of Contrast
-        Those that were registered, as of the board.
-    split : Split, optional
-        Of the board: says which places calibrate conformal protection levels.
+    Report by `tell` the kinds of figures that lack data. `contrasts` are the registered ones; `split` assigns the
+    places that calibrate conformal protection levels.
     """
     shown = shown_matchers(board.table, contrasts)
     queries = queries_of(board.scores)
@@ -129,13 +121,13 @@ def _each(
 
 
 def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
-    """Matcher x rejector that gives probabilities: it is judged as such."""
+    """Return the matchers x rejectors that give probabilities."""
     rows = table[table["metric"] == "ece"]
     return set(zip(rows["matcher"], rows["rejector"], strict=True))
 
 
 def _priced(board: Board, shown: Sequence[str]) -> pd.DataFrame:
-    """Matchers of which some cost is known."""
+    """Return the matchers with some known cost."""
     rows = price_frame(board.table, board.scores, shown)
     known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
     return known

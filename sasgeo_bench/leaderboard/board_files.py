@@ -45,18 +45,10 @@ _TOP: Final = (*BOARD_FILES, FIGURES, PICTURES, *SITE_FOLDERS)
 
 @dataclass(frozen=True, kw_only=True)
 class Extra:
-    """Files of a board besides its own.
+    """Additional files of a board.
 
-    Parameters
-    ----------
-    tables : mapping of str to pandas.DataFrame
-        Each becomes <name>.parquet.
-    texts : mapping of str to str
-        File name -> text.
-    figures : mapping of str to callable
-        Name in `figures/` -> what draws it to a path.
-    pictures : mapping of str to bytes
-        Name in `pictures/`, with the folder there -> its content.
+    `tables` become <name>.parquet, `texts` files by name. `figures` maps names in `figures/` to functions that draw to
+    a path, `pictures` names in `pictures/`, with the folder there, to contents.
     """
 
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
@@ -73,26 +65,11 @@ def write_board(
     about: Mapping[str, Any],
     extras: Sequence[Extra] = (),
 ) -> None:
-    """Write a board, whole or not at all.
+    """Write a board completely or not at all; an older board of the same scorer version there is replaced.
 
-    Parameters
-    ----------
-    folder : Path
-        out/boards/<name>; an older board of the same scorer version there is replaced.
-    tables : mapping of str to pandas.DataFrame
-        Each becomes <name>.parquet; "leaderboard" and "protection" also a csv.
-    texts : mapping of str to str
-        File name -> text.
-    about : mapping
-        What `board.json` says: versions, hashes, what was scored.
-    extras : sequence of Extra
-        Files besides.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds a board of another scorer version, or something that is no part of a board, or cannot be
-        written; an older board is then as it was.
+    Each of `tables` becomes <name>.parquet, "leaderboard" and "protection" also a csv; `texts` are files by name,
+    `about` the content of `board.json`. Raise StoreError if the folder holds a board of another scorer version, or
+    something that is no part of a board, or cannot be written; an older board is then unchanged.
     """
     versions = {name: str(about[name]) for name in _VERSIONS if name in about}
     said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
@@ -134,10 +111,7 @@ def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
 def check_board(folder: Path, *, scorer_version: int) -> None:
     """Refuse a folder that a board of this scorer version cannot replace.
 
-    Raises
-    ------
-    StoreError
-        If it holds a board of another scorer version, or something that is no part of a board.
+    Raise StoreError if it holds a board of another scorer version, or something that is no part of a board.
     """
     if folder.exists() and not folder.is_dir():
         message = f"{folder} is a file: move it away, a board goes there"
@@ -170,10 +144,7 @@ def _version(path: Path) -> str:
 def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """Read `board.json` and the leaderboard.
 
-    Raises
-    ------
-    StoreError
-        If there is none, or a file is damaged.
+    Raise StoreError if there is none, or a file is damaged.
     """
     try:
         data = (folder / BOARD).read_bytes()
@@ -190,19 +161,9 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
 
 
 def read_scores(folder: Path) -> pd.DataFrame:
-    """Scored rows of a board, those of all contestants.
+    """Read the scored rows of all entries of a board.
 
-    Raises
-    ------
-    StoreError
-        If they are missing or damaged.
-
-    Examples
-    --------
-    >>> read_scores(Path("nowhere"))
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: nowhere/scores.parquet cannot be read (No such file or directory): score it again
+    Raise StoreError if they are missing or damaged.
     """
     return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
 
@@ -223,22 +184,10 @@ _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
 
 
 def check_shape(name: str, table: pd.DataFrame) -> None:
-    """Refuse a table whose columns are missing, of another type, or without a name where there must be one.
+    """Refuse a table, as "leaderboard", with a column that is missing, of another type, or without a required value.
 
-    Parameters
-    ----------
-    name : str
-        Of the table, as in "leaderboard".
-    table : pandas.DataFrame
-        As it was read; one that no board has to have may be without columns.
+    A table that is optional on a board may be without columns. Raise StoreError naming the file and the column.
 
-    Raises
-    ------
-    StoreError
-        Naming the file and the column.
-
-    Examples
-    --------
     >>> check_shape("controls", pd.DataFrame({"control": ["blind"]}))
     Traceback (most recent call last):
         ...

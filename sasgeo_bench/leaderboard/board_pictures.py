@@ -86,25 +86,11 @@ def pictures_extra(
     contrasts: Sequence[Contrast] = (),
     has_cases: bool = True,
 ) -> Extra:
-    """Draw pictures of a board, and list them in `pictures.json`.
+    """Draw pictures of a board, and list them in `pictures.json`; empty if there is none.
 
-    Parameters
-    ----------
-    board : Board
-        In memory.
-    tell : callable
-        Gets a line for what cannot be drawn, and how many there are.
-    root : Path
-        Where regions/, tasks/ and truth/ are. Tasks that are missing there, or of other queries, have no picture.
-    contrasts : sequence of Contrast
-        Those that were registered.
-    has_cases : bool
-        Whether queries that went wrong are shown, with their truths.
-
-    Returns
-    -------
-    Extra
-        Without a picture where there is none.
+    `root` holds regions/, tasks/ and truth/; tasks that are missing there, or of other queries, have no picture. Report
+    by `tell` which pictures cannot be drawn, and how many there are. `contrasts` are the registered ones; `has_cases`
+    adds failed queries, with their truths.
     """
     found = _Found(failures=board.failures)
     tasks = [about for about in board.tasks if about["suite"] != CONTROLS]
@@ -142,8 +128,6 @@ def _is_there(about: Mapping[str, Any], root: Path) -> bool:
 def base_region(name: str) -> str:
     """Return a region without the date or suite that changed it.
 
-    Examples
-    --------
     >>> base_region("vaduz@2015-07-27"), base_region("vaduz+growth")
     ('vaduz', 'vaduz')
     """
@@ -151,7 +135,7 @@ def base_region(name: str) -> str:
 
 
 def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
-    """Each region once: as it is, or where that is not here, as the first of its maps."""
+    """Add each region once: itself, or the first of its maps if it is missing."""
     maps: dict[str, list[str]] = {}
     for about in asked:
         maps.setdefault(base_region(str(about["region"])), []).append(str(about["region"]))
@@ -169,7 +153,7 @@ def _thumbnail(folder: Path) -> bytes:
 
 
 def _add_suites(found: _Found, asked: Sequence[Mapping[str, Any]], board: Board, root: Path) -> None:
-    """Of each suite a control and its strongest stress at one site, from the first task that has both, or a stress."""
+    """Add for each suite a control and its strongest stress at one site."""
     drawn: dict[tuple[str, str], set[str]] = {}
     for frame in board.scores.values():
         for suite, region, role in zip(frame["suite"], frame["region"], frame["role"], strict=True):
@@ -195,8 +179,6 @@ def _example(about: Mapping[str, Any], root: Path) -> bytes:
 def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
     """Return a control and the strongest stress of its site, or the strongest stress and another query.
 
-    Examples
-    --------
     >>> control_and_stress([])
     []
     """
@@ -241,7 +223,7 @@ def _add_cases(
 
 
 def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
-    """Every failure of the matchers that a board shows, with its class."""
+    """Return every failure of the matchers that a board shows, with its class."""
     frames = [pd.DataFrame(columns=list(COLUMNS))]
     for name in shown_matchers(board.table, contrasts):
         with board.failures.of(f"cases of {name}"):
@@ -263,7 +245,7 @@ def _cases(
     root: Path,
     found: _Found,
 ) -> Iterator[Case]:
-    """Each chosen case with its view, task by task."""
+    """Yield each chosen case with its view, task by task."""
     by_task: dict[tuple[str, str], list[Mapping[Any, Any]]] = {}
     for row in drawn.values():
         by_task.setdefault((row["suite"], row["region"]), []).append(row)

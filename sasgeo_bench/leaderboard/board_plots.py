@@ -20,8 +20,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.lines import Line2D
 
 from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.errors import counted
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.metrics import primary_of
 
 # Okabe and Ito's colours without the yellow, which is too pale on white; dashes and marks differ, too.
 _COLOURS: Final = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -36,6 +38,7 @@ _GROUP_NAMES: Final = re.compile(r' id="[A-Za-z2.]+_\d+"')  # nothing refers to 
 _STYLE_OF: Final = re.compile(r' style="([^"]*)"')
 _INDENTS: Final = re.compile(r"\n +")
 _DIGITS: Final = re.compile(r"(\.\d\d)\d+")
+_TITLE_LETTERS: Final = 30  # of a panel's title, in a line
 _LABEL_POINTS: Final = 8.5
 _LINE_INCHES: Final = 0.155  # of a note
 _KEY_INCHES: Final = 0.2
@@ -63,13 +66,7 @@ class Look:
 
 
 def look_of(number: int) -> Look:
-    """The look of the thing of a number; no two of the first 28 have colour and dash in common.
-
-    Examples
-    --------
-    >>> look_of(0).colour, look_of(7).dash
-    ('#000000', ':')
-    """
+    """Return the look of the thing of a number; no two of the first 28 have colour and dash in common."""
     return Look(
         colour=_COLOURS[number % len(_COLOURS)],
         dash=_DASHES[number % len(_DASHES)],
@@ -81,24 +78,11 @@ def look_of(number: int) -> Look:
 class Page:
     """Title, notes and size of a figure around its panels.
 
-    Parameters
-    ----------
-    title, note : str
-        Above and below; both are broken into lines.
-    below : str
-        What the axes across are of; written once, under the middle of the panels.
-    rows, columns : int
-        Panels down and across.
-    panel_inches : (float, float)
-        Width and height of a panel.
-    left_inches, gap_inches : float
-        Room for what is written left of the panels, and of each but the first column.
-    row_gap_inches : float
-        Room between rows: for a panel's title, and where each has its own axis, for that.
-    keys : sequence of str
-        Legend, by the numbers of `look_of`; above the panels, never over them.
-    has_marks : bool
-        Whether the legend shows marks on its lines.
+    `title` and `note` stand above and below, broken into lines; `below` names the axes across, once, under the middle
+    of the panels. `rows` and `columns` count panels down and across. `panel_inches` are width and height of a panel,
+    `left_inches` and `gap_inches` the room for text left of all panels, and of each but the first column,
+    `row_gap_inches` that between rows. `keys` is the legend, above the panels, by the numbers of `look_of`, with marks
+    if `has_marks`.
     """
 
     title: str
@@ -116,15 +100,7 @@ class Page:
 
 @contextmanager
 def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
-    """Yield the panels of a figure, row by row; it is written when the block ends.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    about : Page
-        What is around the panels.
-    """
+    """Yield the panels of a figure, row by row; write it as .svg or .png when the block ends."""
     wide, high = about.panel_inches
     width = max(6.4, about.left_inches + about.columns * (wide + about.gap_inches) + 0.2)
     title = textwrap.wrap(about.title, int(width * 10.5))
@@ -153,31 +129,29 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
                 borderaxespad=0.2,
                 handlelength=2.6,
             )
-        charts = []
-        for row in range(about.rows):
-            low = height - top - (row + 1) * high - row * about.row_gap_inches
-            boxes = [
-                (about.left_inches + column * (wide + about.gap_inches), low, wide, high)
-                for column in range(about.columns)
-            ]
-            charts.append([figure.add_axes(_share_of(box, width, height)) for box in boxes])
+        lefts = [about.left_inches + column * (wide + about.gap_inches) for column in range(about.columns)]
+        lows = [height - top - (row + 1) * high - row * about.row_gap_inches for row in range(about.rows)]
+        charts = [
+            [figure.add_axes((left / width, low / height, wide / width, high / height)) for left in lefts]
+            for low in lows
+        ]
         middle = about.left_inches + (about.columns * (wide + about.gap_inches) - about.gap_inches) / 2
         label = "\n".join(textwrap.wrap(about.below, int(2 * min(middle, width - middle) * _LABEL_LETTERS)))
         figure.text(middle / width, (bottom - 0.42) / height, label, ha="center", va="center", fontsize=_LABEL_POINTS)
         yield charts
         if path.suffix == ".svg":
             drawn = io.StringIO()
-            said = {"Date": None, "Creator": None, "Rights": ATTRIBUTION, "Title": about.title}
-            figure.savefig(drawn, format="svg", metadata=said)
+            metadata = {"Date": None, "Creator": None, "Rights": ATTRIBUTION, "Title": about.title}
+            figure.savefig(drawn, format="svg", metadata=metadata)
             path.write_text(_rounded(drawn.getvalue()), encoding="utf-8")
         else:
             figure.savefig(path, metadata={"Software": None, "Title": about.title})
 
 
 def _rounded(svg: str) -> str:
-    """An SVG with hundredths of a point at most, without indents and names of groups, and each style written once.
+    """Shorten an SVG: hundredths of a point at most, no indents or names of groups, each style written once.
 
-    Half of what is drawn with says no more.
+    This halves the file.
     """
     return _classed(_TAGS.sub(lambda tag: _short(tag[0]), _INDENTS.sub("\n", svg)))
 
@@ -187,19 +161,13 @@ def _short(tag: str) -> str:
 
 
 def _classed(svg: str) -> str:
-    """Styles that stand more than once as classes, numbered as they first stand."""
+    """Replace styles that stand more than once by classes, numbered by first appearance."""
     counts = Counter(style for tag in _TAGS.findall(svg) for style in _STYLE_OF.findall(tag))
     names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
     rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
     classes = {f' style="{style}"': f' class="{name}"' for style, name in names.items()}
     short = _TAGS.sub(lambda tag: _STYLE_OF.sub(lambda one: classes.get(one[0], one[0]), tag[0]), svg)
     return short.replace("</style>", f"{rules}</style>", 1)
-
-
-def _share_of(box: tuple[float, float, float, float], width: float, height: float) -> tuple[float, float, float, float]:
-    """Inches -> shares of a figure."""
-    left, low, wide, high = box
-    return (left / width, low / height, wide / width, high / height)
 
 
 def _keys_across(keys: Sequence[str], width: float) -> int:
@@ -228,32 +196,18 @@ HALVES: Final = (0.0, 0.5, 1.0)
 
 
 def those_there(rows: pd.DataFrame, shown: Sequence[str]) -> list[str]:
-    """Matchers that have a row, in the order of their looks.
-
-    Examples
-    --------
-    >>> those_there(pd.DataFrame({"matcher": ["b", "a"]}), ["a", "c", "b"])
-    ['a', 'b']
-    """
+    """Return the matchers that have a row, in the order of their looks."""
     return [name for name in shown if (rows["matcher"] == name).any()]
 
 
 def of_which(row: Mapping[str, Any] | pd.Series) -> str:
-    """Of which queries a figure is.
-
-    Examples
-    --------
-    >>> of_which({"suite": "clean", "track": "localization", "prior_group": "r500-weak-s3"})
-    'clean, localization, prior r500-weak-s3'
-    """
+    """Return the suite, track and prior group of a figure in words."""
     return f"{row['suite']}, {row['track']}, prior {row['prior_group']}"
 
 
 def panels_across(count: int) -> tuple[int, int]:
-    """Rows and columns of so many panels.
+    """Return rows and columns of so many panels.
 
-    Examples
-    --------
     >>> panels_across(3), panels_across(9)
     ((1, 3), (3, 4))
     """
@@ -262,14 +216,14 @@ def panels_across(count: int) -> tuple[int, int]:
 
 
 def dress_share(chart: Axes) -> None:
-    """An axis of shares, with room below for numbers of queries."""
+    """Set an axis of shares, with room below for numbers of queries."""
     chart.set_ylim(-0.13, 1.04)
     chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
     chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
 
 
 def draw_line(chart: Axes, mine: pd.DataFrame, at: Floats, number: int) -> None:
-    """The line of one matcher with an interval at each point; `at` are the places across."""
+    """Draw the line of one matcher with an interval at each point; `at` are the places across."""
     if mine.empty:
         return
     look = look_of(number)
@@ -278,8 +232,67 @@ def draw_line(chart: Axes, mine: pd.DataFrame, at: Floats, number: int) -> None:
     chart.vlines(at, lo, hi, color=look.colour, lw=0.9, alpha=0.75)
 
 
-def draw_bars_of(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
-    """Draw a bar with its interval for each matcher that has a row."""
+def panels(charts: list[list[Axes]], count: int) -> Iterator[tuple[int, Axes]]:
+    """Yield the number and axes of each of `count` panels; hide those beyond."""
+    for number, chart in enumerate(chart for line in charts for chart in line):
+        if number < count:
+            yield number, chart
+        else:
+            chart.set_visible(False)
+
+
+def label_outer(chart: Axes, number: int, columns: int, count: int, label: str) -> None:
+    """Label the axes of a panel where no other panel stands between them and the edge."""
+    is_left = number % columns == 0
+    chart.tick_params(labelleft=is_left, labelbottom=number + columns >= count)
+    if is_left:
+        chart.set_ylabel(label)
+
+
+def ticks_across(chart: Axes, ticks: Sequence[float], low: float, high: float) -> None:
+    """Set a logarithmic axis across from `low` to `high`, with numbers at some ticks."""
+    chart.set_xscale("log")
+    chart.set_xlim(low, high)
+    chart.xaxis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+    chart.xaxis.set_ticks([], minor=True)
+
+
+def panel_title(chart: Axes, name: str, row: Mapping[str, Any] | pd.Series) -> None:
+    """Write a name and the numbers of queries and blocks of a row above a panel."""
+    chart.set_title(f"{name}\nn {row['n']:g}, {counted(int(row['blocks']), 'block')}", fontsize=8, loc="left")
+
+
+def cut(name: str) -> str:
+    """Return a name cut to the width of a panel."""
+    return name if len(name) <= _TITLE_LETTERS else f"{name[: _TITLE_LETTERS - 3]}..."
+
+
+def draw_bar_panels(
+    path: Path, rows: pd.DataFrame, shown: Sequence[str], column: str, values: Sequence[str], *, title: str, note: str
+) -> None:
+    """Draw success as bars with intervals: a panel for each value of a column, a bar for each matcher."""
+    names, (down, across) = those_there(rows, shown), panels_across(len(values))
+    about = Page(
+        title=title,
+        note=note,
+        below=PRIMARY[primary_of(str(rows["track"].iloc[0])).name].replace("\n", " "),
+        rows=down,
+        columns=across,
+        panel_inches=(1.9, 0.3 + 0.19 * len(names)),
+        left_inches=0.35 + 0.075 * max(map(len, names)),
+        gap_inches=0.42,
+        row_gap_inches=0.62,
+    )
+    with page(path, about) as charts:
+        for number, chart in panels(charts, len(values)):
+            mine = rows[rows[column] == values[number]]
+            panel_title(chart, cut(values[number]), mine.iloc[0])
+            _draw_bars(chart, mine, names)
+            if number % across:
+                chart.set_yticklabels([])
+
+
+def _draw_bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
     for at, name in enumerate(names):
         for row in mine[mine["matcher"] == name].to_dict("records"):
             chart.barh(at, row["value"], height=0.72, color=look_of(at).colour, alpha=0.75)
@@ -295,11 +308,5 @@ def draw_bars_of(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
 
 
 def dodged(values: Floats, number: int, count: int, *, by: float) -> Floats:
-    """Places on a logarithmic axis, set apart a little by the number of a line, so that intervals do not hide others.
-
-    Examples
-    --------
-    >>> dodged(np.array([10.0]), 0, 1, by=0.1).tolist()
-    [10.0]
-    """
+    """Shift values on a logarithmic axis a little by the number of a line, so that intervals do not hide others."""
     return np.asarray(values * (1.0 + by) ** (number - (count - 1) / 2))

@@ -197,14 +197,7 @@ def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
 def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     """Return the table of one suite, track and prior group: a matcher a line, the best first, ties marked.
 
-    Parameters
-    ----------
-    book : Book
-        All figures.
-    key : (str, str, str)
-        Suite, track and prior group.
-    names : sequence of str
-        Matchers to show; one without a figure is left out.
+    Matchers in `names` without a figure are left out.
     """
     suite, track, prior_group = key
     primary = primary_of(track).name
@@ -233,7 +226,7 @@ def _value(row: Record) -> float:
 
 
 def _tie_of(ties: Sequence[Tie], name: str) -> int | None:
-    """Number of the tie that a matcher is in."""
+    """Return the number of the tie that a matcher is in."""
     return next((number for number, tie in enumerate(ties) if name in tie.names), None)
 
 
@@ -388,12 +381,7 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:
     """Yield success along each ladder of strengths: a matcher a line, a step a column; strength 0 is the control.
 
-    Parameters
-    ----------
-    steps : pandas.DataFrame
-        From `steps.steps_frame`.
-    ages : mapping, optional
-        From `plot_tables.age_names`: steps that are ages of a map are named by the ages that their maps have.
+    `steps` is from `strata.steps_frame`; `ages`, from `plot_tables.age_names`, names steps that are ages of a map.
     """
     named = ages or {}
     for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):

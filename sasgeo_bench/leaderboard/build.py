@@ -54,29 +54,12 @@ _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated"
 
 
 def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
-    """Score everything and write the board.
+    """Score everything, and write and return the board.
 
-    Parameters
-    ----------
-    request : ScoreRequest
-        What is asked for.
-    tell : callable
-        Gets a line now and then.
-    progress : Progress, optional
-        Shows how far the intervals and the rejectors are; lines by `tell` unless given.
-
-    Returns
-    -------
-    Board
-        What was written.
-
-    Raises
-    ------
-    StoreError
-        If predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by itself
-        answers none of the queries; nothing is written.
-    ConfigError
-        If there is nothing to score, or rejectors are asked for without a split.
+    Report lines by `tell`, and the state of intervals and rejectors by `progress`, by default in lines. Raise
+    StoreError if predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by
+    itself answers none of the queries; nothing is written. Raise ConfigError if there is nothing to score, or rejectors
+    are named without a split.
     """
     progress = progress or Lines(tell)
     check_board(request.board, scorer_version=SCORER_VERSION)
@@ -156,7 +139,7 @@ Compare = Callable[[Mapping[str, pd.DataFrame]], list[pd.DataFrame]]
 
 
 def _compared(scores: Mapping[str, pd.DataFrame], compare: Compare, failures: Failures) -> list[pd.DataFrame] | None:
-    """Figures of all contestants beside each other; None where one of them fails, who is noted."""
+    """Return the figures of all entries together; None if one of them fails, which is noted."""
     try:
         return compare(scores)
     except Exception as error:
@@ -207,7 +190,7 @@ def _all_judged(
 
 
 def _extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:
-    """Files besides; what cannot be made is left out, and so is a figure that cannot be drawn."""
+    """Return the additional files; leave out what cannot be made, and figures that cannot be drawn."""
     if request.extras:
         tell("drawing figures and pictures")
     found: list[Extra] = []
@@ -228,7 +211,7 @@ def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: P
 
 
 def _check_rejectors(rules: Mapping[str, Rule], entries: Sequence[Entry], failures: Failures) -> None:
-    """Raise what a rejector raises that fails with everybody: then it is at fault, not their answers."""
+    """Raise the error of a rejector that fails with every entry: it is at fault, not their answers."""
     for name in rules:
         errors = [failures.errors.get(f"{entry.name} x {name}") for entry in entries]
         if errors and errors[0] is not None and None not in errors:
@@ -236,7 +219,7 @@ def _check_rejectors(rules: Mapping[str, Rule], entries: Sequence[Entry], failur
 
 
 def _tell_gone(folder: Path, everyone: Sequence[Entry], tell: Tell) -> None:
-    """Say which rows an older board of that name had and this one has not: their author may look for them."""
+    """Report rows of an older board of that name that are missing now: their authors may look for them."""
     try:
         about, _ = read_board(folder)
         had = [str(entry["name"]) for entry in about["entries"]]
@@ -320,7 +303,7 @@ def _protection(
     split: Split | None,
     failures: Failures,
 ) -> pd.DataFrame:
-    """Protection levels of all contestants; empty where none tells any."""
+    """Return the protection levels of all entries; empty if none has any."""
     frames = []
     for name, frame in scores.items():
         with failures.of(f"protection levels of {name}"):
@@ -338,12 +321,12 @@ def _in_words(scores: pd.DataFrame) -> str:
 
 
 def _ranked(scores: pd.DataFrame, suites: Collection[str]) -> pd.DataFrame:
-    """Scored rows that make figures: those of some suites, and of no control."""
+    """Return the scored rows of some suites, without controls."""
     return scores[scores["suite"].isin(list(suites)) & ~is_control(scores)].reset_index(drop=True)
 
 
 def _asked_whole(told: Sequence[EntryAnswers], tasks: Sequence[ScoredTask], tell: Tell) -> dict[str, frozenset[str]]:
-    """By contestant the suites of which it was asked every task; who was not would be ranked by what it was spared."""
+    """Return for each entry the suites of which it was asked every task."""
     suites = {task.about["suite"] for task in tasks}
     found = {}
     for item in told:
@@ -363,7 +346,7 @@ def _leaderboards(
     apart: Collection[str],
     progress: Progress,
 ) -> list[pd.DataFrame]:
-    """Figures of suites by those who were asked all of them: in most cases one table of everything."""
+    """Return the figures of suites for the entries that were asked all of them: in most cases one table."""
     asked_by: dict[tuple[str, ...], set[str]] = {}
     progress.begin(
         INTERVALS, len({key for frame in scores.values() for key in frame[[*GROUP]].itertuples(index=False)})
@@ -467,7 +450,7 @@ def _write(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: 
 
 
 def _libraries() -> dict[str, str]:
-    """Versions of what figures and fits hang on, Python's among them; of those that are installed."""
+    """Return the versions of Python and of installed libraries that affect results."""
     found = {"python": platform.python_version()}
     for name in _LIBRARIES:
         with suppress(PackageNotFoundError):

@@ -40,24 +40,9 @@ def pixels_of(figure: Figure) -> NDArray[np.uint8]:
 
 
 def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
-    """Pixels as WebP, as good and then as large as fits; the same bytes for the same pixels.
+    """Return pixels (blue first) as WebP of at most `most_bytes`, as good and then as large as fits.
 
-    Parameters
-    ----------
-    pixels : ndarray of uint8, shape (rows, cols, 3)
-        Blue first.
-    most_bytes : int
-        Of the file.
-
-    Raises
-    ------
-    StoreError
-        If even half of its size in the worst quality takes more.
-
-    Examples
-    --------
-    >>> len(fitted(np.zeros((8, 8, 3), dtype=np.uint8), 1000)) < 200
-    True
+    The same pixels give the same bytes. Raise StoreError if even half of its size in the worst quality takes more.
     """
     for scale in _SCALES:
         smaller = np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
@@ -72,10 +57,7 @@ def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
 def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write pixels without loss, whole or not at all.
 
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written.
+    Raise StoreError if the folder cannot be written.
     """
     scratch = path.with_name(f".{path.name}.partial")
     try:
@@ -96,14 +78,9 @@ def _encoded(kind: str, pixels: NDArray[np.uint8], settings: list[int]) -> bytes
 
 
 def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a region as a small picture with its attribution below; pixels as of `pixels_of`.
+    """Return a region as a small picture with its attribution below, as of `pixels_of`.
 
-    Parameters
-    ----------
-    manifest : Manifest
-        What it is of.
-    overview : ndarray of uint8, shape (C, rows, cols)
-        A coarse level of the layers.
+    `overview`, shape (C, rows, cols), is a coarse level of the layers.
     """
     rows, cols = overview.shape[1:]
     scale = _THUMB_INCHES / max(rows, cols)
@@ -222,7 +199,7 @@ def _panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
 
 
 def _draw_map(chart: Axes, case: CasePicture) -> None:
-    """North up, metres from the lower left corner."""
+    """Draw the map, north up, in metres from the lower left corner."""
     part = case.part
     width_m, height_m = part.east_m - part.west_m, part.north_m - part.south_m
     side_m = max(width_m, height_m)
@@ -264,7 +241,7 @@ def _at(pose: Pose, part: MapPart) -> tuple[float, float]:
 
 
 def _outline(chart: Axes, pose: Pose, size_m: tuple[float, float], part: MapPart, *, colour: str, dash: str) -> None:
-    """Footprint of a view, with a notch that points where its top is."""
+    """Draw the footprint of a view, with a notch at its top."""
     ring = shapely.get_coordinates(footprint(pose, size_m=size_m)) - (part.west_m, part.south_m)
     chart.plot(ring[:, 0], ring[:, 1], color=colour, ls=dash, lw=1.6, path_effects=_HALO)
     up = np.array([(0.0, 0.5), (0.0, 0.36)]) * size_m[1]
@@ -294,7 +271,7 @@ def _offset(chart: Axes, case: CasePicture, part: MapPart) -> None:
 
 
 def _draw_modes(chart: Axes, case: CasePicture) -> None:
-    """Scores of the modes as bars from the least of them; each named by how far it is from the true place."""
+    """Draw the scores of the modes as bars from the least, each named by its distance from the true place."""
     chart.set_title("scores of the modes", fontsize=7.5, pad=2, loc="left")
     modes = list(case.modes[:MOST_MODES])
     chart.set_yticks([])
@@ -323,7 +300,7 @@ def _draw_modes(chart: Axes, case: CasePicture) -> None:
 
 
 def _away(case: CasePicture, pose: Pose, number: int) -> str:
-    """Number of a mode, and how far from the true place it is."""
+    """Return the number of a mode, and its distance from the true place."""
     if case.true is None:
         return str(number)
     away_m = np.hypot(pose.easting_m - case.true.easting_m, pose.northing_m - case.true.northing_m)

@@ -52,24 +52,11 @@ _SITE: Final = ("pair_id", "track", "prior_group", "view_cells")
 def operating_rejector(
     judged: Mapping[tuple[str, str], pd.DataFrame], matcher: str, contrasts: Sequence[Contrast] = ()
 ) -> str | None:
-    """The rejector by whose threshold a matcher's answers are taken for accepted.
+    """Return the rejector whose threshold accepts a matcher's answers; None if none has a threshold.
 
-    Parameters
-    ----------
-    judged : mapping of (matcher, rejector) to pandas.DataFrame
-        What rejectors say, in the order they were asked for.
-    matcher : str
-        Whose answers.
-    contrasts : sequence of Contrast
-        Those that were registered: what stands first in one of them goes first.
+    It is that of the first contrast with the matcher as its first side, else the first in `judged`, else the matcher's
+    own confidence.
 
-    Returns
-    -------
-    str or None
-        Of a contrast, else the first that was asked for, else the matcher's own word; None where none has a threshold.
-
-    Examples
-    --------
     >>> rows = pd.DataFrame({"accepted_0.05": [True]})
     >>> operating_rejector({("m", "own"): rows, ("m", "margin"): rows}, "m")
     'margin'
@@ -85,21 +72,9 @@ def operating_rejector(
 
 
 def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Failures of one matcher.
+    """Return the failures of one matcher in the order of its scored rows, with the columns `COLUMNS`.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Its scored rows.
-    matcher : str
-        Its name.
-    judged : pandas.DataFrame, optional
-        What the operating rejector says of them; rows that it says nothing of have no threshold.
-
-    Returns
-    -------
-    pandas.DataFrame
-        `COLUMNS`, a row for each failure in the order of the scores.
+    `judged` are the results of the operating rejector; rows that it lacks have no threshold.
     """
     taken, has_threshold = _accepted(scores, judged)
     is_present, is_right, is_answered = (
@@ -138,7 +113,7 @@ def _accepted(scores: pd.DataFrame, judged: pd.DataFrame | None) -> tuple[Bools,
 
 
 def _controls(scores: pd.DataFrame) -> pd.DataFrame:
-    """Of each row the controls at its site: whether all are right, whether some are wrong, and what they saw."""
+    """Return for each row the controls at its site: whether all are right, some are wrong, and their shares."""
     controls = scores[(scores["role"] == "control").to_numpy(bool) & scores["is_present"].to_numpy(bool)]
     how = {"is_right": "all", "changed_share": "max", "unknown_share": "max"}
     found = controls.groupby(list(_SITE), as_index=False).agg(how)
@@ -148,27 +123,10 @@ def _controls(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def sample_cases(cases: pd.DataFrame, *, each: int, most: int = MOST_CASES) -> pd.DataFrame:
-    """Return a few failures of each class and matcher; the choice depends on their names only.
+    """Return at most `each` failures of each class and matcher; the choice depends on their names only.
 
-    Parameters
-    ----------
-    cases : pandas.DataFrame
-        From `find_cases`, of all matchers one after the other.
-    each : int
-        At most so many of a class and matcher.
-    most : int
-        At most so many in all: the first of every class and matcher, then the second of each, and so on.
-
-    Returns
-    -------
-    pandas.DataFrame
-        In the order of classes, then of matchers as they were given.
-
-    Examples
-    --------
-    >>> some = pd.DataFrame({"query_id": ["a", "b"], "matcher": "m", "failure": "other", "suite": "clean"})
-    >>> len(sample_cases(some, each=1)), len(sample_cases(some, each=5))
-    (1, 2)
+    `cases` are from `find_cases`, one matcher after the other. At most `most` are chosen in all: the first of every
+    class and matcher, then the second of each, and so on. They are in the order of classes, then of matchers as given.
     """
     if cases.empty:
         return cases
@@ -189,26 +147,15 @@ def _mark(matcher: str, query_id: str) -> str:
 
 
 def count_cases(cases: pd.DataFrame) -> dict[str, int]:
-    """Count the failures of each class.
-
-    Examples
-    --------
-    >>> count_cases(pd.DataFrame({"failure": ["aged", "aged"]}))["aged"]
-    2
-    """
+    """Return the number of failures of each class."""
     counts = cases["failure"].value_counts()
     return {name: int(counts.get(name, 0)) for name in FAILURES}
 
 
 def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
-    """Describe what rejectors state of one answer: chance to be false or rank, and whether they accept it.
+    """Return what rejectors state of one answer: chance to be false or rank, and whether they accept it.
 
-    Parameters
-    ----------
-    words : mapping of (matcher, rejector) to pandas.DataFrame
-        RejectionResult rows by query id.
-    matcher, query_id : str
-        Whose answer to what.
+    `words` are rows of `RejectionResult` by matcher and rejector, with the query ids as index.
     """
     p_false: dict[str, float] = {}
     orders: dict[str, float] = {}

@@ -108,8 +108,6 @@ _HEADINGS: Final = {"known": "to 5 deg", "weak": "to 20 deg", "unknown": "unknow
 def column(term: str, *, is_number: bool = True, order: str = "none", title: str = "") -> Column:
     """Return the column of a term with its meaning; `title` where it is shown under another name.
 
-    Examples
-    --------
     >>> column("n").meaning
     'Queries in the denominator, the same for every matcher'
     """
@@ -120,8 +118,6 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
 def words(*terms: str) -> tuple[Column, ...]:
     """Return columns of text.
 
-    Examples
-    --------
     >>> [one.is_number for one in words("matcher", "suite")]
     [False, False]
     """
@@ -131,8 +127,6 @@ def words(*terms: str) -> tuple[Column, ...]:
 def prior_words(name: str) -> str:
     """Describe a prior group in words.
 
-    Examples
-    --------
     >>> prior_words("r500-weak-s3")
     'within 500 m, heading known to 20 deg, scale to 3 %'
     >>> prior_words("rnone-unknown-s15"), prior_words("another")
@@ -151,8 +145,6 @@ def prior_words(name: str) -> str:
 def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:
     """Return the words next to an entry's name: control, how its answers were made, what it was trained on.
 
-    Examples
-    --------
     >>> [mark.text for mark in marks_of({"how": "as submitted", "trained_on": ["porto"]}, is_control=False)]
     ['as submitted', 'trained on 1 place']
     """

@@ -57,23 +57,11 @@ class Pair:
 class Lookalike:
     """A view, its true place and its lookalike, as the scorer sees them.
 
-    Parameters
-    ----------
-    query : Query
-        The view of the true place, heading north; nothing is known before.
-    pair : Pair
-        Both places.
-    poses : tuple of Pose
-        The best pose near each, the true one first.
-    views : tuple of Evidence
-        What the map shows from these poses.
-    scores : pandas.DataFrame
-        A row for each class, by its name: shares of the cells it covers, `share view`, `share true place` and
-        `share lookalike`, and tempered raster scores of Eq. 8, nats, `score true place` and `score lookalike`.
-    terms : pandas.DataFrame
-        Terms of Eq. 11, nats, weighed as in the joint score: rows raster, graph, contradiction, joint; columns `NAMES`.
-    age_years : float
-        Of the map.
+    `query` is the view of the true place, heading north, without a prior. `poses` are the best near each place, the
+    true one first, `views` the map from these poses. `scores` has a row for each class: the shares of cells that it
+    covers, `share view`, `share true place` and `share lookalike`, and the tempered raster scores of Eq. 8 in nats,
+    `score true place` and `score lookalike`. `terms` are those of Eq. 11 in nats, weighed as in the joint score: rows
+    raster, graph, contradiction, joint; columns `NAMES`. `age_years` is that of the map.
     """
 
     query: Query
@@ -90,12 +78,8 @@ def find_pair(windows: Windows) -> Pair:
 
     Of the tenth of places whose drawn classes are most evenly mixed (largest entropy of their shares), the one whose
     nearest other place by the shares of all classes is nearest. The other lies at least three footprint radii away, as
-    every decoy does. Shares are those of discs: turning changes nothing.
-
-    Raises
-    ------
-    ConfigError
-        If no place holds enough, or none lies far enough from it.
+    every decoy does. Shares are those of discs: turning changes nothing. Raise ConfigError if no place holds enough, or
+    none lies far enough from it.
     """
     shares = windows.shares.reshape(len(windows.points_m), -1, RINGS).mean(axis=2)
     total = shares.sum(axis=1)
@@ -121,7 +105,7 @@ def find_pair(windows: Windows) -> Pair:
 
 
 def _distances(rows: NDArray[np.float64], table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Euclidean distances between all of two tables, shape (R, N)."""
+    """Return Euclidean distances between all rows of two tables, shape (R, N)."""
     squared = (rows**2).sum(axis=1)[:, None] - 2 * rows @ table.T + (table**2).sum(axis=1)[None, :]
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
@@ -131,23 +115,10 @@ def _place(point_m: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def find_lookalike(mapped: Region, world: Region, learnt: ScorerModel, arm: Switches, *, side_m: float) -> Lookalike:
-    """Show a place as it is on the day of `world`, and score it and its lookalike on an older map.
+    """Score a place, as it is on the day of `world`, and its lookalike on an older map.
 
-    Parameters
-    ----------
-    mapped, world : Region
-        One region at two dates, or the same twice.
-    learnt : ScorerModel
-        What is known of classes.
-    arm : Switches
-        Which scorer.
-    side_m : float
-        Side of the view.
-
-    Raises
-    ------
-    ConfigError
-        If the regions are of two places, the map is the younger one, or it holds no such pair of places.
+    `mapped` and `world` are one region at two dates, or the same twice; `arm` selects the scorer. Raise ConfigError if
+    the regions are of two places, the map is the younger one, or it holds no such pair of places.
     """
     check_dates(mapped, world)
     on_map, in_world = State.of(mapped), State.of(world)
@@ -195,7 +166,7 @@ def check_dates(mapped: Region, world: Region) -> None:
 
 
 def best_poses(glance: Reading) -> tuple[Pose, ...]:
-    """The best pose near each candidate of a view, whatever its heading."""
+    """Return the best pose near each candidate of a view, at any heading."""
     found, _ = rank(glance.reader.field, glance.template, glance.query.prior, glance.query.candidates)
     return tuple(
         place if mode is None else mode.pose for mode, place in zip(found, glance.query.candidates, strict=True)
@@ -259,6 +230,6 @@ def sheet_of(found: Lookalike, mapped: Region, learnt: ScorerModel, arm: Switche
 
 
 def _cut(raster: NDArray[np.float32], grid: Grid, at_m: tuple[float, float], size_cells: int) -> NDArray[np.float32]:
-    """The square of a raster around a place."""
+    """Return the square of a raster around a place."""
     col, row = np.rint(grid.to_uv(np.array([at_m]))[0] - size_cells / 2).astype(int).tolist()
     return raster[row : row + size_cells, col : col + size_cells]

@@ -81,15 +81,7 @@ class LookalikeSheet:
 
 
 def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
-    """Draw a view, the map there, its weights and the lookalike, with the scores of both places below.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG to write.
-    sheet : LookalikeSheet
-        What is drawn.
-    """
+    """Draw a view, the map there, its weights and the lookalike as PNG, with the scores of both places below."""
     rows = _told(sheet.scores)
     below = 0.5 + _ROW * max(len(rows) + 3, 13)  # colour bar, table, attribution
     height = 0.98 + _SIDE + below
@@ -117,7 +109,7 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
 
 
 def _told(scores: pd.DataFrame) -> list[str]:
-    """Classes that cover any of the ground in view or on the map."""
+    """Return the classes that cover some ground in view or on the map."""
     return scores.index[(scores[list(_SHARES)] >= _LEAST_SHARE).any(axis=1)].tolist()
 
 
@@ -128,7 +120,7 @@ def _text(figure: Figure, left: float, up: float, text: str, **look: Any) -> Non
 
 
 def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: float) -> None:
-    """Legend and table in one: a row for each class."""
+    """Draw legend and table in one: a row for each class."""
     heads = ("view", "map there", "lookalike", sheet.worth_name, "true place", "lookalike")
     for left, title in ((_COLUMNS[2], "covers, % of the ground"), (_COLUMNS[5], "raster score (Eq. 8), nats")):
         _text(figure, left, top, title, color=_GREY, ha="right")
@@ -154,7 +146,7 @@ def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: 
 
 
 def _term_rows(figure: Figure, sheet: LookalikeSheet, *, top: float) -> None:
-    """Terms of the joint score at both places, and how the places were chosen."""
+    """Draw the terms of the joint score at both places, and how the places were chosen."""
     left, *rights = _TERMS_AT
     for right, head in zip(rights, (*sheet.terms.columns, "difference"), strict=True):
         _text(figure, right, top, head, ha="right", color=_GREY)

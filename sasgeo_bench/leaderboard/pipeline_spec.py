@@ -60,8 +60,6 @@ class TaskSpec(Document):
 class PaperSpec(Document):
     """The paper's own experiment: regions and trials of each of these seeds, drawn with no split and no other setting.
 
-    Examples
-    --------
     >>> PaperSpec().seeds, PaperSpec().trials
     ([42], 220)
     """
@@ -75,8 +73,6 @@ class LearningSpec(Document):
 
     `oracles` learn from the half that they are asked on: yardsticks of what rates known in advance would be worth.
 
-    Examples
-    --------
     >>> LearningSpec(suites=["clean"]).most
     200
     """
@@ -89,8 +85,6 @@ class LearningSpec(Document):
 class PipelineFile(NamedDocument):
     """A pipeline file: suites on regions of a split, the paper's experiment, or both.
 
-    Examples
-    --------
     >>> spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random"]}
     >>> PipelineFile.model_validate(spec | {"task": [{"suites": ["clean"], "sites": 2}]}).top_k
     25
@@ -204,8 +198,6 @@ class PipelineFile(NamedDocument):
     def suites_of(self, matcher: str) -> frozenset[str]:
         """Suites that a matcher is asked on.
 
-        Examples
-        --------
         >>> tasks = [{"suites": ["clean"], "sites": 2}, {"suites": ["alias"], "sites": 2, "matchers": ["fft_vote"]}]
         >>> spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random", "fft_vote"]}
         >>> sorted(PipelineFile.model_validate(spec | {"task": tasks}).suites_of("random"))
@@ -258,8 +250,6 @@ def read_pipeline_file(path: Path) -> PipelineFile:
 def list_pipeline_files() -> dict[str, Path]:
     """Pipeline id -> file, of those shipped; raises as `list_documents` does.
 
-    Examples
-    --------
     >>> "demo" in list_pipeline_files()
     True
     """

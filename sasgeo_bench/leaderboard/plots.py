@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a board: each draws a table of `plottables` on a page, the same bytes for the same table."""
+"""The figures of a board: each draws a table of `plot_tables` on a page, the same bytes for the same table.
+
+Each function writes a .svg or .png; `shown` are the matchers in the order of their looks.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,19 +23,22 @@ from sasgeo_bench.leaderboard.board_plots import (
     INTERVALS,
     PRIMARY,
     Page,
-    draw_bars_of,
+    draw_bar_panels,
     draw_line,
     dress_share,
+    label_outer,
     look_of,
     of_which,
     page,
+    panels,
     panels_across,
     those_there,
 )
-from sasgeo_bench.leaderboard.plot_tables import AS_DRAWN, BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
+from sasgeo_bench.leaderboard.plot_tables import BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, PlaceDifference
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import ProtectionLevels
+from sasgeo_bench.scoring.rejection import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES
 
 _DODGE: Final = 0.011  # of an axis, between two matchers at one step
@@ -42,41 +48,15 @@ _DODGE: Final = 0.011  # of an axis, between two matchers at one step
 
 
 def draw_steps(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw success against strength: a panel for each kind and size of view, a line for each matcher.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `steps.steps_frame`, of one suite, track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
+    """Draw success against strength, from `steps_frame`: panels of kinds and view sizes, lines of matchers."""
     first = rows.iloc[0]
     note = f"Strength 0: the controls, the same places with nothing done to the view. {INTERVALS}"
-    _draw_lines(
-        path,
-        rows,
-        shown,
-        f"Success against strength: {of_which(first)}",
-        note,
-        ("strength", str(first["strength_unit"])),
-    )
+    title = f"Success against strength: {of_which(first)}"
+    _draw_lines(path, rows, shown, title, note, ("strength", str(first["strength_unit"])))
 
 
 def draw_ages(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw success against the age of the map: a panel for each kind and size of view, a line for each matcher.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `plot_tables.ages_frame`, of one suite, track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
+    """Draw success against the age of the map from `ages_frame`, in panels and lines as in `draw_steps`."""
     note = (
         "A point stands at the mean age of the maps of its step; the grey line at the bottom shows from which to "
         f"which age they are. {INTERVALS}"
@@ -132,58 +112,15 @@ def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
 
 
 def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw the success of each matcher on the stresses of each suite as bars with intervals.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `plot_tables.stress_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
-    names, suites = those_there(rows, shown), sorted(set(rows["suite"]))
+    """Draw the success of each matcher on the stresses of each suite, from `stress_frame`, as bars with intervals."""
     first = rows.iloc[0]
-    columns = min(ACROSS, len(suites))
-    about = Page(
-        title=f"Success under stress, suite by suite: {first['track']}, prior {first['prior_group']}",
-        note=INTERVALS.replace("each point", "each bar"),
-        below=PRIMARY[primary_of(str(first["track"])).name].replace("\n", " "),
-        rows=-(-len(suites) // columns),
-        columns=columns,
-        panel_inches=(1.9, 0.3 + 0.19 * len(names)),
-        left_inches=0.35 + 0.075 * max(map(len, names)),
-        gap_inches=0.42,
-        row_gap_inches=0.62,
-    )
-    with page(path, about) as charts:
-        flat = [chart for line in charts for chart in line]
-        for number, chart in enumerate(flat):
-            if number >= len(suites):
-                chart.set_visible(False)
-                continue
-            mine = rows[rows["suite"] == suites[number]]
-            counts = mine.iloc[0]
-            head = f"{suites[number]}\nn {counts['n']:g}, {counted(int(counts['blocks']), 'block')}"
-            chart.set_title(head, fontsize=8, loc="left")
-            draw_bars_of(chart, mine, names)
-            if number % columns:
-                chart.set_yticklabels([])
+    title = f"Success under stress, suite by suite: {first['track']}, prior {first['prior_group']}"
+    note = INTERVALS.replace("each point", "each bar")
+    draw_bar_panels(path, rows, shown, "suite", sorted(set(rows["suite"])), title=title, note=note)
 
 
 def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequence[PlaceDifference]) -> None:
-    """Draw a contrast place by place, and pooled below.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    contrast, finding : Contrast, Finding
-        What was registered, and what came of it.
-    places : sequence of PlaceDifference
-        From `contrasts.by_place`.
-    """
+    """Draw a contrast place by place, from `contrasts.by_place`, and pooled below."""
     is_mean = contrast.metric == "primary"
     what = (
         PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_mean else "area under risk against coverage"
@@ -230,25 +167,14 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
 
 
 def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw risk against coverage: a panel for each matcher, and each mixture, a line for each rejector.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `plot_tables.risk_frame`, of one suite, track and prior group.
-    shown : sequence of str
-        Matchers.
-    """
+    """Draw risk against coverage from `risk_frame`: a panel for each matcher and mixture, a line for each rejector."""
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     mixtures = list(dict.fromkeys(rows["mixture"]))
-    first = rows.iloc[0]
     cells = [(name, mixture) for name in names for mixture in mixtures]
     columns = min(ACROSS, len(cells)) if len(mixtures) == 1 else len(mixtures)
     pooled = " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
     about = Page(
-        title=f"Risk against coverage: {of_which(first)}",
+        title=f"Risk against coverage: {of_which(rows.iloc[0])}",
         note=(
             "Answers are accepted from the surest down, by each rejector; what it says of a place was fitted on other "
             "places. Risk: false fixes among the accepted; coverage: accepted among all n queries, absent places among "
@@ -264,11 +190,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     )
     high = min(1.02, 1.08 * float(rows["risk"].max()))
     with page(path, about) as charts:
-        flat = [chart for line in charts for chart in line]
-        for number, chart in enumerate(flat):
-            if number >= len(cells):
-                chart.set_visible(False)
-                continue
+        for number, chart in panels(charts, len(cells)):
             matcher, mixture = cells[number]
             mine = rows[(rows["matcher"] == matcher) & (rows["mixture"] == mixture)]
             head = matcher if mixture == AS_DRAWN else f"{matcher}, {mixture}"
@@ -278,9 +200,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             chart.set_xticks(HALVES)
             chart.set_ylim(0.0, max(high, 0.02))
             chart.grid(visible=True, color=FAINT, lw=0.6)
-            chart.tick_params(labelleft=number % columns == 0, labelbottom=number + columns >= len(cells))
-            if number % columns == 0:
-                chart.set_ylabel("risk\n(share of accepted)")
+            label_outer(chart, number, columns, len(cells), "risk\n(share of accepted)")
 
 
 def _counts(mine: pd.DataFrame) -> str:
@@ -302,17 +222,7 @@ def _risk_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> No
 
 
 def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw how often answers are false by how likely they were said to be: a panel for each matcher and rejector.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `plot_tables.reliability_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers.
-    """
+    """Draw how often answers are false by stated chance, from `reliability_frame`: a panel a matcher and rejector."""
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
     about = Page(
@@ -376,17 +286,7 @@ def _reliable(chart: Axes, mine: pd.DataFrame) -> None:
 
 
 def draw_stanford(path: Path, told: Mapping[tuple[str, str], ProtectionLevels], limit_m: float) -> None:
-    """Draw protection levels against errors: a panel for each matcher and method.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    told : mapping of (matcher, method) to ProtectionLevels
-        Of one prior group and risk.
-    limit_m : float
-        Alert limit.
-    """
+    """Draw protection levels of one prior group and risk against errors: a panel for each matcher and method."""
     names, methods = (list(dict.fromkeys(key[at] for key in told)) for at in (0, 1))
     first = next(iter(told.values()))
     cells = {key: stanford_cells(item) for key, item in told.items()}

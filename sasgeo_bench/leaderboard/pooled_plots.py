@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a board over many queries at once: each draws a table of `pools` on a page."""
+"""The figures of a board over many queries at once: each draws a table of `pooled_tables` on a page.
+
+Each function writes a .svg or .png; `shown` are the matchers in the order of their looks.
+"""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -16,14 +20,19 @@ from sasgeo_bench.leaderboard.board_plots import (
     INTERVALS,
     PRIMARY,
     Page,
+    cut,
     dodged,
-    draw_bars_of,
+    draw_bar_panels,
     draw_line,
     dress_share,
+    label_outer,
     look_of,
     page,
+    panel_title,
+    panels,
     panels_across,
     those_there,
+    ticks_across,
 )
 from sasgeo_bench.leaderboard.pooled_tables import LEAST_ERROR_M, MOST_ERROR_M, front_of
 from sasgeo_bench.scoring.decisions import COST_RATIOS
@@ -32,65 +41,31 @@ from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
 
 _STRESS: Final = "Present places under stress; of a suite without stresses all of them."
-_LETTERS: Final = 30  # of a panel's title, in a line
 _MOST_ASKED: Final = (
     "A panel has the matchers that were asked all of its queries; no answer is a miss, and in the denominator."
 )
 
 
 def draw_ablation(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw the arms beside each other, pooled over the suites of each registered contrast, as bars with intervals.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `pooled_tables.ablation_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
-    names, pools = those_there(rows, shown), list(dict.fromkeys(rows["pool"]))
-    first = rows.iloc[0]
-    down, across = panels_across(len(pools))
+    """Draw success pooled over the suites of each contrast, from `ablation_frame`, as bars with intervals."""
+    first, pools = rows.iloc[0], list(dict.fromkeys(rows["pool"]))
     suites = "; ".join(f"{pool}: {rows.loc[rows['pool'] == pool, 'suites'].iloc[0]}" for pool in pools)
-    about = Page(
-        title=f"Arms beside each other: {first['track']}, prior {first['prior_group']}",
-        note=(
-            f"Pools of the registered contrasts, all queries of a pool weighing the same. {suites}. "
-            f"{INTERVALS.replace('each point', 'each bar')} {_MOST_ASKED}"
-        ),
-        below=PRIMARY[primary_of(str(first["track"])).name].replace("\n", " "),
-        rows=down,
-        columns=across,
-        panel_inches=(1.9, 0.3 + 0.19 * len(names)),
-        left_inches=0.35 + 0.075 * max(map(len, names)),
-        gap_inches=0.42,
-        row_gap_inches=0.62,
+    title = f"Arms beside each other: {first['track']}, prior {first['prior_group']}"
+    note = (
+        f"Pools of the registered contrasts, all queries of a pool weighing the same. {suites}. "
+        f"{INTERVALS.replace('each point', 'each bar')} {_MOST_ASKED}"
     )
-    with page(path, about) as charts:
-        for number, chart, mine in _panels(charts, rows, "pool", pools):
-            _title(chart, pools[number], _counts(mine.iloc[0]))
-            draw_bars_of(chart, mine, names)
-            if number % across:
-                chart.set_yticklabels([])
+    draw_bar_panels(path, rows, shown, "pool", pools, title=title, note=note)
 
 
-def _title(chart: Axes, name: str, counts: str) -> None:
-    """Return a panel's title: a name cut to the width of the panel, and its number of queries."""
-    short = name if len(name) <= _LETTERS else f"{name[: _LETTERS - 3]}..."
-    chart.set_title(f"{short}\n{counts}", fontsize=8, loc="left")
-
-
-def _counts(row: pd.Series) -> str:
-    return f"n {row['n']:g}, {counted(int(row['blocks']), 'block')}"
-
-
-def _suite_page(rows: pd.DataFrame, names: Sequence[str], *, title: str, note: str, below: str) -> Page:
-    """Draw a page with a panel for each suite."""
-    first = rows.iloc[0]
-    down, across = panels_across(rows["suite"].nunique())
-    return Page(
+@contextmanager
+def _suite_panels(
+    path: Path, rows: pd.DataFrame, names: Sequence[str], *, title: str, note: str, below: str, label: str
+) -> Iterator[Iterator[tuple[Axes, pd.DataFrame]]]:
+    """Yield the axes and rows of each suite on a page of shares, with a line for each matcher."""
+    first, suites = rows.iloc[0], sorted(set(rows["suite"]))
+    down, across = panels_across(len(suites))
+    about = Page(
         title=f"{title}: {first['track']}, prior {first['prior_group']}",
         note=f"{note} {_STRESS} {_MOST_ASKED}",
         below=below,
@@ -101,126 +76,65 @@ def _suite_page(rows: pd.DataFrame, names: Sequence[str], *, title: str, note: s
         row_gap_inches=0.65,
     )
 
-
-def draw_recall(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw Recall@K against K: a panel for each suite, a line for each matcher.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `pooled_tables.recall_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
-    names, suites = those_there(rows, shown), sorted(set(rows["suite"]))
-    track = str(rows["track"].iloc[0])
-    what = "the right candidate" if track == "retrieval" else f"a pose within {FIX_M:g} m, whatever the heading,"
-    note = f"Share of queries with {what} among the first K of the answer; ties count in every order. {INTERVALS}"
-    below = "K (poses of an answer, best first)"
-    about = _suite_page(rows, names, title="Recall against K", note=note, below=below)
-    steps = sorted(set(rows["k"]))
-    with page(path, about) as charts:
-        for number, chart, mine in _panels(charts, rows, "suite", suites):
-            _head_of(chart, mine)
-            chart.set_xscale("log")
-            chart.set_xlim(0.75, 1.35 * steps[-1])
-            chart.xaxis.set_ticks(steps, [str(step) for step in steps])
-            chart.xaxis.set_ticks([], minor=True)
+    def dressed(charts: list[list[Axes]]) -> Iterator[tuple[Axes, pd.DataFrame]]:
+        for number, chart in panels(charts, len(suites)):
+            mine = rows[rows["suite"] == suites[number]]
+            part = mine["stratum"].iloc[0]
+            panel_title(chart, cut(suites[number] + ("" if part == "all" else f" {part}")), mine.iloc[0])
+            yield chart, mine
             chart.set_ylim(-0.02, 1.04)
             chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
             chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
+            label_outer(chart, number, across, len(suites), label)
+
+    with page(path, about) as charts:
+        yield dressed(charts)
+
+
+def draw_recall(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+    """Draw Recall@K against K from `recall_frame`: a panel for each suite, a line for each matcher."""
+    names, steps = those_there(rows, shown), sorted(set(rows["k"]))
+    is_retrieval = rows["track"].iloc[0] == "retrieval"
+    what = "the right candidate" if is_retrieval else f"a pose within {FIX_M:g} m, whatever the heading,"
+    note = f"Share of queries with {what} among the first K of the answer; ties count in every order. {INTERVALS}"
+    below, label = "K (poses of an answer, best first)", "recall@K (share of queries)"
+    with _suite_panels(path, rows, names, title="Recall against K", note=note, below=below, label=label) as charts:
+        for chart, mine in charts:
+            ticks_across(chart, steps, 0.75, 1.35 * steps[-1])
             for at, name in enumerate(names):
                 line_of = mine[mine["matcher"] == name].sort_values("k")
                 places = dodged(line_of["k"].to_numpy(float), at, len(names), by=0.025)
                 draw_line(chart, line_of, places, at)
-            _outer(chart, number, about, len(suites), "recall@K (share of queries)")
-
-
-def _panels(
-    charts: Iterable[Iterable[Axes]], rows: pd.DataFrame, column: str, names: Sequence[str]
-) -> Iterator[tuple[int, Axes, pd.DataFrame]]:
-    """Yield number, axes and rows of the panel of each name in a column; panels beyond the names are hidden."""
-    for number, chart in enumerate(chart for line in charts for chart in line):
-        if number < len(names):
-            yield number, chart, rows[rows[column] == names[number]]
-        else:
-            chart.set_visible(False)
-
-
-def _head_of(chart: Axes, mine: pd.DataFrame) -> None:
-    """Title of a suite's panel."""
-    counts = mine.iloc[0]
-    part = "" if counts["stratum"] == "all" else f" {counts['stratum']}"
-    _title(chart, f"{counts['suite']}{part}", _counts(counts))
-
-
-def _outer(chart: Axes, number: int, about: Page, count: int, label: str) -> None:
-    """Numbers and names of axes where no other panel stands between them and the edge."""
-    is_left, is_low = number % about.columns == 0, number + about.columns >= count
-    chart.tick_params(labelleft=is_left, labelbottom=is_low)
-    if is_left:
-        chart.set_ylabel(label)
 
 
 def draw_errors(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw the distribution of errors: a panel for each suite, a line for each matcher.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `pooled_tables.errors_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
-    names, suites = those_there(rows, shown), sorted(set(rows["suite"]))
+    """Draw the distribution of errors from `errors_frame`: a panel for each suite, a line for each matcher."""
+    names = those_there(rows, shown)
     note = (
         f"Share of all n queries whose fix is that near, whatever the heading; an answer that is none is never near. "
         f"Dashed: {FIX_M:g} m, beyond which a fix is false; bars there: 95 % intervals as on the board (within_25m)."
     )
-    about = _suite_page(rows, names, title="Distribution of errors", note=note, below="position error (m)")
-    ticks = [0.1, 1.0, 10.0, 100.0, 1000.0]
-    with page(path, about) as charts:
-        for number, chart, mine in _panels(charts, rows, "suite", suites):
-            _head_of(chart, mine)
-            chart.set_xscale("log")
-            chart.set_xlim(LEAST_ERROR_M, MOST_ERROR_M)
-            chart.xaxis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-            chart.xaxis.set_ticks([], minor=True)
+    title, below, label = "Distribution of errors", "position error (m)", "share of queries\nwithin that error"
+    with _suite_panels(path, rows, names, title=title, note=note, below=below, label=label) as charts:
+        for chart, mine in charts:
+            ticks_across(chart, [0.1, 1.0, 10.0, 100.0, 1000.0], LEAST_ERROR_M, MOST_ERROR_M)
             chart.axvline(FIX_M, color="#999999", lw=0.8, ls="--")
-            chart.set_ylim(-0.02, 1.04)
-            chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
-            chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
             for at, name in enumerate(names):
                 _error_line(chart, mine[mine["matcher"] == name], at, len(names))
-            _outer(chart, number, about, len(suites), "share of queries\nwithin that error")
 
 
 def _error_line(chart: Axes, mine: pd.DataFrame, number: int, count: int) -> None:
     look = look_of(number)
     chart.plot(mine["radius_m"], mine["value"], color=look.colour, ls=look.dash, lw=1.3)
-    told = mine[mine["lo"].notna()]
-    if len(told):
-        at = dodged(told["radius_m"].to_numpy(float), number, count, by=0.12)
-        chart.vlines(at, told["lo"], told["hi"], color=look.colour, lw=0.9, alpha=0.75)
-        chart.plot(at, told["value"], color=look.colour, marker=look.mark, ms=4, ls="")
+    known = mine[mine["lo"].notna()]
+    if len(known):
+        at = dodged(known["radius_m"].to_numpy(float), number, count, by=0.12)
+        chart.vlines(at, known["lo"], known["hi"], color=look.colour, lw=0.9, alpha=0.75)
+        chart.plot(at, known["value"], color=look.colour, marker=look.mark, ms=4, ls="")
 
 
 def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw the cost of a query against the cost of a false fix: a panel for each matcher, a line for each rejector.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `pooled_tables.cost_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers.
-    """
+    """Draw the cost of a query against that of a false fix, from `cost_frame`: a panel for each matcher."""
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
     down, across = panels_across(len(names))
@@ -241,20 +155,17 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         gap_inches=0.25,
         row_gap_inches=0.65,
     )
-    ticks = [1.0, *COST_RATIOS]
     high = 1.25 * max(float(rows["withhold_all"].max()), float(rows["cost"].quantile(0.9)))
     with page(path, about) as charts:
-        for number, chart, mine in _panels(charts, rows, "matcher", names):
-            counts = sorted(set(mine["n"]))
-            _title(chart, names[number], "n " + ", ".join(f"{count:g}" for count in counts))
+        for number, chart in panels(charts, len(names)):
+            mine = rows[rows["matcher"] == names[number]]
+            counts = ", ".join(f"{count:g}" for count in sorted(set(mine["n"])))
+            chart.set_title(f"{cut(names[number])}\nn {counts}", fontsize=8, loc="left")
             _cost_lines(chart, mine, rejectors)
-            chart.set_xscale("log")
-            chart.set_xlim(float(mine["ratio"].min()), float(mine["ratio"].max()))
-            chart.xaxis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-            chart.xaxis.set_ticks([], minor=True)
+            ticks_across(chart, [1.0, *COST_RATIOS], float(mine["ratio"].min()), float(mine["ratio"].max()))
             chart.set_ylim(0.0, high)
             chart.grid(visible=True, color=FAINT, lw=0.6)
-            _outer(chart, number, about, len(names), "mean cost of a query\n(places without a fix)")
+            label_outer(chart, number, across, len(names), "mean cost of a query\n(places without a fix)")
 
 
 def _cost_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> None:
@@ -268,17 +179,7 @@ def _cost_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> No
 
 
 def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw what answers are worth against what they take, with the front that no other matcher beats.
-
-    Parameters
-    ----------
-    path : Path
-        A .svg or .png to write.
-    rows : pandas.DataFrame
-        From `pooled_tables.price_frame`, of one track and prior group.
-    shown : sequence of str
-        Matchers, in the order of their looks.
-    """
+    """Draw accuracy against cost from `price_frame`, with the front that no other matcher beats."""
     names = those_there(rows, shown)
     first = rows.iloc[0]
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
@@ -340,18 +241,14 @@ def _prices(chart: Axes, rows: pd.DataFrame, names: Sequence[str], column: str) 
         chart.plot(row[column], row["value"], color=look.colour, marker=look.mark, ms=6, ls="")
     known = cost[np.isfinite(cost)]
     if known.min() > 0:
-        chart.set_xscale("log")
         ends = np.concatenate((known, rows["slow_s"].to_numpy(float))) if column == "latency_s" else known
         ends = ends[np.isfinite(ends)]
         lo, hi = float(ends.min()) / 1.6, float(ends.max()) * 1.6
-        chart.set_xlim(lo, hi)
-        ticks = _round_numbers(lo, hi)
-        chart.xaxis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-        chart.xaxis.set_ticks([], minor=True)
+        ticks_across(chart, _round_numbers(lo, hi), lo, hi)
 
 
 def _round_numbers(lo: float, hi: float) -> list[float]:
-    """Ticks of a logarithmic axis: powers of ten, and where there are few, 2 and 5 times these or simple fractions."""
+    """Return ticks of a logarithmic axis: powers of ten, and where there are few, 2 and 5 times these."""
     powers = [10.0**power for power in range(math.floor(math.log10(lo)), math.ceil(math.log10(hi)) + 1)]
     for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8)):
         found = [step * power for power in powers for step in steps if lo <= step * power <= hi]

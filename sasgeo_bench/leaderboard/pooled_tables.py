@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What figures over many queries at once show, as tables: pooled arms, ranks, errors, what it all costs.
+"""The tables behind the figures over many queries at once: pooled arms, ranks, errors, costs.
 
-Each row is of queries that all matchers of its panel were asked: else one would be drawn by what it was spared.
+Each row is of queries that all matchers of its panel were asked; otherwise a matcher would gain by queries it was not
+asked.
 """
 
-import hashlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, Final
@@ -17,14 +17,14 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
-from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_means, effective_count, share_interval
+from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_means, effective_count, seed_of_text, share_interval
 from sasgeo_bench.scoring.metrics import primary_of, ranks_of
 from sasgeo_bench.scoring.pose import rank_pose
 from sasgeo_bench.scoring.ranking import Ranks, hits
 from sasgeo_bench.scoring.rejection import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
-from sasgeo_bench.scoring.strata import ALL, STRESS
+from sasgeo_bench.scoring.strata import ALL, GROUP, STRESS
 from sasgeo_bench.tasks.query import Truth
 
 Scores = Mapping[str, pd.DataFrame]
@@ -35,25 +35,23 @@ LEAST_ERROR_M: Final = 0.1
 MOST_ERROR_M: Final = 2000.0
 _RADII_M: Final = np.unique(np.concatenate((np.geomspace(LEAST_ERROR_M, MOST_ERROR_M, 87), [5.0, 10.0, FIX_M])))
 _RATIOS: Final = np.unique(np.concatenate((np.geomspace(1.0, 200.0, 47), COST_RATIOS)))
-_GROUP: Final = ("suite", "track", "prior_group")
 _NO_INTERVAL: Final = (np.nan, np.nan)
 _FIGURE: Final = ("n", "blocks", "value", "lo", "hi")
 
 
 def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any]]:
-    """Means of columns of values in [0, 1] with intervals as of a board; drawn alike for the same queries."""
-    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    """Return means of columns of values in [0, 1] with intervals as of a board; the same queries share draws."""
     blocks, sites = (np.unique(rows[name], return_inverse=True)[1] for name in ("block", "pair_id"))
-    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=seed, draws=SLOW_DRAWS)
+    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=seed_of_text(text), draws=SLOW_DRAWS)
     means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.empty((0, table.shape[1]))
     trials, values = effective_count(sites), table.mean(axis=0)
     found = [share_interval(float(value), means[:, at], trials)[0] for at, value in enumerate(values)]
-    said = {"n": len(rows), "blocks": drawn.blocks_count}
-    return [{**said, "value": one.value, "lo": one.lo, "hi": one.hi} for one in found]
+    counts = {"n": len(rows), "blocks": drawn.blocks_count}
+    return [{**counts, "value": one.value, "lo": one.lo, "hi": one.hi} for one in found]
 
 
 def _alike(frames: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Those matchers that were asked the most queries of a pool, the same ones, and can answer; rows in one order."""
+    """Return the matchers that can answer and were asked the most queries of a pool, the same ones."""
     able = {name: frame for name, frame in frames.items() if _is_able(frame)}
     sorted_ = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in able.items()}
     most = max(sorted_.values(), key=len, default=pd.DataFrame({"query_id": []}))["query_id"]
@@ -73,42 +71,31 @@ def _is_whole(first: pd.DataFrame) -> Bools:
 
 
 def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[dict[str, Any], dict[str, pd.DataFrame]]]:
-    """Rows of the matchers of each suite, track and prior group, and what a panel says of them."""
+    """Yield the keys of a panel and the rows of its matchers, for each suite, track and prior group."""
     mine = {name: scores[name] for name in shown if name in scores}
-    keys = {key for frame in mine.values() for key in zip(*(frame[name] for name in _GROUP), strict=True)}
+    keys = {key for frame in mine.values() for key in zip(*(frame[name] for name in GROUP), strict=True)}
     for key in sorted(keys):
         some = {}
         for name, frame in mine.items():
-            is_mine = [frame[column].to_numpy() == value for column, value in zip(_GROUP, key, strict=True)]
+            is_mine = [frame[column].to_numpy() == value for column, value in zip(GROUP, key, strict=True)]
             rows = frame[np.logical_and.reduce(is_mine)]
             some[name] = rows[_is_whole(rows)]
         alike = _alike(some)
         if alike:
             first = next(iter(alike.values()))
             part = STRESS if (first["role"] == STRESS).all() else ALL
-            yield {**dict(zip(_GROUP, key, strict=True)), "stratum": part}, alike
+            yield {**dict(zip(GROUP, key, strict=True)), "stratum": part}, alike
 
 
 # --- arms side by side ------------------------------------------------------------------------------------------------
 
 
 def ablation_frame(scores: Scores, contrasts: Sequence[Contrast], shown: Sequence[str]) -> pd.DataFrame:
-    """The figure that matchers are ranked by, pooled over the suites of each registered contrast.
+    """Return the primary metric, pooled over the suites of each registered contrast.
 
-    Parameters
-    ----------
-    scores : mapping of str to pandas.DataFrame
-        Scored rows by matcher.
-    contrasts : sequence of Contrast
-        Those that were registered. Those of means make a pool each, two over the same queries one; without any, all
-        suites are one pool for each track.
-    shown : sequence of str
-        Matchers; a pool has those that were asked all of it.
-
-    Returns
-    -------
-    pandas.DataFrame
-        pool, suites, track, prior_group, matcher, n, blocks, value, lo, hi: present places under stress.
+    A pool has the matchers that were asked all of it. Contrasts of means make a pool each, two over the same queries
+    one; without any, all suites are one pool for each track. The columns are pool, suites, track, prior_group, matcher,
+    n, blocks, value, lo and hi: present places under stress.
     """
     rows: list[dict[str, Any]] = []
     for pool in _pools(contrasts, scores):
@@ -152,22 +139,9 @@ def recall_frame(
 ) -> pd.DataFrame:
     """Return recall@K: the share of answers with the right place among the first K.
 
-    Parameters
-    ----------
-    scores : mapping of str to pandas.DataFrame
-        Scored rows by matcher.
-    predictions : mapping of str to mapping
-        Answers by matcher and query.
-    truths : mapping of str to Truth
-        By query.
-    shown : sequence of str
-        Matchers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        suite, track, prior_group, stratum, matcher, k, n, blocks, value, lo, hi. Of retrieval the right candidate, of
-        localization a pose within 25 m, whatever the heading. Nothing where no answer has a second pose.
+    The columns are suite, track, prior_group, stratum, matcher, k, n, blocks, value, lo and hi; no row where no answer
+    has a second pose. Right is the right candidate in retrieval, and in localization a pose within 25 m, whatever the
+    heading.
     """
     rows: list[dict[str, Any]] = []
     for said, frames in _suites(scores, shown):
@@ -185,7 +159,7 @@ def recall_frame(
             table = np.column_stack([hits(ranks, k) for k in steps])
             found = _figures(frame, table, text)
             rows += [{**said, "matcher": name, "k": k, **one} for k, one in zip(steps, found, strict=True)]
-    return pd.DataFrame(rows, columns=[*_GROUP, "stratum", "matcher", "k", *_FIGURE])
+    return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "k", *_FIGURE])
 
 
 def _answers(predictions: Mapping[str, Prediction], frame: pd.DataFrame) -> Iterator[Prediction]:
@@ -193,33 +167,22 @@ def _answers(predictions: Mapping[str, Prediction], frame: pd.DataFrame) -> Iter
 
 
 def _near(frame: pd.DataFrame, predictions: Mapping[str, Prediction], truths: Mapping[str, Truth]) -> Ranks:
-    """Rank of the best pose near the truth. Headings do not count: stored results may have left them out."""
+    """Return the rank of the best pose near the truth. Headings do not count: stored results may lack them."""
     return Ranks.of(
         [rank_pose(predictions.get(name), truths[name], within_m=FIX_M, within_deg=180.0) for name in frame["query_id"]]
     )
 
 
 def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
-    """Share of all queries whose fix is within some metres.
+    """Return the share of all queries whose fix is within some metres; localization alone.
 
-    Parameters
-    ----------
-    scores : mapping of str to pandas.DataFrame
-        Scored rows by matcher.
-    table : pandas.DataFrame
-        The leaderboard: it says the intervals at 25 m.
-    shown : sequence of str
-        Matchers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        suite, track, prior_group, stratum, matcher, radius_m, n, blocks, value, lo, hi (NaN but at 25 m). Localization
-        alone; a query without an answer is within no distance, and in the denominator.
+    The columns are suite, track, prior_group, stratum, matcher, radius_m, n, blocks, value, lo and hi. The ends are
+    those of the leaderboard `table` at 25 m, elsewhere NaN. A query without an answer is within no distance, and in the
+    denominator.
     """
     rows: list[dict[str, Any]] = []
     told = table[(table["metric"] == WITHIN_M) & (table["rejector"] == "")]
-    keys = zip(*(told[name] for name in (*_GROUP, "stratum", "matcher")), strict=True)
+    keys = zip(*(told[name] for name in (*GROUP, "stratum", "matcher")), strict=True)
     both = zip(told["lo"].to_numpy(float), told["hi"].to_numpy(float), strict=True)
     ends = dict(zip(keys, both, strict=True))
     for said, frames in _suites(scores, shown):
@@ -234,7 +197,7 @@ def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> p
                 lo, hi = end if radius_m == FIX_M else _NO_INTERVAL
                 point = {"radius_m": radius_m, "value": value, "lo": lo, "hi": hi}
                 rows.append({**said, "matcher": name, **counts, **point})
-    return pd.DataFrame(rows, columns=[*_GROUP, "stratum", "matcher", "radius_m", *_FIGURE])
+    return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "radius_m", *_FIGURE])
 
 
 # --- what decisions and answers cost ----------------------------------------------------------------------------------
@@ -243,22 +206,11 @@ def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> p
 def cost_frame(
     judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
 ) -> pd.DataFrame:
-    """Mean cost of a query against the cost of a false fix, when fixes are accepted by Eq. (14).
+    """Return the mean cost of a query against the cost of a false fix, when fixes are accepted by Eq. (14).
 
-    Parameters
-    ----------
-    judged : mapping of (matcher, rejector) to pandas.DataFrame
-        From `rejection.judge` and `rejection.own_confidence`.
-    calibrated : collection of (matcher, rejector)
-        Those that give probabilities.
-    shown : sequence of str
-        Matchers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        track, prior_group, matcher, rejector, n, ratio, cost, accept_all, withhold_all: all suites together. As
-        `cost_20_place` of a board: a present place without an accepted fix costs 1, a false fix `ratio`.
+    Arguments are as of `plot_tables.reliability_frame`. The columns are track, prior_group, matcher, rejector, n,
+    ratio, cost, accept_all and withhold_all: all suites together. As `cost_20_place` of a board: a present place
+    without an accepted fix costs 1, a false fix `ratio`.
     """
     rows: list[dict[str, Any]] = []
     for said, part in calibrated_parts(judged, calibrated, shown):
@@ -279,20 +231,9 @@ COSTS: Final = {"latency_p50": "latency_s", "latency_p95": "slow_s", "map_per_km
 def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd.DataFrame:
     """Return accuracy against cost: a row for each matcher, on the queries that all of them were asked.
 
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        The leaderboard: it says the costs.
-    scores : mapping of str to pandas.DataFrame
-        Scored rows by matcher.
-    shown : sequence of str
-        Matchers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        suites, track, prior_group, matcher, n, blocks, value, lo, hi, latency_s, slow_s (95th percentile),
-        map_kb_per_km2; NaN where a cost is not known. Present places of the suites of the track that all were asked.
+    The columns are suites, track, prior_group, matcher, n, blocks, value, lo, hi, latency_s, slow_s (95th percentile)
+    and map_kb_per_km2, from the leaderboard `table`; NaN where a cost is unknown. The queries are the present places of
+    the suites of the track that all were asked.
     """
     rows: list[dict[str, Any]] = []
     mine = {name: scores[name][scores[name]["is_present"].to_numpy(bool)] for name in shown if name in scores}
@@ -315,26 +256,17 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
 
 
 def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]:
-    """Costs of one matcher as the board says them."""
+    """Return the costs of one matcher from the leaderboard."""
     told = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
     known = dict(zip(told["metric"], told["value"], strict=True))
     return {column: float(known.get(metric, np.nan)) for metric, column in COSTS.items()}
 
 
 def front_of(cost: Floats, value: Floats) -> Bools:
-    """Return the Pareto front: methods that no other one beats in cost and accuracy.
+    """Return the Pareto front, shape (N,): methods that no other one beats in cost and accuracy.
 
-    Parameters
-    ----------
-    cost, value : ndarray of float, shape (N,)
-        Less and more are better; a cost that is not known (NaN) or infinite is on no front.
+    A cost that is NaN or infinite is on no front.
 
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-
-    Examples
-    --------
     >>> front_of(np.array([1.0, 2.0, 3.0, np.nan]), np.array([0.5, 0.4, 0.9, 1.0])).tolist()
     [True, False, True, False]
     """

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare a public board with one of a private seed of the same pipeline: which rows are reproduced."""
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,16 +25,17 @@ from sasgeo_bench.scoring.intervals import (
     difference_interval,
     effective_count,
     percentile_interval,
-    wilson,
+    seed_of_text,
+    wilson_share,
 )
 from sasgeo_bench.scoring.metrics import FALSE_ABSENT, MeanMetric, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, REPRODUCED, RUN_HERE, name_alone
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
+from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
 from sasgeo_bench.tasks.query import TASK_VERSION
 
-_GROUP: Final = ("suite", "track", "prior_group")
 _ALL_PRIORS: Final = "all"
 SEEDS_NOTE: Final = (
     "The same matchers, by version and hash, on the same pipeline drawn by a private seed. The sites differ, so no "
@@ -81,22 +81,11 @@ class _Pair:
 
 
 def compare_seeds(public: pd.DataFrame, private: pd.DataFrame, *, draws: int) -> tuple[SeedFigure, ...]:
-    """Figures of a matcher on both seeds: of all suites on a track first, then suite by suite.
+    """Return figures of a matcher on both seeds: of all suites on a track first, then suite by suite.
 
-    Parameters
-    ----------
-    public, private : pandas.DataFrame
-        Its scored rows (`score.score_task`) on the tasks that both seeds have.
-    draws : int
-        Of the bootstrap.
+    `public` and `private` are its scored rows (`score.score_task`) on the tasks that both seeds have. No figure is of
+    queries that were asked on one seed alone, or that the matcher's card excludes.
 
-    Returns
-    -------
-    tuple of SeedFigure
-        None of what was asked on one seed alone, or what the matcher's card says that it cannot.
-
-    Notes
-    -----
     The seeds have different sites, so that no query pairs with another. A draw resamples blocks of ground with all
     queries in them, those of both seeds at once where a block holds both, else of the one it holds. No interval is
     narrower than that of two independent shares of as many trials as there are sites (`difference_interval`).
@@ -111,13 +100,13 @@ def _pairs(public: pd.DataFrame, private: pd.DataFrame) -> Iterator[_Pair]:
     for track in sorted(set(frames[0]["track"])):
         sides = [frame[frame["track"] == track] for frame in frames]
         yield from _measured((ALL_SUITES, str(track), _ALL_PRIORS), *sides)
-    for key in sorted(set(frames[0][list(_GROUP)].itertuples(index=False, name=None))):
-        sides = [frame[(frame[list(_GROUP)] == list(key)).all(axis=1)] for frame in frames]
+    for key in sorted(set(frames[0][list(GROUP)].itertuples(index=False, name=None))):
+        sides = [frame[(frame[list(GROUP)] == list(key)).all(axis=1)] for frame in frames]
         yield from _measured(key, *sides)
 
 
 def _measured(key: tuple[str, str, str], public: pd.DataFrame, private: pd.DataFrame) -> Iterator[_Pair]:
-    """The primary figure, under stress where there is any on both seeds, and false fixes at absent places."""
+    """Yield the primary figure, under stress where there is any on both seeds, and false fixes at absent places."""
     primary = primary_of(key[1])
     sides = [frame[_counted(primary, frame)] for frame in (public, private)]
     stressed = [frame[(frame["role"] == "stress").to_numpy(bool)] for frame in sides]
@@ -139,7 +128,7 @@ def _figure(pair: _Pair, *, draws: int, level: float) -> SeedFigure:
     is_private = np.repeat([0.0, 1.0], [len(frame) for frame in sides])
     drawn = ClusterDraws(
         blocks=[block for frame in sides for block in frame["block"]],
-        seed=_seed(pair),
+        seed=seed_of_text("/".join(("public and private", *pair.key, pair.measure.name))),
         draws=draws,
         draws_within=False,
     )
@@ -171,33 +160,14 @@ def _figure(pair: _Pair, *, draws: int, level: float) -> SeedFigure:
 
 
 def _wilson(values: "np.ndarray[Any, np.dtype[np.float64]]", frame: pd.DataFrame, level: float) -> Interval:
-    trials = effective_count(frame["pair_id"].tolist())
-    return wilson(min(float(values.mean()) * trials, trials), trials, level=level)
-
-
-def _seed(pair: _Pair) -> int:
-    text = "/".join(("public and private", *pair.key, pair.measure.name))
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    return wilson_share(float(values.mean()), effective_count(frame["pair_id"].tolist()), level=level)
 
 
 def verdict_of(figures: Sequence[SeedFigure]) -> tuple[str, str]:
-    """Return the label of a row by its figures on both seeds, and the reason.
+    """Return the label of a row by its figures on both seeds (`compare_seeds`), and the reason in a line.
 
-    Parameters
-    ----------
-    figures : sequence of SeedFigure
-        Of `compare_seeds`.
-
-    Returns
-    -------
-    str, str
-        `not reproduced` where a figure is shown to be worse on the private seed, `reproduced` where none is, `run here`
-        where the blocks are too few to say the latter; and the reason in a line.
-
-    Examples
-    --------
-    >>> verdict_of([])
-    ('run here', 'nothing was asked on both seeds')
+    `not reproduced` means that a figure is shown to be worse on the private seed, `reproduced` that none is, and `run
+    here` that the blocks are too few to decide.
     """
     worse = [item for item in figures if item.is_worse]
     if worse:
@@ -218,13 +188,7 @@ def said_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[
 
 
 def seed_lines(about: Mapping[str, Any]) -> list[str]:
-    """Return whether the rows of a board were compared with a private seed, and the result of each.
-
-    Examples
-    --------
-    >>> seed_lines({"entries": [{"name": "mine", "how": "run here"}]})[0][:40]
-    'Seeds: the queries of this board are dra'
-    """
+    """Return whether the rows of a board were compared with a private seed, and the result of each."""
     if about.get("private_seed"):
         return [_IS_PRIVATE]
     seed = about.get("private")
@@ -245,10 +209,9 @@ _TASK: Final = ("suite", "region", "map_date")
 
 @dataclass(frozen=True, kw_only=True)
 class OnPrivate:
-    """Results of a private board for the rows of a public one.
+    """Results of a private board for the rows of a public one; empty if the public one was not compared with it.
 
-    `seed` are commitment and bits, `rows` what `board.json` is to say of each entry, by name; a board that nobody held
-    against a private one has neither.
+    `seed` are commitment and bits, `rows` the entries of `board.json` by name of matcher.
     """
 
     seed: Mapping[str, Any] | None = None
@@ -260,40 +223,21 @@ class OnPrivate:
 
 
 def seed_of(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Commitment and bits of the private seed that tasks were drawn by; None of public tasks.
+    """Return the commitment and bits of the private seed that tasks were drawn by; None for public tasks.
 
-    Raises
-    ------
-    ConfigError
-        If they are of several seeds, or some are public.
-
-    Examples
-    --------
-    >>> seed_of([{"suite": "clean"}]) is None
-    True
+    Raise ConfigError if they are of several seeds, or some are public.
     """
-    found: list[dict[str, Any] | None] = []
-    for about in tasks:
-        said = about.get(task_files.PRIVATE)
-        if said not in found:
-            found.append(said)
-    if len(found) > 1:
+    seeds = [about.get(task_files.PRIVATE) for about in tasks]
+    if any(seed != seeds[0] for seed in seeds):
         message = "these tasks are drawn by several seeds, and one is private: draw them by one, and score those alone"
         raise ConfigError(message)
-    return found[0] if found else None
+    return seeds[0] if seeds else None
 
 
 def check_public(seed: Mapping[str, Any] | None, what: str) -> None:
-    """Refuse to publish what is of a private seed: once its queries or truths are out, it vouches for nothing.
+    """Refuse to publish results of a private seed: once its queries or truths are known, it proves nothing.
 
-    Raises
-    ------
-    ConfigError
-        Naming what.
-
-    Examples
-    --------
-    >>> check_public(None, "out/boards/mine")
+    Raise ConfigError that names `what`.
     """
     if seed is not None:
         message = (
@@ -313,28 +257,12 @@ def hold_private(
     draws: int,
     tell: Callable[[str], None],
 ) -> OnPrivate:
-    """Hold the rows of a public board against a board of a private seed.
+    """Compare the rows of a public board with a board of a private seed in `folder`.
 
-    Parameters
-    ----------
-    folder : Path
-        The private board.
-    entries, scores, tasks : sequence of Entry, mapping of str to pandas.DataFrame, sequence of mapping
-        Of the public one: contestants, their scored rows, what each `task.json` says.
-    pipeline : mapping
-        Its id and hash.
-    draws : int
-        Of the bootstrap.
-    tell : callable
-        Gets a line for what the two boards do not share.
-
-    Raises
-    ------
-    ConfigError
-        If the folder holds no board of a private seed, or one of another pipeline or version, or the public one is
-        itself of a private seed.
-    StoreError
-        If it holds no sound board.
+    `entries`, `scores`, `tasks` (contents of each `task.json`) and `pipeline` (its id and hash) are those of the public
+    board. Report by `tell` which tasks the two boards do not share. Raise ConfigError if the folder holds no board of a
+    private seed, or one of another pipeline or version, or the public one is itself of a private seed. Raise StoreError
+    if it holds no sound board.
     """
     about = read_private(folder, pipeline)
     if seed_of(tasks) is not None:
@@ -364,20 +292,7 @@ def hold_private(
 
 
 def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
-    """Read the `board.json` of a private board that rows of a pipeline are compared with.
-
-    Raises
-    ------
-    ConfigError, StoreError
-        As `hold_private` does.
-
-    Examples
-    --------
-    >>> read_private(Path("nowhere"), {})
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: nowhere holds no board: score some runs first
-    """
+    """Read the `board.json` of a private board that rows of a pipeline are compared with."""
     about, _ = read_board(folder)
     if not about.get(task_files.PRIVATE):
         message = f"{folder} is a board of a public seed: name one that 'leaderboard --seed-file' has made"
@@ -409,7 +324,7 @@ def _whose(name: str, said: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
-    """Return why a private board vouches for nobody's row, or not for this one; empty where it can."""
+    """Return why a private board cannot confirm any row, or not this one; empty where it can."""
     if seed["bits"] < REPRODUCING_BITS:
         return f"the private seed has {seed['bits']} bits, {REPRODUCING_BITS} are needed"
     if entry is None:
@@ -421,21 +336,9 @@ def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
 
 
 def kept_private(about: Mapping[str, Any], entries: Sequence[Entry], root: Path) -> OnPrivate:
-    """Return what stored results keep of a private seed, for entries whose answers all come from them.
+    """Return the results on a private seed that stored results keep, for entries whose answers all come from them.
 
-    Parameters
-    ----------
-    about : mapping
-        `board.json` of the stored results.
-    entries : sequence of Entry
-        Those that are scored.
-    root : Path
-        Where the stored results are laid out.
-
-    Examples
-    --------
-    >>> kept_private({"entries": []}, [], Path("out")).rows
-    {}
+    `about` is the `board.json` of the stored results, `root` the folder that they are unpacked to.
     """
     if not about.get("private"):
         return OnPrivate()

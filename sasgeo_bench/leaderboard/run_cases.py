@@ -51,20 +51,9 @@ _MOST_LETTERS: Final = 40  # of a name there
 class Case:
     """One query and all that is known of its answer.
 
-    Parameters
-    ----------
-    matcher, failure : str
-        Who answered, and how it failed; "" where it did not.
-    query, truth : Query, Truth
-        What was asked.
-    prediction : Prediction, optional
-        The answer; None for a missing row.
-    p_false : mapping of str to float
-        By rejector, how likely it says that the answer is false.
-    orders : mapping of str to float
-        The same of rejectors that order answers by it, and tell no probability.
-    accepted : mapping of str to bool
-        By rejector, whether the threshold for a risk of 5 % accepts it.
+    `failure` is the class of the failure; "" without one. `prediction` is None for a missing row. By rejector,
+    `p_false` is the stated chance that the answer is false, `orders` the same of rejectors that give an order and no
+    probability, and `accepted` whether the threshold for a risk of 5 % accepts it.
     """
 
     matcher: str
@@ -78,7 +67,7 @@ class Case:
 
     @property
     def fix(self) -> Pose | None:
-        """The first pose of the answer."""
+        """Return the first pose of the answer."""
         has_pose = self.prediction is not None and self.prediction.status == "ok" and self.prediction.candidates
         return self.prediction.candidates[0][0] if has_pose and self.prediction is not None else None
 
@@ -135,19 +124,8 @@ def _plain(value: float | str) -> float | str:
 def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePicture:
     """Read the map, evidence and poses that the picture of a case shows.
 
-    Parameters
-    ----------
-    case : Case
-        The query and its answer.
-    region : Path
-        Folder of the map that is searched.
-    about : mapping
-        What `task.json` says: the map must be that very build.
-
-    Raises
-    ------
-    StoreError
-        If the map is missing, damaged, or was built anew since the queries were drawn.
+    `region` is the folder of the searched map, `about` the content of `task.json`: the map must be that very build.
+    Raise StoreError if the map is missing, damaged, or was built anew since the queries were drawn.
     """
     manifest = region_files.read_manifest(region)
     if not task_files.is_of_map(about, manifest):
@@ -173,7 +151,7 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
 
 
 def _disc(query: Query) -> tuple[float, float, float] | None:
-    """Middle and radius of what is searched, where that is a disc."""
+    """Return the middle and radius of the searched disc, if the search is in a disc."""
     center_m, radius_m = query.prior.center_m, query.prior.radius_m
     return None if center_m is None or radius_m is None or query.candidates else (*center_m, radius_m)
 
@@ -195,7 +173,7 @@ def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
 
 
 def _map_part(layers: NDArray[np.uint8], grid: Grid, manifest: Manifest) -> MapPart:
-    """Layers as colours, at most `_MOST_CELLS` along a side: one shows what is there in any cell it is made of."""
+    """Return layers as colours, at most `_MOST_CELLS` along a side."""
     step = max(1, min(-(-max(grid.shape) // _MOST_CELLS), *grid.shape))
     rows, cols = (side // step for side in grid.shape)
     parts = layers[:, : rows * step, : cols * step].reshape(len(layers), rows, step, cols, step)
@@ -279,24 +257,10 @@ _NAMED: Final = 3
 
 @dataclass(frozen=True, kw_only=True)
 class RunCases:
-    """A matcher's answers, scored.
+    """A matcher's scored answers.
 
-    Parameters
-    ----------
-    run : Path
-        As it was named.
-    entry : Entry
-        Who answered.
-    root : Path
-        Where tasks/, truth/ and regions/ are.
-    scores : pandas.DataFrame
-        Scored rows of all tasks.
-    judged : mapping of (matcher, rejector) to pandas.DataFrame
-        What rejectors say of them, its own word among them.
-    tasks : mapping of (str, str) to ScoredTask
-        By suite and region.
-    predictions : mapping of str to Prediction
-        By query.
+    `run` is the path as given, `root` holds tasks/, truth/ and regions/. `judged` are results of rejectors by matcher
+    and rejector, its own confidence among them; `tasks` are by suite and region, `predictions` by query.
     """
 
     run: Path
@@ -308,7 +272,7 @@ class RunCases:
     predictions: Mapping[str, Prediction]
 
     def failures(self) -> pd.DataFrame:
-        """Every failure with its class (`cases.COLUMNS`); controls of boards are none."""
+        """Return every failure with its class (`cases.COLUMNS`), without those of a board's controls."""
         rejector = operating_rejector(self.judged, self.entry.name)
         judged = None if rejector is None else self.judged[self.entry.name, rejector]
         return find_cases(self.scores[~is_control(self.scores)].reset_index(drop=True), self.entry.name, judged)
@@ -321,39 +285,18 @@ def root_of(run: Path, out: Path) -> Path:
 
 
 def is_run(folder: Path) -> bool:
-    """Return whether a folder is a run, or holds those of a matcher.
-
-    Examples
-    --------
-    >>> is_run(Path("nowhere"))
-    False
-    """
+    """Return True if a folder is a run, or holds those of a matcher."""
     patterns = (prediction_files.RUN, f"*/*/{prediction_files.RUN}", f"*/*/*/{prediction_files.RUN}")
     return any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
 def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequence[str] = (), tell: Tell) -> RunCases:
-    """Score the answers of a run.
+    """Score the answers of a run, in a folder with runs of one matcher.
 
-    Parameters
-    ----------
-    run : Path
-        Folder of a run, or one with runs of one matcher.
-    out : Path
-        Root of what is built, for runs that lie elsewhere.
-    split : Split, optional
-        Says which places calibrate.
-    rejectors : sequence of str
-        Names, or module:Class; the matcher's own word is always among them.
-    tell : callable
-        Gets a line for runs that are left out.
-
-    Raises
-    ------
-    StoreError
-        If no task of the run is there as it was asked, or a truth is missing.
-    ConfigError
-        If the folder holds runs of several matchers.
+    `out` is the root of tasks and truths of runs that lie elsewhere; `split` assigns the places that calibrate.
+    `rejectors` are names, or module:Class; the matcher's own confidence is always among them. Report by `tell` which
+    runs are left out. Raise StoreError if no task of the run is there as it was asked, or a truth is missing. Raise
+    ConfigError if the folder holds runs of several matchers.
     """
     entries = find_entries([run])
     if len(entries) > 1:
@@ -386,7 +329,7 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
 
 
 def _answers(source: Path, about: Mapping[str, Any], folder: Path) -> dict[str, Prediction]:
-    """Answers of a run to the queries as they are now."""
+    """Return the answers of a run to the queries as they are now."""
     task = AskedTask.of(folder)
     is_same = about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
     found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
@@ -415,21 +358,10 @@ def _judged(
 
 
 def picture_of(cases: RunCases, query: str) -> tuple[str, CasePicture]:
-    """Id of a query and what its picture shows.
+    """Return the id of a query, from the beginning of one, and the content of its picture.
 
-    Parameters
-    ----------
-    cases : RunCases
-        The run.
-    query : str
-        The beginning of an id.
-
-    Raises
-    ------
-    ConfigError
-        If no query, or more than one, begins so.
-    StoreError
-        If the query was drawn anew since it was asked, or its map is missing or another one.
+    Raise ConfigError if no query, or more than one, begins so. Raise StoreError if the query was drawn anew since it
+    was asked, or its map is missing or another one.
     """
     query_id = _find(cases, query)
     row = cases.scores[cases.scores["query_id"] == query_id].iloc[0]
@@ -453,7 +385,7 @@ def _truth(task: ScoredTask, query_id: str) -> Truth:
 
 
 def _find(cases: RunCases, query: str) -> str:
-    """The one id that begins so."""
+    """Return the one id that begins so."""
     if not query:
         message = f"--query is empty: name the beginning of an id, as 'inspect {cases.run}' lists some"
         raise ConfigError(message)

@@ -29,8 +29,6 @@ def figure_text(row: Record) -> str:
 def interval_text(value: float, lo: float, hi: float) -> str:
     """Return a figure with the ends of its interval, or alone where it has none.
 
-    Examples
-    --------
     >>> interval_text(0.63, 0.55, 0.7), interval_text(0.63, math.nan, math.nan)
     ('0.630 [0.550, 0.700]', '0.630')
     """
@@ -49,8 +47,6 @@ def number_text(value: float) -> str:
 def tally_text(value: float) -> str:
     """Return a count, or an expected count, never as a power of ten.
 
-    Examples
-    --------
     >>> tally_text(3072.0), tally_text(3.0), tally_text(0.13636)
     ('3072', '3', '0.136')
     """
@@ -75,13 +71,7 @@ class Bar:
 
     @classmethod
     def of_share(cls, row: Record) -> Self | None:
-        """Of a share with an interval; None of anything else.
-
-        Examples
-        --------
-        >>> Bar.of_share({"value": 0.5, "lo": 0.25, "hi": 0.75, "unit": "1"})
-        Bar(lo=25.0, hi=75.0, at=50.0)
-        """
+        """Return the bar of a share with an interval; None for other figures."""
         ends = tuple(float(row[name]) for name in ("lo", "hi", "value"))
         if row.get("unit") != "1" or not all(0 <= end <= 1 for end in ends):
             return None
@@ -159,8 +149,6 @@ class Table:
 def text_of(cell: Cell) -> str:
     """Return a cell as plain text; a mark that praises or warns stands in brackets.
 
-    Examples
-    --------
     >>> text_of(Cell(text="mine", marks=(Mark(text="as submitted", meaning="", tone="warn"),)))
     'mine (as submitted)'
     """
@@ -173,21 +161,13 @@ def sort_key(value: float) -> float | None:
 
 
 def text_cells(*texts: str) -> tuple[Cell, ...]:
-    """Return cells of plain text.
-
-    Examples
-    --------
-    >>> [cell.text for cell in text_cells("a", "b")]
-    ['a', 'b']
-    """
+    """Return cells of plain text."""
     return tuple(Cell(text=str(text)) for text in texts)
 
 
 def plain_cell(value: object) -> Cell:
     """Return a cell of a text or a whole number; "-" where there is none.
 
-    Examples
-    --------
     >>> plain_cell(3), plain_cell("").text
     (Cell(text='3', key=3.0, href='', marks=(), bar=None), '-')
     """
@@ -198,8 +178,6 @@ def plain_cell(value: object) -> Cell:
 def number_cell(value: float, unit: str = "") -> Cell:
     """Return a cell of one number, with its unit if it has one.
 
-    Examples
-    --------
     >>> number_cell(12.345, "s").text, number_cell(math.nan).text
     ('12.3 s', '-')
     """
@@ -222,8 +200,6 @@ def figure_cell(row: Record | None, *, has_bar: bool = False) -> Cell:
 def rank_cell(row: Record, *, ranked: int, mark: Mark | None = None) -> Cell:
     """Return a cell of a rank interval, with a bar of the ranks it covers unless one matcher alone is ranked.
 
-    Examples
-    --------
     >>> row = {"matcher": "mine", "rank_best": 1, "rank_worst": 1}
     >>> rank_cell(row, ranked=2).bar, rank_cell(row, ranked=1).bar
     (Bar(lo=0.0, hi=50.0, at=None), None)
@@ -237,10 +213,8 @@ def rank_cell(row: Record, *, ranked: int, mark: Mark | None = None) -> Cell:
 
 
 def file_stem(*parts: str) -> str:
-    """Parts as letters, digits and hyphens alone.
+    """Return parts as letters, digits and hyphens alone.
 
-    Examples
-    --------
     >>> file_stem("matcher", "<script>alert(1)</script>")
     'matcher-script-alert-1-script'
     """
@@ -251,8 +225,6 @@ def file_stem(*parts: str) -> str:
 def page_names(kind: str, names: Iterable[str]) -> dict[str, str]:
     """Name -> name of its page, no two alike, whatever the names are.
 
-    Examples
-    --------
     >>> page_names("matcher", ["raster", "raster!", "raster-2"])
     {'raster': 'matcher-raster.html', 'raster!': 'matcher-raster-3.html', 'raster-2': 'matcher-raster-2.html'}
     """
@@ -279,26 +251,13 @@ class Tie:
     worst: int
 
     def to_text(self) -> str:
-        """In a line.
-
-        Examples
-        --------
-        >>> Tie(names=("a", "b"), best=1, worst=2).to_text()
-        'a, b share ranks 1 to 2'
-        """
+        """Return the tie in a line."""
         return f"{', '.join(self.names)} share ranks {self.best} to {self.worst}"
 
 
 def ties_of(rows: Sequence[Record]) -> tuple[Tie, ...]:
-    """Ties among the ranked rows of one table.
+    """Return the ties among the ranked rows of one table; rows without a rank are left out.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        With `matcher`, `rank_best` and `rank_worst`; those without a rank have no part.
-
-    Examples
-    --------
     >>> ranked = [("a", 1, 2), ("b", 1, 2), ("c", 3, 3)]
     >>> ties_of([dict(zip(("matcher", "rank_best", "rank_worst"), row)) for row in ranked])
     (Tie(names=('a', 'b'), best=1, worst=2),)

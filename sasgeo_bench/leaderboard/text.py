@@ -46,8 +46,6 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """Return whether the controls of a board held, failures one by one.
 
-    Examples
-    --------
     >>> control_lines([])
     ['Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them).']
     """
@@ -69,8 +67,6 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
 def training_lines(about: Mapping[str, Any]) -> list[str]:
     """Return which rows are set apart, and which entries were trained on which places.
 
-    Examples
-    --------
     >>> said = {"file": "learned/ab.json", "trained_on": ["monaco", "porto"], "pairs": 24, "asked": ["clean/vaduz"]}
     >>> training_lines({"entries": [{"name": "mine", "learned": [said]}]})
     ['mine: for 1 task (clean/vaduz) learnt from 24 queries of 2 places (monaco, porto).']
@@ -99,18 +95,7 @@ def tables_of(
 ) -> Iterator[Table]:
     """Yield the tables of a board in the order of its pages; those without a row are left out.
 
-    Parameters
-    ----------
-    board : pandas.DataFrame
-        The leaderboard.
-    about : mapping
-        The content of `board.json`.
-    findings, falsifiers, verdicts : sequence
-        Registered contrasts, how they fare without the stress, and controls.
-    steps : pandas.DataFrame, optional
-        From `steps.steps_frame`.
-    ages : mapping, optional
-        From `plot_tables.age_names`.
+    `about` is the content of `board.json`, `steps` is from `strata.steps_frame`, `ages` from `plot_tables.age_names`.
     """
     book = Book.of(board, about)
     suites = [
@@ -175,8 +160,6 @@ def _section(table: Table) -> Iterator[str]:
 def markdown_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
     r"""Yield the lines of a table of plain texts; see `texts.markdown`.
 
-    Examples
-    --------
     >>> list(markdown_table(["matcher"], [["mine 1|2"]]))[-1]
     '| mine 1\\|2 |'
     """

@@ -16,15 +16,9 @@ Ints = NDArray[np.int64]
 def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:
     """Return the values of a column as floats, shape (N,); infinity is allowed.
 
-    `count` is the expected N, `name` names the column in errors.
+    `count` is the expected N, `name` names the column in errors. Raise MetricError if the shape differs, or a value is
+    NaN.
 
-    Raises
-    ------
-    MetricError
-        If the shape differs, or a value is NaN.
-
-    Examples
-    --------
     >>> check_column([True, False], "hits").tolist()
     [1.0, 0.0]
     """
@@ -42,12 +36,8 @@ def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floa
 def check_weights(weights: ArrayLike | None, count: int) -> Floats:
     """Return the weights of N queries, shape (N,); 1 each where none are given.
 
-    Weights are counts: a query of weight 2 counts twice.
-
-    Raises
-    ------
-    MetricError
-        If their number is not N, or one is negative or not finite.
+    Weights are counts: a query of weight 2 counts twice. Raise MetricError if their number is not N, or one is negative
+    or not finite.
     """
     if weights is None:
         return np.ones(count)
@@ -62,15 +52,9 @@ def check_weights(weights: ArrayLike | None, count: int) -> Floats:
 def block_codes(blocks: Sequence[str] | Ints, count: int) -> tuple[Ints, Ints]:
     """Return the sizes of K blocks, shape (K,), and the index of each query's block from 0, shape (N,).
 
-    Blocks stand in the order of their names. Integer codes in the same order give the same result.
+    Blocks stand in the order of their names. Integer codes in the same order give the same result. Raise MetricError if
+    the number of blocks is not N.
 
-    Raises
-    ------
-    MetricError
-        If the number of blocks is not N.
-
-    Examples
-    --------
     >>> sizes, code = block_codes(["b", "a", "b"], 3)
     >>> sizes.tolist(), code.tolist()
     ([1, 2], [1, 0, 1])
@@ -89,8 +73,6 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> float:
 
     An infinite value of positive weight makes the mean infinite; a value of weight 0 never counts.
 
-    Examples
-    --------
     >>> weighted_mean([1.0, 0.0, 0.0], weights=[2.0, 1.0, 1.0])
     0.5
     """
@@ -106,20 +88,11 @@ def weighted_quantile(values: ArrayLike, share: float, weights: ArrayLike | None
     """Return the least value that at least a fraction `share` in (0, 1] of the queries does not exceed.
 
     The result is always one of the values, so a finite and an infinite error are never averaged; NaN where the weights
-    sum to 0.
+    sum to 0. Raise MetricError if the share is out of range.
 
-    Raises
-    ------
-    MetricError
-        If the share is out of range.
-
-    Notes
-    -----
     The inverse of the empirical distribution function, type 1 of Hyndman and Fan (1996). For an even number of queries
     the median is the lower of the two in the middle.
 
-    Examples
-    --------
     >>> weighted_quantile([3.0, 1.0, float("inf"), 2.0], 0.5)
     2.0
     """

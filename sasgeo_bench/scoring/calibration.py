@@ -23,19 +23,10 @@ def brier(answers: Answers, weights: ArrayLike | None = None) -> float:
     """Return the Brier score of the confidences: the mean of (confidence - right)^2 over answered queries, in [0, 1].
 
     NaN without answers, and where any answer has no confidence: otherwise a method could omit unsure confidences to
-    look calibrated.
+    look calibrated. Raise MetricError if a confidence is no probability.
 
-    Raises
-    ------
-    MetricError
-        If a confidence is no probability.
-
-    Notes
-    -----
     Brier, Monthly Weather Review 1950, for two outcomes: half of his sum.
 
-    Examples
-    --------
     >>> brier(Answers(confidence=[0.5, 1.0], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1]))
     0.125
     """
@@ -51,19 +42,10 @@ def calibration_error(answers: Answers, weights: ArrayLike | None = None, *, bin
     """Return the expected calibration error over at most `bins` bins of equal mass, in [0, 1].
 
     This is the mean over answers of |mean confidence - fraction right| of their bin. NaN as for `brier`. It is biased
-    upwards for few answers.
+    upwards for few answers. Raise MetricError if a confidence is no probability, or there is no bin.
 
-    Raises
-    ------
-    MetricError
-        If a confidence is no probability, or there is no bin.
-
-    Notes
-    -----
     Nguyen and O'Connor, EMNLP 2015; for the bias see Roelofs et al., AISTATS 2022.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.9, 0.1], is_answered=[1] * 3, is_right=[1, 0, 0], is_present=[1] * 3)
     >>> round(calibration_error(some, bins=2), 3)  # (2 |0.9 - 0.5| + |0.1 - 0|) / 3
     0.3
@@ -87,8 +69,6 @@ def equal_mass_bins(confidence: Floats, mass: Floats | None = None, *, bins: int
 
     Equal confidences share the bin that holds the middle of their mass. `mass` is positive, shape (N,); 1 by default.
 
-    Examples
-    --------
     >>> equal_mass_bins(np.array([0.9, 0.1, 0.9, 0.9]), bins=2).tolist()
     [1, 0, 1, 1]
     """
@@ -100,20 +80,15 @@ def equal_mass_bins(confidence: Floats, mass: Floats | None = None, *, bins: int
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stanford:
-    """Areas of the Stanford diagram, each of shape (N,); every query lies in exactly one.
+    """Areas of the Stanford diagram as masks, each of shape (N,); every query lies in exactly one.
 
-    Parameters
-    ----------
-    nominal : ndarray of bool
-        Available and bounded: error <= level <= limit.
-    misleading : ndarray of bool
-        Available, not bounded, harmless: level < error <= limit.
-    hazardous : ndarray of bool
-        Hazardously misleading: level <= limit < error.
-    unavailable : ndarray of bool
-        Not available, bounded: limit < level, error <= level.
-    unavailable_misleading : ndarray of bool
-        Not available, not bounded: limit < level < error.
+    Available means level <= limit, bounded error <= level.
+
+    - nominal: available and bounded
+    - misleading: available, not bounded, harmless (level < error <= limit)
+    - hazardous: hazardously misleading (level <= limit < error)
+    - unavailable: not available, bounded
+    - unavailable_misleading: not available, not bounded (limit < level < error)
     """
 
     nominal: Bools
@@ -126,26 +101,12 @@ class Stanford:
 def stanford(protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_limit_m: float) -> Stanford:
     """Return the area of the Stanford diagram that each query lies in.
 
-    Parameters
-    ----------
-    protection_level_m : array_like, shape (N,)
-        Stated upper bound of the error; infinite without a level or an answer.
-    position_error_m : array_like, shape (N,)
-        Infinite for an answer where the place is absent.
-    alert_limit_m : float
-        Largest error that is safe to use.
+    The protection level, shape (N,), is the stated upper bound of the error; infinite without a level or an answer. The
+    position error, shape (N,), is infinite for an answer where the place is absent. The alert limit is the largest
+    error that is safe to use. Raise MetricError if a value is negative or NaN, or the limit is not positive and finite.
 
-    Raises
-    ------
-    MetricError
-        If a value is negative or NaN, or the limit is not positive and finite.
-
-    Notes
-    -----
     Tossaint et al., "The Stanford-ESA integrity diagram", NAVIGATION 2007. Equality counts as within.
 
-    Examples
-    --------
     >>> areas = stanford([5.0, 5.0, 5.0, 20.0], [4.0, 6.0, 11.0, 11.0], 10.0)
     >>> areas.misleading.tolist(), areas.hazardous.tolist()
     ([False, True, False, False], [False, False, True, False])

@@ -4,7 +4,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Final, Literal
 
 import numpy as np
@@ -45,19 +44,10 @@ def mcnemar_exact(first: ArrayLike, second: ArrayLike) -> PairedTest:
     """Test by McNemar's exact test whether two methods are right equally often.
 
     The inputs are hits (0 or 1), shape (N,), in the same order of queries. The p-value is that of a fair coin tossed
-    once per discordant query.
+    once per discordant query. Raise MetricError if a value is neither 0 nor 1, or the numbers differ.
 
-    Raises
-    ------
-    MetricError
-        If a value is neither 0 nor 1, or the numbers differ.
-
-    Notes
-    -----
     The test assumes independent queries, which those of one block are not: compare `mcnemar_clustered`.
 
-    Examples
-    --------
     Six discordant queries, all for the first: 2 / 2^6.
 
     >>> mcnemar_exact([1, 1, 1, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0, 0])
@@ -74,20 +64,14 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
     """Test by McNemar's test for clustered queries whether two methods are right equally often.
 
     The inputs are as for `mcnemar_exact`, with the block of each query. The p-value is NaN for fewer than two blocks.
+    Raise MetricError if a value is neither 0 nor 1, or the numbers differ.
 
-    Raises
-    ------
-    MetricError
-        If a value is neither 0 nor 1, or the numbers differ.
-
-    Notes ----- Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K, (K
-    - 1) / K (sum d_k)^2 / sum d_k^2 is chi-squared with one degree of freedom. It tests the difference of the means
+    Obuchowski, Statistics in Medicine 17 (1998): with d_k = first only less second only in block k of K, the statistic
+    (K - 1) / K (sum d_k)^2 / sum d_k^2 is chi-squared with one degree of freedom. It tests the difference of the means
     over all queries, which boards print; Durkalski et al. (2003) give each block the same weight instead. With one
     query per block it is McNemar's test without correction, times (K - 1) / K.
 
-    Examples
-    --------
-    Blocks differ by 2, 2 and 2: (2/3) 6^2 / 12 = 2.
+    Blocks differ by 2, 2 and 2, so the statistic is (2/3) 6^2 / 12 = 2:
 
     >>> found = mcnemar_clustered([1] * 6, [0] * 6, ["a", "a", "b", "b", "c", "c"])
     >>> round(found.p_value, 4)
@@ -97,28 +81,22 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
     _, code = block_codes(blocks, len(ours))
     each = np.bincount(code, weights=ours.astype(float) - theirs, minlength=1)
     count = len(each)
-    gained, lost = int((ours & ~theirs).sum()), int((~ours & theirs).sum())
     squared = float((each**2).sum())
     if count < 2:  # noqa: PLR2004 - one block cannot differ from itself
         p_value = math.nan
     else:
         statistic = (count - 1) / count * float(each.sum()) ** 2 / squared if squared > 0 else 0.0
         p_value = float(chi2.sf(statistic, 1))
+    gained, lost = int((ours & ~theirs).sum()), int((~ours & theirs).sum())
     return PairedTest(first_only=gained, second_only=lost, p_value=p_value)
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values adjusted for the number of registered contrasts (Holm, Scandinavian Journal of Statistics 1979).
 
-    A contrast holds at level a if its adjusted value is at most a. Pass every registered contrast and no others.
+    A contrast holds at level a if its adjusted value is at most a. Pass every registered contrast and no others. Raise
+    MetricError if a value lies outside [0, 1] or is NaN: a contrast without a test has p = 1.
 
-    Raises
-    ------
-    MetricError
-        If a value lies outside [0, 1] or is NaN: a contrast without a test has p = 1.
-
-    Examples
-    --------
     >>> {name: round(value, 3) for name, value in holm({"graph": 0.01, "stability": 0.04, "unknown": 0.03}).items()}
     {'graph': 0.03, 'stability': 0.06, 'unknown': 0.06}
     """
@@ -126,9 +104,7 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     if wrong is not None:
         message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; an untested contrast has 1"
         raise MetricError(message)
-    if not p_values:
-        return {}
-    adjusted = multipletests(list(p_values.values()), method="holm")[1]
+    adjusted = multipletests(list(p_values.values()), method="holm")[1] if p_values else ()
     return dict(zip(p_values, map(float, adjusted), strict=True))
 
 
@@ -136,27 +112,13 @@ def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["hig
     """Return which method is better than which, shape (M, M), at a level of 95 % for all pairs at once.
 
     An element is True where the method of the row is better than that of the column and the difference is significant.
+    `values`, shape (M,), is the metric of each method, `draws`, shape (D, M), the same in D paired draws. Raise
+    MetricError if shapes do not fit, or a number is not finite.
 
-    Parameters
-    ----------
-    values : array_like, shape (M,)
-        Metric of each of M methods.
-    draws : array_like, shape (D, M)
-        The same in D paired draws, as from `bootstrap_means`.
-
-    Raises
-    ------
-    MetricError
-        If shapes do not fit, or a number is not finite.
-
-    Notes
-    -----
     A difference counts where it exceeds c standard deviations of its draws. c is the 95 % quantile, over draws, of the
     largest |draw - difference| / deviation of any pair (Romano and Wolf, Econometrica 2005; for ranks Mogstad et al.,
     Review of Economic Studies 2024).
 
-    Examples
-    --------
     >>> chance = np.random.default_rng(1).normal(0.0, 0.01, (1000, 2))
     >>> distinguishable([0.5, 0.9], chance + [0.5, 0.9], better="higher").tolist()
     [[False, False], [True, False]]
@@ -207,15 +169,9 @@ class RankInterval:
 def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
     """Return the rank interval of each method from the table of `distinguishable`, shape (M, M).
 
-    The best rank is one more than the number of better methods; the worst leaves room for all known to be worse.
+    The best rank is one more than the number of better methods; the worst leaves room for all known to be worse. Raise
+    MetricError if the table is not square, or two methods are better than each other.
 
-    Raises
-    ------
-    MetricError
-        If the table is not square, or two methods are better than each other.
-
-    Examples
-    --------
     The first beats the third, nothing else is certain:
 
     >>> [rank.text for rank in rank_intervals([[0, 0, 1], [0, 0, 0], [0, 0, 0]])]
@@ -231,29 +187,21 @@ def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
     )
 
 
-ALPHA: Final = 0.05
-POWER: Final = 0.8
+_Z_LEVEL: Final = float(norm.isf(0.05 / 2))  # deviates of a two-sided level of 5 % and a power of 80 %
+_Z_POWER: Final = float(norm.ppf(0.8))
 
 
 def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> float:
     """Return how much more alike values of one block are than values of different blocks, at most 1.
 
     Negative where values of a block are less alike than chance. NaN for fewer than two blocks, without a block of two
-    queries, or where nothing varies. For two methods, pass the difference of their hits per query.
+    queries, or where nothing varies. For two methods, pass the difference of their hits per query. Raise MetricError if
+    a value is not finite.
 
-    Raises
-    ------
-    MetricError
-        If a value is not finite.
-
-    Notes
-    -----
     The analysis-of-variance estimator for blocks of unequal size (Donner, International Statistical Review 1986):
     (B - W) / (B + (n0 - 1) W), with B and W the mean squares between and within K blocks and
     n0 = (N - sum n_k^2 / N) / (K - 1).
 
-    Examples
-    --------
     >>> intraclass_correlation([1.0, 1.0, 0.0, 0.0], ["a", "a", "b", "b"])
     1.0
     """
@@ -276,20 +224,12 @@ def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> f
 def design_effect(sizes: ArrayLike, correlation: float) -> float:
     """Return how many times more queries blocks need than independent ones, at least 1.
 
-    `sizes`, shape (K,), are the queries of each block; a negative correlation counts as 0.
+    `sizes`, shape (K,), are the queries of each block; a negative correlation counts as 0. Raise MetricError if there
+    is no block, a block is empty, or the correlation exceeds 1.
 
-    Raises
-    ------
-    MetricError
-        If there is no block, a block is empty, or the correlation exceeds 1.
-
-    Notes
-    -----
     Kish 1965: 1 + (m - 1) rho, with m = sum n_k^2 / sum n_k the size of the block of a random query, which for equal
     blocks is their size.
 
-    Examples
-    --------
     >>> round(design_effect([50] * 36, 0.05), 2)
     3.45
     """
@@ -301,75 +241,35 @@ def design_effect(sizes: ArrayLike, correlation: float) -> float:
     return 1.0 + (size - 1.0) * max(correlation, 0.0)
 
 
-@cache
-def _deviates(alpha: float, power: float) -> tuple[float, float]:
-    if not (0 < alpha < 1 and 0.5 <= power < 1):  # noqa: PLR2004 - below, the quadratic's other root would hold
-        message = f"alpha must lie in (0, 1) and power in [0.5, 1), got {alpha!r} and {power!r}"
-        raise MetricError(message)
-    return float(norm.isf(alpha / 2)), float(norm.ppf(power))
+def detectable_difference(pairs: float, discordant_share: float) -> float:
+    """Return the least difference of two shares that McNemar's test finds at 5 % (two-sided) with a power of 80 %.
 
+    `pairs` are independent pairs: queries divided by the design effect. `discordant_share`, in [0, 1], is the share of
+    queries that just one of the two methods gets right; the result is infinite if even that difference would be missed.
+    Raise MetricError if a number is out of range.
 
-def detectable_difference(
-    pairs: float, discordant_share: float, *, alpha: float = ALPHA, power: float = POWER
-) -> float:
-    """Return the least difference of two shares that McNemar's test finds with some independent pairs.
-
-    Infinite if even a difference of `discordant_share` would be missed.
-
-    Parameters
-    ----------
-    pairs : float
-        Independent pairs: queries divided by the design effect.
-    discordant_share : float
-        Share of queries that just one of the two methods gets right, in [0, 1].
-    alpha : float
-        Two-sided level.
-    power : float
-        Chance to find the difference, in [0.5, 1).
-
-    Raises
-    ------
-    MetricError
-        If a number is out of range.
-
-    Notes
-    -----
     Connor, Biometrics 1987: n = (z_a sqrt(p) + z_b sqrt(p - d^2))^2 / d^2, solved for the difference d:
     d = sqrt(p) (z_a sqrt(n) + z_b sqrt(n + z_b^2 - z_a^2)) / (n + z_b^2).
 
-    Examples
-    --------
     >>> round(detectable_difference(521, 0.06), 4)
     0.03
     """
-    low, high = _deviates(alpha, power)
     if not pairs >= 0 or not 0 <= discordant_share <= 1:
         message = f"expected pairs >= 0 and a discordant share in [0, 1], got {pairs!r} and {discordant_share!r}"
         raise MetricError(message)
     # Even if all discordant pairs point one way, d = p: n p^2 must reach (z_a sqrt(p) + z_b sqrt(p - p^2))^2.
-    least = low + high * math.sqrt(1.0 - discordant_share)
+    least = _Z_LEVEL + _Z_POWER * math.sqrt(1.0 - discordant_share)
     if pairs * discordant_share < least**2:
         return math.inf
-    root = low * math.sqrt(pairs) + high * math.sqrt(pairs + high**2 - low**2)
-    return math.sqrt(discordant_share) * root / (pairs + high**2)
+    root = _Z_LEVEL * math.sqrt(pairs) + _Z_POWER * math.sqrt(pairs + _Z_POWER**2 - _Z_LEVEL**2)
+    return math.sqrt(discordant_share) * root / (pairs + _Z_POWER**2)
 
 
 def sensitivity(first: ArrayLike, second: ArrayLike, blocks: Sequence[str] | Ints) -> float:
     """Return the minimum detectable difference of two methods on a suite; infinite if even the largest would be missed.
 
     `first` and `second` are hits in [0, 1], shape (N,), for the same queries. A correlation that cannot be estimated
-    counts as 0.
-
-    Raises
-    ------
-    MetricError
-        If there is no query, or numbers differ.
-
-    Examples
-    --------
-    >>> blocks = [str(at // 50) for at in range(1800)]
-    >>> round(sensitivity([at % 32 == 0 for at in range(1800)], [at % 32 == 1 for at in range(1800)], blocks), 4)
-    0.0166
+    counts as 0. Raise MetricError if there is no query, or numbers differ.
     """
     ours = check_column(first, "first")
     gaps = ours - check_column(second, "second", len(ours))

@@ -37,10 +37,7 @@ class AskedTask:
     def of(cls, folder: Path) -> Self:
         """Read it from its folder.
 
-        Raises
-        ------
-        StoreError
-            If the folder holds no valid task.
+        Raise StoreError if the folder holds no valid task.
         """
         return cls(folder=folder, about=task_files.read_task(folder), asked=task_files.read_asked(folder))
 
@@ -68,10 +65,7 @@ class ScoredTask:
 def read_scored_task(folder: Path, root: Path) -> ScoredTask:
     """Read a task and its truths from their own root, and check that they match.
 
-    Raises
-    ------
-    StoreError
-        If either is missing or damaged, or they do not belong together.
+    Raise StoreError if either is missing or damaged, or they do not belong together.
     """
     about = task_files.read_task(folder)
     truth = root / str(about["suite"]) / str(about["region"])
@@ -128,14 +122,8 @@ def read_entry_answers(
 
     Without `folders`, the tasks are those that runs were made on and that files answer; `root` is the parent of tasks/.
     `named` are the paths that the user named, `tell` receives a line about skipped runs. `failures` records entries
-    whose answers cannot be read.
-
-    Raises
-    ------
-    StoreError
-        If a run that the user named answers none of the queries.
-    ConfigError
-        If no entry answers any task.
+    whose answers cannot be read. Raise StoreError if a run that the user named answers none of the queries. Raise
+    ConfigError if no entry answers any task.
     """
     files: dict[str, dict[str, Prediction]] = {}
     for entry in entries:
@@ -268,12 +256,7 @@ def score_entries(
 def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
     """Check a file or submission against the tasks; a query without a row is a miss, not a fault.
 
-    Raises
-    ------
-    ConfigError
-        With the first fault, and the number of faults.
-    StoreError
-        If it cannot be read.
+    Raise ConfigError with the first fault, and the number of faults. Raise StoreError if it cannot be read.
     """
     path = entry.sources[0]
     if entry.submission is None:

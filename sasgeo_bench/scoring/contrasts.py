@@ -23,7 +23,7 @@ from sasgeo_bench.scoring.intervals import (
     mean_interval,
     percentile_interval,
     seed_of_text,
-    wilson,
+    wilson_share,
 )
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rejection import SLOW_DRAWS, answers_of
@@ -36,22 +36,11 @@ LESS_THAN_MATTERS: Final = ", by less than would matter"  # suffix of a verdict
 class Contrast:
     """Two methods and the queries they are compared on, as a pipeline file registers it.
 
-    Parameters
-    ----------
-    name : str
-        As in "graph".
-    first, second : str
-        Matchers; the difference is first less second. For "aurc" each is "matcher x rejector".
-    suites : tuple of str
-        Suites whose queries count, pooled.
-    kinds : tuple of str
-        Prefixes of the kinds that count, as in "U2"; empty for all stresses.
-    metric : {"primary", "aurc"}
-        Success or recall at 1 on present places, or the area under the risk-coverage curve on all places.
-    track : str
-        Track of the queries.
-    min_effect : float
-        Least relevant difference: of fractions, or for "aurc" relative to the second method.
+    The difference is `first` less `second`: matchers, or for the metric "aurc" each "matcher x rejector". The queries
+    are those of `suites`, pooled, on one track; `kinds` are prefixes of the kinds that count, as in "U2", all if empty.
+    The metric is "primary", success or recall at 1 on present places, or "aurc", the area under the risk-coverage curve
+    on all places. `min_effect` is the least relevant difference: of fractions, or for "aurc" relative to the second
+    method.
     """
 
     name: str
@@ -68,22 +57,12 @@ class Contrast:
 class Finding:
     """Result of a contrast.
 
-    Parameters
-    ----------
-    first_value, second_value, difference, lo, hi : float
-        Both metrics, first less second, and its paired 95 % interval; NaN without draws.
-    n, blocks : int
-        Numbers of queries and of their blocks; fewer than `LEAST_BLOCKS` decide nothing.
-    first_only, second_only : int
-        Discordant queries; 0 for "aurc".
-    p_exact, p_clustered, p_holm : float
-        McNemar's exact test (assumes independent queries), Obuchowski's for blocks, and the latter adjusted by Holm
-        over all registered contrasts. For "aurc" twice the fraction of draws on the other side of zero replaces
-        Obuchowski's.
-    detectable : float
-        Least difference that these queries can show; NaN for "aurc" and for too few blocks.
-    verdict : str
-        The decision in words.
+    The difference is first less second, `lo` and `hi` its paired 95 % interval; NaN without draws. Fewer than
+    `LEAST_BLOCKS` blocks decide nothing. `first_only` and `second_only` are the discordant queries; 0 for "aurc".
+    `p_exact` is from McNemar's exact test, which assumes independent queries, `p_clustered` from Obuchowski's for
+    blocks, and `p_holm` is the latter adjusted by Holm over all registered contrasts. For "aurc" twice the fraction of
+    draws on the other side of zero replaces Obuchowski's. `detectable` is the least difference that these queries can
+    show; NaN for "aurc" and for too few blocks.
     """
 
     name: str
@@ -120,23 +99,10 @@ def hold_contrasts(
 ) -> tuple[Finding, ...]:
     """Test every registered contrast, in order; a contrast without queries, or with a failed side, has p = 1.
 
-    Parameters
-    ----------
-    contrasts : sequence of Contrast
-        All registered contrasts and no others: Holm's adjustment covers them.
-    scores : mapping of str to pandas.DataFrame
-        Scored rows by matcher.
-    rejections : mapping of (matcher, rejector) to pandas.DataFrame
-        From `rejection.judge`.
-    draws : int
-        Number of bootstrap draws.
-    failed : collection of str
-        Matchers, and "matcher x rejector", that failed and so are not on the board.
-
-    Raises
-    ------
-    ConfigError
-        If a contrast names a method that is not on the board, and none failed.
+    `contrasts` are all registered ones and no others: Holm's adjustment covers them. `scores` are scored rows by
+    matcher, `rejections` those of `rejection.judge` by matcher and rejector. `failed` names matchers, and "matcher x
+    rejector", that failed and so are not on the board. Raise ConfigError if a contrast names a method that is not on
+    the board, and none failed.
     """
     there = scores.keys() | {" x ".join(key) for key in rejections}
     found = [
@@ -173,9 +139,8 @@ def _pair(
     contrast: Contrast, scores: Mapping[str, pd.DataFrame], rejections: Mapping[tuple[str, str], pd.DataFrame]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of both sides for the same queries in the same order."""
-    is_mean = contrast.metric == "primary"
-    known = scores if is_mean else {" x ".join(key): rows for key, rows in rejections.items()}
-    return both_on(contrast, known, _stressed if is_mean else _unfalsified)
+    known = scores if contrast.metric == "primary" else {" x ".join(key): rows for key, rows in rejections.items()}
+    return both_on(contrast, known, _counted(contrast))
 
 
 def both_on(
@@ -183,12 +148,8 @@ def both_on(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of both sides on a contrast's suites, track and kinds, for the same queries in the same order.
 
-    `known` holds scored rows by the names of sides; `chosen` selects the rows that count, shape (N,).
-
-    Raises
-    ------
-    ConfigError
-        If a side is not on the board.
+    `known` holds scored rows by the names of sides; `chosen` selects the rows that count, shape (N,). Raise ConfigError
+    if a side is not on the board.
     """
     frames = []
     for name in (contrast.first, contrast.second):
@@ -254,7 +215,7 @@ def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, pla
 
 def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
     """Return the scored rows that a contrast counts: its suites, kinds and track."""
-    return _rows_of(contrast, frame, _stressed if contrast.metric == "primary" else _unfalsified)
+    return _rows_of(contrast, frame, _counted(contrast))
 
 
 def _rows_of(
@@ -267,12 +228,11 @@ def _rows_of(
     return rows[is_kind.to_numpy(bool)]
 
 
-def _stressed(rows: pd.DataFrame) -> "pd.Series[bool]":
-    return rows["is_present"].astype(bool) & (rows["role"] == "stress")
-
-
-def _unfalsified(rows: pd.DataFrame) -> "pd.Series[bool]":
-    return rows["role"] != "falsifier"
+def _counted(contrast: Contrast) -> Callable[[pd.DataFrame], "pd.Series[bool]"]:
+    """Return a function that masks the rows a contrast counts: present places under stress, or all but falsifiers."""
+    if contrast.metric == "primary":
+        return lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "stress")
+    return lambda rows: rows["role"] != "falsifier"
 
 
 def _nothing(contrast: Contrast) -> Finding:
@@ -309,9 +269,9 @@ def _hits(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> tupl
 
 
 def _mean_interval(ours: Floats, theirs: Floats, drawn: ClusterDraws) -> Interval:
-    apart = ours - theirs
-    sides = (float(np.maximum(apart, 0.0).mean()), float(np.maximum(-apart, 0.0).mean()))
-    return _guarded(mean_interval(apart, drawn), sides, drawn)
+    gaps = ours - theirs
+    sides = (float(np.maximum(gaps, 0.0).mean()), float(np.maximum(-gaps, 0.0).mean()))
+    return _guarded(mean_interval(gaps, drawn), sides, drawn)
 
 
 def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
@@ -369,7 +329,7 @@ def _guarded(found: Interval, sides: tuple[float, float], drawn: ClusterDraws) -
     if drawn.blocks_count >= LEAST_BLOCKS and found.lo < found.hi:
         return found
     trials = effective_count(drawn.blocks if drawn.sites is None else drawn.sites)
-    won, lost = (wilson(min(side * trials, trials), trials) for side in sides)
+    won, lost = (wilson_share(side, trials) for side in sides)
     wide = difference_interval(won, lost)
     return Interval(value=found.value, lo=float(np.fmin(found.lo, wide.lo)), hi=float(np.fmax(found.hi, wide.hi)))
 
@@ -384,22 +344,24 @@ def _p_of_draws(draws: Floats) -> float:
 
 def _with_verdict(found: Finding) -> Finding:
     """Return a finding with its verdict; a null is a result."""
+    is_mean = found.metric == "primary"
+    least = found.min_effect * (1.0 if is_mean else abs(found.second_value))
     if not found.n:
-        return replace(found, verdict=found.verdict or "not tested: no query")
-    if found.blocks < LEAST_BLOCKS:
-        return replace(
-            found, verdict=f"not decided: {counted(found.blocks, 'block')}, at least {LEAST_BLOCKS} are needed"
+        verdict = found.verdict or "not tested: no query"
+    elif found.blocks < LEAST_BLOCKS:
+        verdict = f"not decided: {counted(found.blocks, 'block')}, at least {LEAST_BLOCKS} are needed"
+    elif found.p_holm <= ALPHA and (found.lo > 0 or found.hi < 0):
+        is_better = found.difference > 0 if is_mean else found.difference < 0
+        verdict = f"{found.first if is_better else found.second} is better" + (
+            "" if abs(found.difference) >= least else LESS_THAN_MATTERS
         )
-    least = found.min_effect * (1.0 if found.metric == "primary" else abs(found.second_value))
-    is_better = found.difference > 0 if found.metric == "primary" else found.difference < 0
-    if found.p_holm <= ALPHA and (found.lo > 0 or found.hi < 0):
-        size = "" if abs(found.difference) >= least else LESS_THAN_MATTERS
-        return replace(found, verdict=f"{found.first if is_better else found.second} is better{size}")
-    if -least < found.lo and found.hi < least:
-        return replace(found, verdict="null: any difference is smaller than would matter")
-    return replace(found, verdict="null: no difference shown, and one that matters is not ruled out")
+    elif -least < found.lo and found.hi < least:
+        verdict = "null: any difference is smaller than would matter"
+    else:
+        verdict = "null: no difference shown, and one that matters is not ruled out"
+    return replace(found, verdict=verdict)
 
 
 def contrast_frame(findings: Sequence[Finding]) -> pd.DataFrame:
     """Return findings as a table with a column per field."""
-    return pd.DataFrame([{name: getattr(item, name) for name in COLUMNS} for item in findings], columns=list(COLUMNS))
+    return pd.DataFrame(list(findings), columns=list(COLUMNS))

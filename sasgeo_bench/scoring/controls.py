@@ -47,8 +47,6 @@ class Verdict:
     def is_of_board(self) -> bool:
         """Return True if a failure is the board's fault: a rival's failure is that of its own rows.
 
-        Examples
-        --------
         >>> names = ("random 1 (c85212)", "fft_vote", "oracle_of_mine")
         >>> same = {"control": "c", "n": 1, "found": 1.0, "expected": 0.0, "p": 0.0, "holds": False}
         >>> [Verdict(matcher=name, **same).is_of_board for name in names]
@@ -59,8 +57,6 @@ class Verdict:
     def to_text(self) -> str:
         """Return the result in one line.
 
-        Examples
-        --------
         >>> Verdict(control="blind views withheld", matcher="m", n=4, found=4.0, expected=0.0, p=math.nan, holds=False
         ... ).to_text()
         'blind views withheld: FAILED by m, 4 of 4 where 0 are expected'
@@ -104,8 +100,6 @@ def failed_controls(verdicts: Sequence[Verdict], matcher: str) -> tuple[Verdict,
 def knows_too_much(verdicts: Sequence[Verdict], matcher: str) -> str | None:
     """Return why the answers of an entry cannot come from the view and the map alone; None if they can.
 
-    Examples
-    --------
     >>> one = Verdict(control=_AT_CHANCE[TWINS], matcher="mine", n=24, found=24.0, expected=12.0, p=6e-8, holds=False)
     >>> knows_too_much([one], "mine")
     'right 24 of 24 times at the control "identical twins tie", where guessing is right 12 times'
@@ -144,8 +138,6 @@ def chances(scores: pd.DataFrame) -> Floats:
 def at_least(count: float, each: Floats) -> float:
     """Return the chance of at least `count` hits in independent trials of chance `each` (Poisson binomial).
 
-    Examples
-    --------
     >>> at_least(2, np.array([0.5, 0.5]))
     0.25
     """

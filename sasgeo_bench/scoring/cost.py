@@ -36,16 +36,9 @@ class RunCost:
 class Costs:
     """Input of the cost metrics of one matcher.
 
-    Parameters
-    ----------
-    scores : pandas.DataFrame
-        Its scored rows.
-    runs : sequence of mapping
-        Contents of each `run.json`; none for a file of predictions.
-    view_bytes : mapping of str to int
-        By query: two bits per cell and class, one byte per confidence, WKB per vector.
-    area_km2 : mapping of str to float
-        Mapped area by region, where known.
+    `scores` are its scored rows, `runs` the contents of each `run.json`; none for a file of predictions. `view_bytes`
+    are by query: two bits per cell and class, one byte per confidence, WKB per vector. `area_km2` is the mapped area by
+    region, where known.
     """
 
     scores: pd.DataFrame
@@ -57,13 +50,8 @@ class Costs:
 def run_cost(about: Mapping[str, Any]) -> RunCost:
     """Read the cost of a run from the content of `run.json`, empty for a submission without code.
 
-    Raises
-    ------
-    MetricError
-        If an entry is no number.
+    Raise MetricError if an entry is no number.
 
-    Examples
-    --------
     >>> cost = run_cost({"prepare_s": 2.5, "peak_bytes": 3_000_000})
     >>> cost.prepare_s, cost.peak_rss_mb, cost.cpu_s
     (2.5, 3.0, nan)
@@ -130,15 +118,9 @@ def sent_kb_per_fix(costs: Costs) -> float:
 def per_fix(total: float, fixes: float) -> float:
     """Return the total cost of all queries, answered or not, per fix.
 
-    Infinite for a cost without fixes; NaN for no cost and no fixes, or an unknown total.
+    Infinite for a cost without fixes; NaN for no cost and no fixes, or an unknown total. Raise MetricError if a number
+    is negative.
 
-    Raises
-    ------
-    MetricError
-        If a number is negative.
-
-    Examples
-    --------
     >>> per_fix(9000.0, 3), per_fix(9000.0, 0)
     (3000.0, inf)
     """

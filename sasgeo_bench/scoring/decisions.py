@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, check_weights, weighted_mean
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, weighted_mean
 
 COST_RATIOS: Final = (5.0, 20.0, 100.0)
 PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
@@ -23,25 +23,11 @@ PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
 class Answers:
     """Answers to N queries of the integrity track, present and absent places mixed; each column has shape (N,).
 
-    Parameters
-    ----------
-    confidence : ndarray of float
-        Probability that the fix is right, or any other number that increases with trust; NaN if missing. Ignored where
-        there is no answer.
-    is_answered : ndarray of bool
-        There is a fix that could be accepted.
-    is_right : ndarray of bool
-        The fix is within tolerance of a present place.
-    is_present : ndarray of bool
-        The place is on the searched map.
+    `confidence` is the probability that the fix is right, or any other number that increases with trust; NaN if
+    missing. It is ignored where `is_answered` is False: there is no fix that could be accepted. `is_right`: the fix is
+    within tolerance of a present place. `is_present`: the place is on the searched map. Raise MetricError if shapes
+    differ, a confidence is infinite, or a fix is right without an answer or without a place.
 
-    Raises
-    ------
-    MetricError
-        If shapes differ, a confidence is infinite, or a fix is right without an answer or without a place.
-
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.9, np.nan], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 0, 0])
     >>> some.tie.tolist()
     [0, 0, 1]
@@ -79,31 +65,25 @@ class Answers:
         return len(self.tie)
 
 
-def presence_weights(is_present: ArrayLike, share: float, weights: ArrayLike | None = None) -> Floats:
-    """Return weights, shape (N,), under which present places make up a given share of the queries; their sum is kept.
+def presence_weights(is_present: ArrayLike, share: float) -> Floats:
+    """Return weights, shape (N,), under which present places make up a given share of the queries; they sum to N.
 
-    Raises
-    ------
-    MetricError
-        If the share is not in [0, 1], or a side of positive share has no query.
+    Raise MetricError if the share is not in [0, 1], or a side of positive share has no query.
 
-    Examples
-    --------
     >>> presence_weights([True, True, True, False], 0.5).round(3).tolist()
     [0.667, 0.667, 0.667, 2.0]
     """
     present = check_column(is_present, "is_present") > 0
-    mass = check_weights(weights, len(present))
     if not 0 <= share <= 1:
         message = f"share must lie in [0, 1], got {share!r}"
         raise MetricError(message)
-    wanted = np.where(present, share, 1.0 - share)
-    there = np.where(present, mass[present].sum(), mass[~present].sum()) / max(float(mass.sum()), np.finfo(float).tiny)
-    for side, part in (("present", share), ("absent", 1.0 - share)):
-        if part > 0 and len(present) and not (mass[present == (side == "present")] > 0).any():
+    target = np.where(present, share, 1.0 - share)
+    there = np.where(present, present.sum(), (~present).sum()) / max(len(present), 1)
+    for side, part, count in (("present", share, present.sum()), ("absent", 1.0 - share, (~present).sum())):
+        if part > 0 and len(present) and not count:
             message = f"no query has its place {side}, so none can count {part:g}: draw some, or ask for another share"
             raise MetricError(message)
-    return np.asarray(mass * np.divide(wanted, there, out=np.zeros(len(mass)), where=there > 0))
+    return np.asarray(np.divide(target, there, out=np.zeros(len(present)), where=there > 0))
 
 
 def accept(answers: Answers, threshold: float) -> Bools:
@@ -111,8 +91,6 @@ def accept(answers: Answers, threshold: float) -> Bools:
 
     A threshold of `-inf` accepts every answer, even without a confidence; queries without an answer are never accepted.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.5, 0.4], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 1, 1])
     >>> accept(some, 0.5).tolist(), accept(some, -np.inf).tolist()
     ([True, True, False], [True, True, False])
@@ -124,19 +102,10 @@ def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
     """Return which fixes Eq. (14) accepts, shape (N,): chance of a false fix below 1 / (1 + cost ratio).
 
     The cost ratio is the cost of a false fix over that of withholding a right one: 5, 20 or 100. False without an
-    answer or without a confidence.
+    answer or without a confidence. Raise MetricError if the ratio is not positive, or a confidence is no probability.
 
-    Raises
-    ------
-    MetricError
-        If the ratio is not positive, or a confidence is no probability.
-
-    Notes
-    -----
     The SASGeo paper, Eqs. (12)-(14), with P(F=1|E) = 1 - confidence; strict, as printed there.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.8, np.nan], is_answered=[1, 1, 1], is_right=[1, 0, 0], is_present=[1, 1, 1])
     >>> accept_by_cost(some, 5.0).tolist()
     [True, False, False]
@@ -155,10 +124,7 @@ def _check_ratio(cost_ratio: float) -> None:
 def check_probabilities(answers: Answers) -> None:
     """Check that all confidences lie in [0, 1].
 
-    Raises
-    ------
-    MetricError
-        With the range found.
+    Raise MetricError with the range found.
     """
     given = answers.confidence[~np.isnan(answers.confidence)]
     if ((given < 0) | (given > 1)).any():
@@ -171,26 +137,11 @@ def cost_values(
 ) -> Floats:
     """Return the cost of each query's decision, shape (N,), in units of a wrongly withheld fix: 0, 1 or `cost_ratio`.
 
-    Parameters
-    ----------
-    answers : Answers
-        N queries.
-    accepted : array_like of bool, shape (N,)
-        Accepted fixes.
-    cost_ratio : float
-        Cost of a false fix.
-    charged : {"right fix", "place"}
-        What costs 1 when withheld. "right fix" (Eq. (13)) evaluates the decision alone: a matcher that is never right
-        and withholds everything costs 0. "place" charges every present place without a fix and evaluates the whole
-        method.
+    `accepted`, shape (N,), are the accepted fixes; `charged` is what costs 1 when withheld. "right fix" (Eq. (13))
+    evaluates the decision alone: a matcher that is never right and withholds everything costs 0. "place" charges every
+    present place without a fix and evaluates the whole method. Raise MetricError if the ratio is not positive, or a
+    query without an answer is accepted.
 
-    Raises
-    ------
-    MetricError
-        If the ratio is not positive, or a query without an answer is accepted.
-
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.2], is_answered=[1, 1], is_right=[0, 0], is_present=[1, 1])
     >>> cost_values(some, [True, False], 20.0).tolist()
     [20.0, 0.0]
@@ -215,12 +166,9 @@ def decision_cost(
 ) -> float:
     """Return the mean of `cost_values` when fixes are accepted by Eq. (14); NaN for no queries.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1])
     >>> decision_cost(some, 5.0)
     0.5
     """
-    return weighted_mean(
-        cost_values(answers, accept_by_cost(answers, cost_ratio), cost_ratio, charged=charged), weights
-    )
+    accepted = accept_by_cost(answers, cost_ratio)
+    return weighted_mean(cost_values(answers, accepted, cost_ratio, charged=charged), weights)

@@ -110,14 +110,8 @@ def find_entries(
 
     Runs may lie at any depth. Two versions of one matcher are two entries, with the version in their names, and the
     hash if versions agree. `failures` records runs and submissions that cannot be read; without it, the first one
-    raises.
-
-    Raises
-    ------
-    StoreError
-        If a path holds no predictions, a `run.json` does not identify its matcher, or a submission is damaged.
-    ConfigError
-        If two entries share a name, or a file or submission has that of a control.
+    raises. Raise StoreError if a path holds no predictions, a `run.json` does not identify its matcher, or a submission
+    is damaged. Raise ConfigError if two entries share a name, or a file or submission has that of a control.
     """
     runs: list[Path] = []
     files: list[Entry] = []
@@ -174,10 +168,8 @@ def find_entries(
 def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Entry, ...]:
     """Return the entries without runs on some regions and their modified maps; drop entries without runs.
 
-    Raises
-    ------
-    ConfigError
-        If no run is on one of the regions, all runs are, or an entry is a file, which does not name regions.
+    Raise ConfigError if no run is on one of the regions, all runs are, or an entry is a file, which does not name
+    regions.
     """
     if not regions:
         return entries

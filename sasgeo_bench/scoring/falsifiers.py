@@ -48,12 +48,8 @@ def hold_falsifiers(
 ) -> tuple[Falsifier, ...]:
     """Compare the methods of each contrast by success or recall on controls and falsifiers of its suites.
 
-    The order is by contrast: all suites together, then suite by suite.
-
-    Raises
-    ------
-    ConfigError
-        If a contrast names a method that is not on the board.
+    The order is by contrast: all suites together, then suite by suite. Raise ConfigError if a contrast names a method
+    that is not on the board.
     """
     means = (contrast for contrast in contrasts if contrast.metric == "primary")
     return tuple(item for contrast in means for item in _of(contrast, scores, draws))

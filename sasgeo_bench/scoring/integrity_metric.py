@@ -40,8 +40,6 @@ def risk_coverage(answers: Answers, weights: ArrayLike | None = None) -> RiskCov
 
     There is one point per distinct confidence; the last coverage is the share of answered queries.
 
-    Examples
-    --------
     >>> facts = {"is_answered": [1, 1, 1, 0], "is_right": [1, 0, 1, 0], "is_present": [1] * 4}
     >>> curve = risk_coverage(Answers(confidence=[0.9, 0.8, 0.8, np.nan], **facts))
     >>> curve.coverage.tolist(), curve.risk.round(3).tolist()
@@ -62,14 +60,12 @@ def aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
 
     In [0, 1]; NaN for no queries. `weights`, shape (N,), are counts: they may be fractions, but should sum to about N.
 
-    Notes ----- Geifman and El-Yaniv, NeurIPS 2017, and the SASGeo paper, Sec. V. For tied confidences it is the
-    expected area under a random order, so strictly monotone maps of the confidence leave it unchanged. After j of t
-    tied queries with f false ones, j f / t false ones are expected. With F false of A accepted before, the sum over j
-    of (F + j f / t) / (A + j) is f + (F - A f / t) (psi(A + t + 1) - psi(A + 1)), where psi is the digamma function;
-    this also holds for fractional weights.
+    Geifman and El-Yaniv, NeurIPS 2017, and the SASGeo paper, Sec. V. For tied confidences it is the expected area under
+    a random order, so strictly monotone maps of the confidence leave it unchanged. After j of t tied queries with f
+    false ones, j f / t false ones are expected. With F false of A accepted before, the sum over j of (F + j f / t) / (A
+    + j) is f + (F - A f / t) (psi(A + t + 1) - psi(A + 1)), where psi is the digamma function; this also holds for
+    fractional weights.
 
-    Examples
-    --------
     The third of three is false, (0 + 0 + 1/3) / 3; all three tied, 1/3 at each coverage:
 
     >>> facts = {"is_answered": [1, 1, 1], "is_right": [1, 1, 0], "is_present": [1, 1, 1]}
@@ -105,8 +101,6 @@ class DrawnAreas:
 def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
     """Return `aurc` and `augrc` for each row of weights, shape (D, N); several times faster than one by one.
 
-    Examples
-    --------
     >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 0], is_present=[1, 1])
     >>> found = drawn_areas(some, np.array([[1.0, 1.0], [2.0, 0.0]]))
     >>> found.aurc.tolist(), found.augrc.tolist()
@@ -133,11 +127,9 @@ def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
 def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
     """Return the E-AURC: the AURC less that of the best order of the same answers, in [0, 1]; NaN for no queries.
 
-    Notes ----- Geifman, Uziel and El-Yaniv, ICLR 2019. They subtract r + (1 - r) ln(1 - r), the limit for many queries.
-    This function subtracts the exact area of the best order of N, so a perfect order has 0 for every N.
+    Geifman, Uziel and El-Yaniv, ICLR 2019. They subtract r + (1 - r) ln(1 - r), the limit for many queries. This
+    function subtracts the exact area of the best order of N, so a perfect order has 0 for every N.
 
-    Examples
-    --------
     >>> facts = {"is_answered": [1, 1], "is_right": [1, 0], "is_present": [1, 1]}
     >>> excess_aurc(Answers(confidence=[0.9, 0.1], **facts)), excess_aurc(Answers(confidence=[0.1, 0.9], **facts))
     (0.0, 0.5)
@@ -155,13 +147,9 @@ def augrc(answers: Answers, weights: ArrayLike | None = None) -> float:
 
     It is the chance of an undetected false fix, averaged over coverages.
 
-    Notes
-    -----
     Traub et al., NeurIPS 2024: false and accepted / all, over accepted / all. With ties averaged the curve is piecewise
     linear, and its area is (1 - AUROC) a (1 - a) + (1 - a)^2 / 2, with a the share of right fixes.
 
-    Examples
-    --------
     One false fix of two, taken last or first: (0 + 1/2) / 2 / 2 and (1/2 + 1/2 + 1/2) / 2 / 2.
 
     >>> facts = {"is_answered": [1, 1], "is_right": [1, 0], "is_present": [1, 1]}
@@ -180,15 +168,8 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     """Return the risk among the most confident share `coverage` in (0, 1] of the queries; NaN for no queries.
 
     Where the coverage falls among tied confidences or within a query, false ones count in proportion. Queries without
-    an answer come last and count as false.
+    an answer come last and count as false. Raise MetricError if the coverage is out of range.
 
-    Raises
-    ------
-    MetricError
-        If the coverage is out of range.
-
-    Examples
-    --------
     >>> facts = {"is_answered": [1] * 4, "is_right": [1, 1, 0, 0], "is_present": [1] * 4}
     >>> false_fix_rate(Answers(confidence=[0.9, 0.8, 0.8, 0.1], **facts), 0.5)
     0.25
@@ -205,19 +186,13 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     return float(np.interp(coverage * total, accepted, wrong) / (coverage * total))
 
 
-def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | None = None) -> float:
+def choose_threshold(calibration: Answers, risk: float) -> float:
     """Return the threshold of largest coverage whose risk on calibration blocks is at most `risk`.
 
     The result is one of the confidences; `-inf` accepts all answers, some without a confidence; `inf` means that no
     coverage keeps the risk. The risk is empirical, without a margin; boards report the risk reached on test blocks.
+    Raise MetricError if the risk is not in [0, 1].
 
-    Raises
-    ------
-    MetricError
-        If the risk is not in [0, 1].
-
-    Examples
-    --------
     >>> facts = {"is_answered": [1] * 3, "is_right": [1, 1, 0], "is_present": [1] * 3}
     >>> choose_threshold(Answers(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
     0.8
@@ -225,6 +200,6 @@ def choose_threshold(calibration: Answers, risk: float, weights: ArrayLike | Non
     if not 0 <= risk <= 1:
         message = f"risk must lie in [0, 1], got {risk!r}"
         raise MetricError(message)
-    curve = risk_coverage(calibration, weights)
+    curve = risk_coverage(calibration)
     allowed = np.flatnonzero(curve.risk <= risk)
     return float(curve.threshold[allowed[-1]]) if len(allowed) else math.inf

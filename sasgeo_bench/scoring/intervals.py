@@ -36,34 +36,12 @@ def seed_of_text(text: str) -> int:
 class ClusterDraws:
     """Draws with replacement: first blocks, then sites within each drawn block, with all their queries.
 
-    Parameters
-    ----------
-    blocks : sequence of str or ndarray of int, length N
-        Block of each query. Metrics to compare must have the same queries in the same order.
-    sites : sequence of str or ndarray of int, length N, optional
-        Site of each query within its block; by default each query is a site. Queries of a site show one place, so they
-        are drawn together.
-    seed : int
-        The same seed, blocks and number of draws give the same draws for every metric.
-    draws : int
-        Number of draws.
-    draws_within : bool
-        False draws whole blocks.
-
-    Raises
-    ------
-    MetricError
-        If the number of draws is not positive, or the numbers of sites and blocks differ.
-
-    Notes ----- A block of n sites that is drawn c times gives c n sites, each drawn from its n. Sample sizes differ
-    between draws if blocks or sites differ in size; means are ratios of sums and account for that.
-
-    Examples
-    --------
-    >>> drawn = ClusterDraws(blocks=["a", "a", "b"], seed=1, draws=1000)
-    >>> weights = np.vstack(list(drawn.weights()))
-    >>> weights.shape, bool((weights.sum(axis=1) >= 2).all()), round(float(weights.mean()), 1)
-    ((1000, 3), True, 1.0)
+    Metrics with the same seed, blocks, sites and number of draws share draws. `blocks` holds the block of each of N
+    queries, `sites` the site within its block; by default each query is a site. Queries of a site show one place, so
+    they are drawn together. Without `draws_within`, whole blocks are drawn. A block of n sites that is drawn c times
+    gives c n sites, each drawn from its n. Sample sizes differ between draws if blocks or sites differ in size; means
+    are ratios of sums and account for that. Raise MetricError if the number of draws is not positive, or the numbers of
+    sites and blocks differ.
 
     Two queries of one site are drawn together:
 
@@ -145,7 +123,8 @@ class ClusterDraws:
                 yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=None)
                 continue
             # For each draw and block, as many sites are drawn as the block has, times its copies.
-            within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=_small(size))
+            dtype = np.uint16 if size <= np.iinfo(np.uint16).max else np.uint32
+            within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=dtype)
             yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=within)
 
 
@@ -193,13 +172,7 @@ class _Picked:
         return csr_array((np.ones(len(column)), column, ends), shape=(rows, len(self.sites)))
 
 
-def _small(size: int) -> type[np.uint16] | type[np.uint32]:
-    return np.uint16 if size <= np.iinfo(np.uint16).max else np.uint32
-
-
 LEVEL: Final = 0.95
-
-Statistic = Callable[[Floats], float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,19 +187,11 @@ class Interval:
 def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval:
     """Return Wilson's score interval of a proportion; [0, 1] without trials.
 
-    `successes` and `trials` may be fractions, as for hits shared among tied poses or with weights.
+    `successes` and `trials` may be fractions, as for hits shared among tied poses or with weights. Raise MetricError if
+    not 0 <= successes <= trials, or the level is not in (0, 1).
 
-    Raises
-    ------
-    MetricError
-        If not 0 <= successes <= trials, or the level is not in (0, 1).
-
-    Notes
-    -----
     Wilson, JASA 1927, without continuity correction. The trials must be independent: across blocks use the bootstrap.
 
-    Examples
-    --------
     The SASGeo paper's Recall@1 of 0.586 in 220 trials:
 
     >>> found = wilson(129, 220)
@@ -251,45 +216,33 @@ def _check_level(level: float) -> None:
         raise MetricError(message)
 
 
-def wilson_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Interval:
+def wilson_mean(values: ArrayLike) -> Interval:
     """Return Wilson's interval of a mean of values in [0, 1], shape (N,), as hits with ties.
 
-    Values between 0 and 1 vary less than successes and failures, so the interval is not too narrow. Weights count as
-    (sum w)^2 / sum w^2 trials (Kish 1965).
+    Values between 0 and 1 vary less than successes and failures, so the interval is not too narrow. Raise MetricError
+    if a value lies outside [0, 1].
 
-    Raises
-    ------
-    MetricError
-        If a value lies outside [0, 1].
-
-    Examples
-    --------
     >>> wilson_mean([1.0, 0.5, 0.5, 0.0]) == wilson(2, 4)
     True
     """
     column = check_column(values, "values")
-    mass = check_weights(weights, len(column))
     if ((column < 0) | (column > 1)).any():
         message = f"values reach from {column.min():g} to {column.max():g}, expected shares in [0, 1]"
         raise MetricError(message)
-    squared = float((mass**2).sum())
-    trials = float(mass.sum()) ** 2 / squared if squared > 0 else 0.0
-    share = weighted_mean(column, mass)
-    return wilson(min(share * trials, trials) if trials else 0.0, trials)
+    return wilson_share(weighted_mean(column), len(column))
+
+
+def wilson_share(share: float, trials: float, *, level: float = LEVEL) -> Interval:
+    """Return Wilson's interval of a share of some trials, which need not be whole; of a NaN that of no trials."""
+    return wilson(0.0, 0.0) if math.isnan(share) else wilson(min(share * trials, trials), trials, level=level)
 
 
 def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Floats:
     """Return weighted means of every draw, shape (D,) or (D, M); NaN where a draw has no weight.
 
-    `values` has shape (N,), or (N, M) for M methods or metrics that share the draws.
+    `values` has shape (N,), or (N, M) for M methods or metrics that share the draws. Raise MetricError if a value is
+    not finite, or their number is not that of the queries.
 
-    Raises
-    ------
-    MetricError
-        If a value is not finite, or their number is not that of the queries.
-
-    Examples
-    --------
     >>> drawn = ClusterDraws(blocks=["a", "b"], seed=1, draws=4000)
     >>> means = bootstrap_means([[0.0, 1.0], [1.0, 0.0]], drawn)
     >>> means.shape, round(float((means[:, 0] == 1).mean()), 2)
@@ -307,28 +260,17 @@ def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike |
     return np.asarray(means[:, 0] if table.ndim == 1 else means)
 
 
-def bootstrap_statistic(statistic: Statistic, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Floats:
+def bootstrap_statistic(statistic: Callable[[Floats], float], drawn: ClusterDraws) -> Floats:
     """Return a statistic of every draw, shape (D,); slower than `bootstrap_means`.
 
     `statistic` maps weights, shape (N,), to a number, as `lambda weights: aurc(answers, weights)`.
-
-    Examples
-    --------
-    >>> drawn = ClusterDraws(blocks=["a", "a", "b", "b"], seed=1, draws=50)
-    >>> values = np.array([1.0, 0.0, 1.0, 1.0])
-    >>> slow = bootstrap_statistic(lambda weights: weighted_mean(values, weights), drawn)
-    >>> bool(np.allclose(slow, bootstrap_means(values, drawn)))
-    True
     """
-    mass = check_weights(weights, drawn.count)
-    return np.array([statistic(row * mass) for some in drawn.weights() for row in some], dtype=np.float64)
+    return np.array([statistic(row) for some in drawn.weights() for row in some], dtype=np.float64)
 
 
 def percentile_interval(value: float, draws: ArrayLike, *, level: float = LEVEL) -> Interval:
     """Return the interval between percentiles of the draws, shape (D,), without NaN; NaN where none is left.
 
-    Examples
-    --------
     >>> percentile_interval(0.5, np.linspace(0.0, 1.0, 1001))
     Interval(value=0.5, lo=0.025, hi=0.975)
     """
@@ -347,8 +289,6 @@ def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = No
 
     Groups of equal mass count 1 each; 0 for nothing.
 
-    Examples
-    --------
     >>> effective_count(["a", "a", "b", "b"]), effective_count(["a", "a", "a", "b"])
     (2.0, 1.6)
     """
@@ -359,38 +299,25 @@ def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = No
 
 
 def share_interval(value: float, draws: ArrayLike, trials: float) -> tuple[Interval, str]:
-    """Return the 95 % interval of a metric in [0, 1], and how it was found.
+    """Return the 95 % interval of a metric in [0, 1], and how it was found; NaN gives NaN and "".
 
-    The ends are percentiles of the draws, shape (D,), but never inside Wilson's interval. "blocks" means that draws
-    decide both ends, "wilson" that Wilson's lies farther out at one; "" comes with NaN.
+    `draws`, shape (D,), are its bootstrap draws, empty for a single block; `trials` is the effective number of
+    independent trials, as sites by `effective_count`. The ends are percentiles of the draws, but never inside Wilson's
+    interval. "blocks" means that draws decide both ends, "wilson" that Wilson's lies farther out at one.
 
-    Parameters
-    ----------
-    value : float
-        The metric; NaN gives NaN.
-    draws : array_like, shape (D,)
-        Its bootstrap draws; empty for a single block.
-    trials : float
-        Effective number of independent trials, as sites by `effective_count`.
+    A mean of values in [0, 1] varies at most as much as a proportion, so Wilson's interval of as many sites is wide
+    enough if blocks add no correlation. Draws alone are too narrow for few sites, and a point where all answers are
+    right. The wider end keeps the order: a method that is right wherever another one is has both ends at least as high.
 
-    Notes ----- A mean of values in [0, 1] varies at most as much as a proportion, so Wilson's interval of as many sites
-    is wide enough if blocks add no correlation. Draws alone are too narrow for few sites, and a point where all answers
-    are right. The wider end keeps the order: a method that is right wherever another one is has both ends at least as
-    high.
-
-    Examples
-    --------
-    Four sites, all found; and four sites, all found but for one query of ten at one of them:
+    Four sites, all found:
 
     >>> found, how = share_interval(1.0, np.ones(100), 4)
     >>> round(found.lo, 2), found.hi, how
     (0.51, 1.0, 'wilson')
-    >>> round(share_interval(0.975, np.array([0.95, 0.975, 1.0]), 4)[0].lo, 2)
-    0.49
     """
     if math.isnan(value):
         return Interval(value=value, lo=value, hi=value), ""
-    exact = wilson(min(max(value * trials, 0.0), trials), trials)
+    exact = wilson_share(max(value, 0.0), trials)
     drawn = percentile_interval(value, draws)
     ends = Interval(value=value, lo=float(np.fmin(drawn.lo, exact.lo)), hi=float(np.fmax(drawn.hi, exact.hi)))
     return ends, "blocks" if (ends.lo, ends.hi) == (drawn.lo, drawn.hi) else "wilson"
@@ -401,14 +328,6 @@ def difference_interval(first: Interval, second: Interval) -> Interval:
 
     The sides are independent, or vary against each other no more than parts of one whole. Distances to the ends are
     added in quadrature (Newcombe 1998; Zou and Donner, Statistics in Medicine 2008).
-
-    Examples
-    --------
-    No query of four was won by either of two methods:
-
-    >>> found = difference_interval(wilson(0, 4), wilson(0, 4))
-    >>> found.value, round(found.lo, 2), round(found.hi, 2)
-    (0.0, -0.49, 0.49)
     """
     value = first.value - second.value
     return Interval(
@@ -418,18 +337,15 @@ def difference_interval(first: Interval, second: Interval) -> Interval:
     )
 
 
-def mean_interval(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike | None = None) -> Interval:
-    """Return a weighted mean with its bootstrap interval over blocks; NaN ends for fewer than two blocks.
+def mean_interval(values: ArrayLike, drawn: ClusterDraws) -> Interval:
+    """Return a mean with its bootstrap interval over blocks; NaN ends for fewer than two blocks.
 
     `values`, shape (N,), are finite; the difference of two methods per query gives a paired interval. The interval is a
     point where all values are equal: compare `wilson_mean`.
 
-    Examples
-    --------
     >>> mean_interval([1.0, 0.0, 1.0, 1.0], ClusterDraws(blocks=["a", "a", "b", "b"], seed=1, draws=500))
     Interval(value=0.75, lo=0.25, hi=1.0)
     """
     column = check_column(values, "values", drawn.count)
-    value = weighted_mean(column, weights)
-    draws = bootstrap_means(column, drawn, weights) if drawn.blocks_count > 1 else np.empty(0)
-    return percentile_interval(value, draws)
+    draws = bootstrap_means(column, drawn) if drawn.blocks_count > 1 else np.empty(0)
+    return percentile_interval(weighted_mean(column), draws)

@@ -32,20 +32,9 @@ _INF: Final = float("inf")
 class Metric:
     """A metric as a board prints it.
 
-    Parameters
-    ----------
-    name : str
-        As in the column `metric` of `leaderboard.parquet`.
-    meaning : str
-        One or two sentences for a reader of the board.
-    source : str
-        Reference of the definition.
-    unit : str
-        "1" for none.
-    better : {"higher", "lower"}
-        Direction of improvement.
-    bounds : (float, float)
-        Least and greatest possible value.
+    `name` is as in the column `metric` of `leaderboard.parquet`, `meaning` one or two sentences for a reader of the
+    board, `source` the reference of the definition, `unit` "1" for none, `bounds` the least and greatest possible
+    value.
     """
 
     name: str
@@ -63,18 +52,10 @@ class Metric:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeanMetric(Metric):
-    """A mean over queries.
+    """A mean over queries, printed on some tracks; matchers are ranked by the primary one.
 
-    Parameters
-    ----------
-    tracks : tuple of str
-        Tracks that print it.
-    values : callable
-        Scored rows -> one finite value for each.
-    counts : callable
-        Scored rows -> mask of the denominator, the same for every matcher.
-    is_primary : bool
-        Matchers are ranked by it.
+    `values` maps scored rows to one finite value for each, `counts` to a mask of the denominator, the same for every
+    matcher.
     """
 
     tracks: tuple[str, ...]
@@ -137,11 +118,6 @@ def is_present(scores: pd.DataFrame) -> Bools:
     return scores["is_present"].to_numpy(bool)
 
 
-def is_absent(scores: pd.DataFrame) -> Bools:
-    """Return a mask of the rows whose place is absent: any answer is a false fix."""
-    return ~is_present(scores)
-
-
 def _successes(scores: pd.DataFrame, within_m: float, within_deg: float = 5.0) -> Floats:
     return successes(errors_of(scores), within_m, within_deg).astype(float)
 
@@ -168,7 +144,7 @@ FALSE_ABSENT: Final = MeanMetric(
     source="share of queries",
     tracks=TRACKS,
     values=_answers,
-    counts=is_absent,
+    counts=lambda scores: ~is_present(scores),  # any answer is a false fix
 )
 WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metric
     name="within_25m",
@@ -411,8 +387,6 @@ METRICS: Final[tuple[Metric, ...]] = (*_MEANS, *QUANTILES, *REJECTION, *THRESHOL
 def means_of(track: str) -> tuple[MeanMetric, ...]:
     """Return the metrics of a track that are means over queries.
 
-    Examples
-    --------
     >>> [metric.name for metric in means_of("retrieval")]
     ['recall_1', 'recall_5', 'chance_1', 'mrr', 'answered', 'answered_absent']
     """

@@ -23,14 +23,8 @@ AUC_M: Final = 50.0
 class PoseErrors:
     """Errors of N answers, each of shape (N,) and not negative; infinite without an answer.
 
-    Parameters
-    ----------
-    position_m : ndarray of float
-        Distance on the map plane.
-    yaw_deg : ndarray of float
-        Unsigned, in [0, 180].
-    log_scale : ndarray of float
-        |ln(scale / true scale)|: twice too large and half as large are equally wrong, and 0.1 is about 10 %.
+    `position_m` is the distance on the map plane, `yaw_deg` unsigned in [0, 180], `log_scale` is |ln(scale / true
+    scale)|: twice too large and half as large are equally wrong, and 0.1 is about 10 %.
     """
 
     position_m: Floats
@@ -61,13 +55,8 @@ def first_pose(prediction: Prediction | None) -> Pose | None:
 def pose_errors(answers: Sequence[Pose | None], truths: Sequence[Pose]) -> PoseErrors:
     """Return the errors of N fixes against N truths; infinite for None, never clipped.
 
-    Raises
-    ------
-    MetricError
-        If there are not as many answers as truths.
+    Raise MetricError if there are not as many answers as truths.
 
-    Examples
-    --------
     >>> truth = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=350.0)
     >>> errors = pose_errors([Pose(easting_m=3.0, northing_m=4.0, yaw_deg=10.0), None], [truth, truth])
     >>> errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist()
@@ -97,15 +86,9 @@ def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_D
     """Return which fixes are right, shape (N,): `position_m <= within_m` and `yaw_deg <= within_deg`.
 
     Use 180 degrees to ignore the heading. An error equal to a tolerance is within it, as in all of this package. Metres
-    are those of the region's UTM zone, which differ from metres on the ground by at most 0.1 %.
+    are those of the region's UTM zone, which differ from metres on the ground by at most 0.1 %. Raise MetricError if a
+    tolerance is negative or `within_m` is not finite.
 
-    Raises
-    ------
-    MetricError
-        If a tolerance is negative or `within_m` is not finite.
-
-    Examples
-    --------
     >>> errors = PoseErrors(position_m=[5.0, 5.1, 0.0], yaw_deg=[5.0, 0.0, 5.1], log_scale=[0.0, 0.0, 0.0])
     >>> successes(errors, 5.0).tolist()
     [True, False, False]
@@ -119,10 +102,7 @@ def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_D
 def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, within_deg: float = SUCCESS_DEG) -> Rank:
     """Return the rank of the best pose within tolerance in an answer to a localization query; `MISS` without one.
 
-    Raises
-    ------
-    MetricError
-        If the place is absent: recall is a share of the queries whose place is present.
+    Raise MetricError if the place is absent: recall is a share of the queries whose place is present.
     """
     if not truth.is_present or truth.pose is None:
         message = (
@@ -137,21 +117,11 @@ def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, w
     return rank_of([score for _, score in prediction.candidates], successes(errors, within_m, within_deg))
 
 
-def area_values(errors: PoseErrors, up_to_m: float = AUC_M, within_deg: float = SUCCESS_DEG) -> Floats:
-    """Return each query's part of the success AUC, shape (N,): max(0, 1 - error / up_to), 0 for a wrong heading.
+def area_values(errors: PoseErrors) -> Floats:
+    """Return each query's part of the success AUC, shape (N,): max(0, 1 - error / 50 m), 0 for a wrong heading.
 
-    Raises
-    ------
-    MetricError
-        If `up_to_m` is not positive and finite.
-
-    Examples
-    --------
     >>> area_values(PoseErrors(position_m=[10.0, 60.0, 0.0], yaw_deg=[0.0, 0.0, 90.0], log_scale=[0.0] * 3)).tolist()
     [0.8, 0.0, 0.0]
     """
-    if not 0 < up_to_m < math.inf:
-        message = f"up_to_m must be positive and finite, got {up_to_m!r}"
-        raise MetricError(message)
-    near = np.maximum(0.0, 1.0 - errors.position_m / up_to_m)
-    return np.where(errors.yaw_deg <= within_deg, near, 0.0)
+    near = np.maximum(0.0, 1.0 - errors.position_m / AUC_M)
+    return np.where(errors.yaw_deg <= SUCCESS_DEG, near, 0.0)

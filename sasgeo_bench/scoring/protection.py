@@ -16,7 +16,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.protection import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.base import Bools, Floats, check_column, weighted_mean
 from sasgeo_bench.scoring.calibration import stanford
-from sasgeo_bench.scoring.intervals import LEVEL, Interval, effective_count, wilson
+from sasgeo_bench.scoring.intervals import LEVEL, Interval, effective_count, wilson_share
 from sasgeo_bench.scoring.rejection import turns
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
@@ -26,22 +26,12 @@ _DIGITS: Final = 2  # more would claim a precision that counts do not have
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StanfordCounts:
-    """Shares of all queries in the areas of a Stanford diagram, with Wilson's intervals.
+    """Shares of all queries in the areas of a Stanford diagram, with Wilson's intervals of `trials`.
 
-    Parameters
-    ----------
-    trials : float
-        Trials of the intervals: queries, or sites where several queries are of one.
-    available : Interval
-        The level is within the alert limit.
-    unavailable : Interval
-        It is not, or there is no level or no answer.
-    misleading : Interval
-        Available, and the error exceeds the level.
-    hazardous : Interval
-        Misleading, and the error exceeds the alert limit too: level <= limit < error.
-    exceeded : Interval
-        The error exceeds the level, available or not: this share should not exceed the stated risk.
+    Trials are queries, or sites where several queries are of one. Available: the level is within the alert limit;
+    unavailable: it is not, or there is no level or no answer. Misleading: available, and the error exceeds the level.
+    Hazardous: misleading, and the error exceeds the alert limit too. Exceeded: the error exceeds the level, available
+    or not; this share should not exceed the stated risk.
     """
 
     trials: float
@@ -53,19 +43,12 @@ class StanfordCounts:
 
 
 def stanford_counts(
-    protection_level_m: ArrayLike,
-    position_error_m: ArrayLike,
-    alert_limit_m: float,
-    *,
-    trials: float | None = None,
-    level: float = LEVEL,
+    protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_limit_m: float, *, trials: float | None = None
 ) -> StanfordCounts:
     """Count a Stanford diagram; see `calibration.stanford` for parameters and errors.
 
     `trials` is the effective number of independent trials, N by default; NaN in [0, 1] for no queries.
 
-    Examples
-    --------
     Of six queries five have a level of 5 m and errors of 4, 4, 4, 6 and 11 m, one has neither; the limit is 10 m:
 
     >>> counts = stanford_counts([5, 5, 5, 5, 5, np.inf], [4, 4, 4, 6, 11, np.inf], 10.0)
@@ -74,53 +57,38 @@ def stanford_counts(
     """
     areas = stanford(protection_level_m, position_error_m, alert_limit_m)
     count = float(len(areas.nominal)) if trials is None else trials
-
-    def share(which: ArrayLike) -> Interval:
-        """Return the share of the queries with its interval."""
-        value = weighted_mean(which)
-        return wilson(0.0, 0.0) if math.isnan(value) else wilson(min(value * count, count), count, level=level)
-
     misleading = areas.misleading | areas.hazardous
+    masks = {
+        "available": areas.nominal | misleading,
+        "unavailable": areas.unavailable | areas.unavailable_misleading,
+        "misleading": misleading,
+        "hazardous": areas.hazardous,
+        "exceeded": misleading | areas.unavailable_misleading,
+    }
     return StanfordCounts(
-        trials=count,
-        available=share(areas.nominal | misleading),
-        unavailable=share(areas.unavailable | areas.unavailable_misleading),
-        misleading=share(misleading),
-        hazardous=share(areas.hazardous),
-        exceeded=share(misleading | areas.unavailable_misleading),
+        trials=count, **{name: wilson_share(weighted_mean(mask), count) for name, mask in masks.items()}
     )
 
 
-def supported_risk(failures: float, trials: float, *, confidence: float = LEVEL) -> float:
-    """Return the least risk that counts support, Clopper-Pearson's one-sided upper bound; 1 without a trial.
+def supported_risk(failures: float, trials: float) -> float:
+    """Return the least risk that counts support: Clopper-Pearson's one-sided upper bound of 95 %; 1 without a trial.
 
     Counts need not be whole; 0 <= failures <= trials.
 
-    Examples
-    --------
     >>> supported_risk(0, 299) < 0.01 < supported_risk(0, 298), supported_risk(0, 0)
     (True, 1.0)
     """
     if failures == trials:
         return 1.0
-    return float(proportion_confint(failures, trials, alpha=2.0 * (1.0 - confidence), method="beta")[1])
+    return float(proportion_confint(failures, trials, alpha=2.0 * (1.0 - LEVEL), method="beta")[1])
 
 
-def statement(failures: float, trials: float, *, risk: float, confidence: float = LEVEL) -> str:
+def statement(failures: float, trials: float, *, risk: float) -> str:
     """Return which risk some counts support, in a line that claims no more than they support.
 
-    The bound is Clopper-Pearson's upper end, one-sided. Without failures, the line also gives the trials that the risk
-    takes.
+    Counts need not be whole; 0 <= failures <= trials. Without failures, the line also gives the trials that the risk
+    takes. Raise MetricError if the risk is not in (0, 1).
 
-    Raises
-    ------
-    MetricError
-        If the risk or the confidence is not in (0, 1).
-    ConfigError
-        If not 0 <= failures <= trials.
-
-    Examples
-    --------
     >>> statement(0, 299, risk=0.01)
     '0 of 299 support below 1 % (95 % confidence)'
     >>> statement(0, 100, risk=0.01)
@@ -128,12 +96,12 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     >>> statement(4, 100, risk=0.01)
     '4 of 100 support below 9 % and not below 1 % (95 % confidence)'
     """
-    if not (0 < risk < 1 and 0 < confidence < 1):
-        message = f"risk and confidence must lie in (0, 1), got {risk!r} and {confidence!r}"
+    if not 0 < risk < 1:
+        message = f"risk must lie in (0, 1), got {risk!r}"
         raise MetricError(message)
-    at_most = supported_risk(failures, trials, confidence=confidence)
+    at_most = supported_risk(failures, trials)
     claim = f"{failures:.4g} of {trials:.4g} support below "
-    sure = f" ({100 * confidence:g} % confidence)"
+    sure = f" ({100 * LEVEL:g} % confidence)"
     if at_most < risk:
         return f"{claim}{100 * risk:g} %{sure}"
     if failures == trials:  # also 0 of 0
@@ -141,7 +109,7 @@ def statement(failures: float, trials: float, *, risk: float, confidence: float 
     # Rounded up: below 2.951 % is not below 2.95 %.
     scale = 10.0 ** (_DIGITS - 1 - math.floor(math.log10(100 * at_most)))
     shown = math.ceil(100 * at_most * scale) / scale
-    least_trials = math.ceil(math.log(1.0 - confidence) / math.log1p(-risk))
+    least_trials = math.ceil(math.log(1.0 - LEVEL) / math.log1p(-risk))
     takes = f", which takes {least_trials} without one" if failures == 0 else ""
     return f"{claim}{shown:g} % and not below {100 * risk:g} %{takes}{sure}"
 
@@ -151,20 +119,11 @@ def conformal_factor(position_error_m: ArrayLike, scale_m: ArrayLike, risk: floa
 
     It is the ceil((N + 1) (1 - risk))-th least ratio of error to scale over N calibration answers; infinite where that
     is more than N, or falls among infinite errors (absent places). The scale is each answer's estimate of its
-    uncertainty.
+    uncertainty. Raise MetricError if the risk or a number is out of range.
 
-    Raises
-    ------
-    MetricError
-        If the risk or a number is out of range.
-
-    Notes
-    -----
     Split conformal prediction (Vovk et al. 2005; Lei et al., JASA 2018). It holds on average over calibration sets, for
     answers that are exchangeable with those of calibration; it says nothing about accepted answers.
 
-    Examples
-    --------
     >>> conformal_factor([2.0, 4.0, 6.0, 8.0], [2.0, 2.0, 2.0, 2.0], 0.2), conformal_factor([1.0], [1.0], 0.2)
     (4.0, inf)
     """
@@ -226,10 +185,7 @@ class ProtectionLevels:
 def protection_levels(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], split: Split | None = None
 ) -> Iterator[ProtectionLevels]:
-    """Yield the protection levels of one matcher per query, for each prior group, risk and method with a level.
-
-    Parameters are those of `protection_frame`.
-    """
+    """Yield the levels of one matcher per query, for each prior group, risk and method; see `protection_frame`."""
     usable = scores[(scores["status"] != NOT_APPLICABLE) & (scores["track"] == "localization")]
     for prior_group, group in usable.groupby("prior_group", sort=True):
         yield from _levels_of_group(str(prior_group), group, predictions, split)
@@ -240,7 +196,7 @@ def _levels_of_group(
 ) -> Iterator[ProtectionLevels]:
     is_holdout = split is not None and split.spec.kind == "holdout"
     is_tested = (group["part"] == "test").to_numpy(bool) if is_holdout else np.ones(len(group), dtype=bool)
-    error_m = _errors_m(group)
+    error_m = group["position_error_m"].fillna(np.inf).to_numpy(float)
     sites = group["pair_id"].to_numpy(str)
 
     def of(method: str, risk: float, level_m: Floats, counts: Bools) -> ProtectionLevels:
@@ -262,12 +218,6 @@ def _levels_of_group(
         scale_m = _diagnostic(group, predictions, SCALE)
         if split is not None and np.isfinite(scale_m).any():
             yield of(CONFORMAL, risk, *_conformal(group, split, scale_m, error_m, risk))
-
-
-def _errors_m(group: pd.DataFrame) -> Floats:
-    """Return the error of each query; infinite without an answer, and for an answer at an absent place."""
-    error_m = group["position_error_m"].to_numpy(float)
-    return np.where(np.isnan(error_m), np.inf, error_m)
 
 
 def _diagnostic(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
@@ -298,20 +248,12 @@ def _counted(levels: ProtectionLevels) -> Iterator[dict[str, Any]]:
     sites = effective_count(np.unique(levels.sites, return_inverse=True)[1])
     for limit_m in ALERT_LIMITS_M:
         counts = stanford_counts(levels.level_m, levels.error_m, limit_m, trials=sites)
-        row = {"method": levels.method, "risk": levels.risk, "alert_limit_m": limit_m}
+        row: dict[str, Any] = {"method": levels.method, "risk": levels.risk, "alert_limit_m": limit_m}
         row |= {"n": len(levels.level_m), "sites": sites}
-        yield row | _shares(counts) | {"supports": _supports(counts, levels.risk)}
-
-
-def _shares(counts: StanfordCounts) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for area in _AREAS:
-        interval = getattr(counts, area)
-        found |= {area: interval.value, f"{area}_lo": interval.lo, f"{area}_hi": interval.hi}
-    return found
-
-
-def _supports(counts: StanfordCounts, risk: float) -> str:
-    """Return what the misleading ones among the available support, both counted in sites."""
-    available = counts.available.value * counts.trials
-    return statement(min(counts.misleading.value * counts.trials, available), available, risk=risk)
+        for area in _AREAS:
+            interval = getattr(counts, area)
+            row |= {area: interval.value, f"{area}_lo": interval.lo, f"{area}_hi": interval.hi}
+        # The misleading among the available, both counted in sites.
+        available = counts.available.value * sites
+        misleading = min(counts.misleading.value * sites, available)
+        yield row | {"supports": statement(misleading, available, risk=levels.risk)}

@@ -20,19 +20,9 @@ from sasgeo_bench.tasks.query import Truth
 class Rank:
     """Rank of the first right pose of one answer.
 
-    Parameters
-    ----------
-    above : int
-        Poses with a higher score.
-    tied : int
-        Poses with the same score, including itself.
-    right : int
-        Number of right poses among the tied ones; 0 if no pose of the answer is right or there is no answer.
-
-    Raises
-    ------
-    MetricError
-        If more are right than tied, or a number is negative.
+    `above` counts poses with a higher score, `tied` those with the same score, including itself, and `right` the right
+    ones among the tied; 0 if no pose of the answer is right or there is no answer. Raise MetricError if more are right
+    than tied, or a number is negative.
     """
 
     above: int
@@ -54,8 +44,6 @@ def rank_of(scores: ArrayLike, is_right: ArrayLike) -> Rank:
 
     `scores`, shape (K,), may be in any order; larger is better.
 
-    Examples
-    --------
     >>> rank_of([9.0, 7.0, 7.0, 1.0], [False, False, True, True])
     Rank(above=1, tied=2, right=1)
     """
@@ -71,12 +59,8 @@ def rank_of(scores: ArrayLike, is_right: ArrayLike) -> Rank:
 def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
     """Return the rank of the right candidate in an answer to a retrieval query; `MISS` if the answer lacks it.
 
-    A pose of the answer is the candidate at its position.
-
-    Raises
-    ------
-    MetricError
-        If no candidate is right: recall is a share of the queries whose place is present.
+    A pose of the answer is the candidate at its position. Raise MetricError if no candidate is right: recall is a share
+    of the queries whose place is present.
     """
     if not 0 <= truth.candidate < len(candidates):
         message = (
@@ -114,18 +98,11 @@ class Ranks:
 def hits(ranks: Ranks, k: int) -> Floats:
     """Return the chance that a right pose is among the first k, shape (N,), if tied poses are in random order.
 
-    0 or 1 without ties; the mean is Recall@k.
+    0 or 1 without ties; the mean is Recall@k. Raise MetricError if k is less than 1.
 
-    Raises
-    ------
-    MetricError
-        If k is less than 1.
-
-    Notes ----- With m places left for t tied poses of which r are right, all r are left out with chance C(t - r, m) /
+    With m places left for t tied poses of which r are right, all r are left out with chance C(t - r, m) /
     C(t, m), which is the product of (t - m - j) / (t - j) over j < r. With one right pose the chance to be in is m / t.
 
-    Examples
-    --------
     >>> ranks = Ranks.of([Rank(above=0, tied=1, right=1), Rank(above=0, tied=4, right=1), MISS])
     >>> hits(ranks, 1).tolist(), hits(ranks, 5).tolist()
     ([1.0, 0.25, 0.0], [1.0, 1.0, 0.0])
@@ -146,8 +123,6 @@ def reciprocal_ranks(ranks: Ranks) -> Floats:
 
     The mean is the MRR.
 
-    Examples
-    --------
     One of two tied poses behind a better one: (1/2 + 1/3) / 2.
 
     >>> reciprocal_ranks(Ranks.of([Rank(above=1, tied=2, right=1)])).round(4).tolist()

@@ -29,7 +29,6 @@ from sasgeo_bench.tasks.split import Split
 AS_DRAWN: Final = "as drawn"
 _CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
 SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
-_NO_DRAWS: Final = np.empty(0)
 
 
 def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
@@ -39,19 +38,9 @@ def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibr
     come with present places reweighted to a share of 0.9, 0.7 and 0.5. Without `is_calibrated`, skip metrics that need
     probabilities.
     """
+    names = {"matcher": matcher, "rejector": rejector, "stratum": AS_DRAWN}
     parts = [
-        (
-            RowKey.of(
-                part,
-                matcher=matcher,
-                rejector=rejector,
-                suite=str(suite),
-                track=str(track),
-                prior_group=str(prior_group),
-                stratum=AS_DRAWN,
-            ),
-            part,
-        )
+        (RowKey.of(part, suite=str(suite), track=str(track), prior_group=str(prior_group), **names), part)
         for (track, prior_group), whole in rows.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
@@ -66,7 +55,7 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
     sites = np.unique(part["pair_id"], return_inverse=True)[1]
     drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)
     is_pooled = key.suite == ALL_SUITES
-    mixtures = dict(_mixtures(some, is_pooled=is_pooled))
+    mixtures = dict(mixtures_of(some, is_pooled=is_pooled))
     areas = _drawn_areas(some, mixtures, drawn) if is_pooled and drawn.blocks_count > 1 else {}
     shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
     drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
@@ -74,22 +63,17 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
         mine, trials = replace(key, stratum=stratum), effective_count(sites, mass)
         for metric in metrics:
             value = metric.compute(some, weights=mass)
-            if is_pooled and metric.has_interval:
-                drawn_values = areas.get((stratum, metric.name), _NO_DRAWS)
-                found, how = _area_interval(value, drawn_values, trials, metric.bounds[1])
-                yield mine.row(metric, found, how)
-            else:
+            if not (is_pooled and metric.has_interval):
                 yield mine.row(metric, bare(value))
+                continue
+            most = metric.bounds[1]  # an area is a mean risk: scale it to [0, 1] and back
+            area = areas.get((stratum, metric.name), np.empty(0))
+            found, how = share_interval(value / most, area / most, trials)
+            yield mine.row(metric, Interval(value=value, lo=found.lo * most, hi=found.hi * most), how)
         for share in shares[stratum]:
             value = weighted_mean(share.counted, share.mass)
             found, how = share_interval(value, next(drawn_shares), effective_count(sites, share.mass))
             yield mine.row(share.metric, found, how)
-
-
-def _area_interval(value: float, draws: Floats, trials: float, most: float) -> tuple[Interval, str]:
-    """Return the interval of an area in [0, `most`]: it is a mean risk, so scale it to [0, 1] and back."""
-    found, how = share_interval(value / most, draws / most, trials)
-    return Interval(value=value, lo=found.lo * most, hi=found.hi * most), how
 
 
 def _drawn_areas(
@@ -106,7 +90,7 @@ def _drawn_areas(
     return {key: np.concatenate(listed) for key, listed in found.items()}
 
 
-def _mixtures(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
+def mixtures_of(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
     """Yield names and weights: as drawn, and for pooled suites the declared mixtures of present and absent places."""
     yield AS_DRAWN, np.ones(len(some))
     if is_pooled and some.is_present.any() and not some.is_present.all():
@@ -152,7 +136,6 @@ def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Flo
 
 OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
 _NUMBER: Final = r"\d+(?:\.\d+)?"
-_SAID: Final = ("p_right", "remark", "is_calibrated")
 _PARTS: Final = 5  # folds of the calibration blocks: thresholds need answers that the rejector was not fitted on
 
 Make = Callable[[], Rejector]
@@ -170,10 +153,7 @@ class Rule:
 def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
     """Return rejectors by name from names or module:Class, after making each once.
 
-    Raises
-    ------
-    ConfigError
-        If there is no split, two share a name, or one has that of a matcher's own confidence.
+    Raise ConfigError if there is no split, two share a name, or one has that of a matcher's own confidence.
     """
     found: dict[str, Rule] = {}
     named: dict[str, str] = {}
@@ -231,14 +211,9 @@ def judge(
     """Return a rejector's output for the answers of one matcher, each from a fit on other places.
 
     Each track and prior group has its own fit, over all suites. `make` makes a new rejector; `is_taught` is as in
-    `turns`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The tested rows, with the columns `p_right` (NaN without an answer), `is_calibrated` (False if `p_right` is only
-        an order), `accepted_<risk>` for each of `RISKS`, `is_own_calibration`, and `remark`, the rejector's remark on
-        its fit.
+    `turns`. The result holds the tested rows, with the columns `p_right` (NaN without an answer), `is_calibrated`
+    (False if `p_right` is only an order), `accepted_<risk>` for each of `RISKS`, `is_own_calibration`, and `remark`,
+    the rejector's remark on its fit.
     """
     frames = []
     usable = scores[scores["status"] != NOT_APPLICABLE]
@@ -247,22 +222,22 @@ def judge(
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
-    return _together(frames, [*scores.columns, *_SAID, *map(_accepted, RISKS), "is_own_calibration"])
+    return _together(
+        frames, [*scores.columns, "p_right", "remark", "is_calibrated", *map(_accepted, RISKS), "is_own_calibration"]
+    )
 
 
 def remarks_of(judged: pd.DataFrame) -> list[str]:
     """Return a rejector's remarks on its fits with the number of answers; remarks that differ in numbers are one.
 
-    Examples
-    --------
     >>> remarks_of(pd.DataFrame({"remark": ["", "2 too few", "2 too few"], "is_answered": [True, True, False]}))
     ['2 too few (1 answer judged so)']
     >>> remarks_of(pd.DataFrame({"remark": ["2 too few", "9 too few", "9 too few"], "is_answered": True}))
     ['9 too few (and alike in 1 fit more: 3 answers judged so)']
     """
-    said = judged.loc[judged["is_answered"].astype(bool) & (judged["remark"] != ""), "remark"]
+    remarks = judged.loc[judged["is_answered"].astype(bool) & (judged["remark"] != ""), "remark"]
     found = []
-    for _, alike in said.groupby(said.str.replace(_NUMBER, "#", regex=True), sort=True):
+    for _, alike in remarks.groupby(remarks.str.replace(_NUMBER, "#", regex=True), sort=True):
         counts = alike.value_counts()
         most = min(counts.index[counts == counts.max()])
         others = f"and alike in {counted(len(counts) - 1, 'fit')} more: " if len(counts) > 1 else ""
@@ -271,13 +246,7 @@ def remarks_of(judged: pd.DataFrame) -> list[str]:
 
 
 def why_not(scores: pd.DataFrame, *, is_taught: bool = False) -> str:
-    """Return why `judge` has no row for a matcher; `is_taught` as there.
-
-    Examples
-    --------
-    >>> why_not(pd.DataFrame({"is_answered": [False, False], "place": ["vaduz", "monaco"]}))
-    'it has no answers to judge'
-    """
+    """Return why `judge` has no row for a matcher; `is_taught` as there."""
     if not scores["is_answered"].any():
         return "it has no answers to judge"
     if is_taught:
@@ -327,7 +296,7 @@ def _accepted(risk: float) -> str:
 def _judged(
     test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
 ) -> pd.DataFrame:
-    p_false, remark = _fit_and_say(make, calibration, test, predictions)
+    p_false, remark = _fit_and_apply(make, calibration, test, predictions)
     asked = test.assign(p_right=1.0 - p_false, remark=remark, is_calibrated=make().card.is_calibrated)
     known = calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
     return asked.assign(**_accepted_rows(known, asked))
@@ -343,17 +312,17 @@ def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, 
     """Return probabilities on calibration blocks, each from a fit on the others; a single block uses its own fit."""
     names = sorted(set(calibration["block"]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
-        return _fit_and_say(make, calibration, calibration, predictions)[0]
+        return _fit_and_apply(make, calibration, calibration, predictions)[0]
     fold = calibration["block"].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
     found = np.full(len(calibration), np.nan)
     for part in sorted(set(fold)):
         rest, mine = calibration[fold != part], calibration[fold == part]
         if rest["is_answered"].any():
-            found[fold == part] = _fit_and_say(make, rest, mine, predictions)[0]
+            found[fold == part] = _fit_and_apply(make, rest, mine, predictions)[0]
     return found
 
 
-def _fit_and_say(
+def _fit_and_apply(
     make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictions: Mapping[str, Prediction]
 ) -> tuple[Floats, str]:
     """Fit on the answers of some rows; return P(false) of others, NaN without an answer, and the remark on the fit."""
@@ -413,7 +382,7 @@ class RejectionResult:
     matcher: str
     by_rejector: Mapping[str, pd.DataFrame]
     rows: tuple[pd.DataFrame, ...] = ()
-    skipped: tuple[str, ...] = field(default=())
+    skipped: tuple[str, ...] = ()
     failed: Mapping[str, Exception] = field(default_factory=dict)
 
 
@@ -426,31 +395,24 @@ def _evaluated(task: RejectionTask) -> RejectionResult:
     """Apply all rejectors to one entry, and its own confidence; a rejector that is not applied has no rows."""
     by_rejector, rows, skipped, failed = {}, [], [], {}
     for name in (OWN, *task.rules):
+        is_own = name == OWN
         try:
-            frame = _rows_of(task, name)
-            rows += [_metrics(task, name, frame)] if len(frame) else []
+            if is_own:
+                frame = own_confidence(task.scores, task.split, is_taught=task.is_taught)
+            else:
+                rule = task.rules[name]
+                frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
+            if len(frame):  # a matcher's own confidence counts as a probability
+                is_calibrated = is_own or task.rules[name].card.is_calibrated
+                rows.append(to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated))))
         except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
             failed[name] = error
             continue
-        if len(frame) or name != OWN:
+        if len(frame) or not is_own:
             by_rejector[name] = frame
-        if not len(frame) and name != OWN:
+        if not len(frame) and not is_own:
             why = why_not(task.scores, is_taught=task.is_taught)
             skipped.append(f"{name} on {task.matcher}: not applied, {why}")
     return RejectionResult(
         matcher=task.matcher, by_rejector=by_rejector, rows=tuple(rows), skipped=tuple(skipped), failed=failed
     )
-
-
-def _rows_of(task: RejectionTask, name: str) -> pd.DataFrame:
-    """Return the rows of a rejector, or of the matcher's own confidence."""
-    if name == OWN:
-        return own_confidence(task.scores, task.split, is_taught=task.is_taught)
-    rule = task.rules[name]
-    return judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
-
-
-def _metrics(task: RejectionTask, name: str, frame: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of the board; a matcher's own confidence counts as a probability."""
-    is_calibrated = name == OWN or task.rules[name].card.is_calibrated
-    return to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))

@@ -154,8 +154,6 @@ def in_threads(
 def name_alone(matcher: str) -> str:
     """Return the name of an entry without the version and hash that tell it from another of its name.
 
-    Examples
-    --------
     >>> name_alone("random 1 (c85212)"), name_alone("random")
     ('random', 'random')
     """
@@ -165,8 +163,6 @@ def name_alone(matcher: str) -> str:
 def is_unranked(matcher: str) -> bool:
     """Return True for a control of any version.
 
-    Examples
-    --------
     >>> is_unranked("oracle_pose 1 (c85212)"), is_unranked("raster_uniform")
     (True, False)
     """
@@ -215,8 +211,6 @@ def with_entry_labels(board: pd.DataFrame, contestants: Mapping[str, EntryLabel]
 def is_apart(board: pd.DataFrame) -> "pd.Series[bool]":
     """Return a mask of the rows that are excluded from ranks; all False if the table has no such column.
 
-    Examples
-    --------
     >>> is_apart(pd.DataFrame({"matcher": ["mine"], "set_apart": ["trained on vaduz"]})).tolist()
     [True]
     """

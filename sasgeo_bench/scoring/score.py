@@ -112,12 +112,7 @@ def score_task(
     """Score the predictions of one task: a row for each query in order, with the columns of `Score`.
 
     `heads` and `truths` cover the same queries; a query without a prediction is a miss. `place_of` maps blocks to
-    places of the split.
-
-    Raises
-    ------
-    MetricError
-        If a query has no truth or a prediction belongs to no query.
+    places of the split. Raise MetricError if a query has no truth or a prediction belongs to no query.
     """
     by_id = {truth.query_id: truth for truth in truths}
     asked = list(heads)

@@ -30,8 +30,6 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
     Roles, then each step of each kind at each view size, then bins of measured properties of the truth. A kind with one
     step and size has no separate rows for them.
 
-    Examples
-    --------
     >>> table = {"role": ["control", "stress"], "kind": ["control", "U1"], "strength": [0.0, 0.3]}
     >>> table |= {"view_cells": [96, 96]}
     >>> table |= {name: [0.1, 0.5] for name in ("unknown_share", "changed_share", "feature_density", "alias_index")}

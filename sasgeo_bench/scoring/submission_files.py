@@ -37,12 +37,7 @@ _LEVEL: Final = 19
 def read_card(path: Path) -> Card:
     """Read the card that an author wrote.
 
-    Raises
-    ------
-    StoreError
-        If it cannot be read.
-    ConfigError
-        If a field is wrong; all faults on one line.
+    Raise StoreError if it cannot be read. Raise ConfigError if a field is wrong; all faults on one line.
     """
     text = _text_of(path, _MOST_CARD_BYTES, "a card (submit --example-card prints one)")
     return parse_toml(text, Card, source=str(path))
@@ -74,13 +69,8 @@ def write_submission(
     """Write a submission completely or not at all, and return it with its files; the same answers give the same bytes.
 
     The folder has the name of the card; an older submission there is replaced. `asked` holds the hash of each answered
-    query, by query id.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds something else or has another name, the predictions are too large, or writing fails; the
-        folder is then unchanged.
+    query, by query id. Raise StoreError if the folder holds something else or has another name, the predictions are too
+    large, or writing fails; the folder is then unchanged.
     """
     if folder.name != submission.card.name:
         message = f"{folder} must be named as the card is, {submission.card.name!r}: name another folder"
@@ -130,10 +120,7 @@ def is_submission(folder: Path) -> bool:
 def list_submissions(folder: Path) -> tuple[Path, ...]:
     """Return a submission itself, or all in a folder by name, without hidden files and the README.
 
-    Raises
-    ------
-    StoreError
-        If there is no such folder, or something in it is no submission.
+    Raise StoreError if there is no such folder, or something in it is no submission.
     """
     if is_submission(folder):
         return (folder,)
@@ -151,12 +138,8 @@ def list_submissions(folder: Path) -> tuple[Path, ...]:
 def read_submission(folder: Path) -> Submission:
     """Read a submission after checking its folder.
 
-    Raises
-    ------
-    StoreError
-        If a file is missing, unknown, a link, too large, differs from its hash, or holds no predictions.
-    ConfigError
-        If a field of `submission.json` is wrong; all faults on one line.
+    Raise StoreError if a file is missing, unknown, a link, too large, differs from its hash, or holds no predictions.
+    Raise ConfigError if a field of `submission.json` is wrong; all faults on one line.
     """
     _check_names(folder, {SUBMISSION, PREDICTIONS})
     submission = _read_document(folder / SUBMISSION)

@@ -41,21 +41,9 @@ def leaderboard(
 ) -> pd.DataFrame:
     """Return the metrics of every matcher on every suite, track, prior group and stratum, with the columns of `Row`.
 
-    Parameters
-    ----------
-    scored : mapping of str to pandas.DataFrame
-        By matcher, from `score.score_task`; all hold the same queries.
-    draws : int
-        Number of bootstrap draws.
-    excluded : collection of str
-        Matchers without a rank, which are nobody's rivals; controls are always so.
-    done : callable
-        Called after each suite, track and prior group.
-
-    Raises
-    ------
-    MetricError
-        If two matchers were scored on different queries.
+    `scored` holds rows of `score.score_task` by matcher, all for the same queries. Matchers in `excluded` have no rank
+    and are no rivals; controls never are. `done` is called after each suite, track and prior group. Raise MetricError
+    if two matchers were scored on different queries.
     """
     groups = _groups(_aligned(scored))
     unranked = frozenset({*excluded, *filter(is_unranked, scored)})

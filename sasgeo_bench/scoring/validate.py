@@ -46,8 +46,6 @@ class Violation:
     def to_text(self) -> str:
         """Return the fault in one line.
 
-        Examples
-        --------
         >>> Violation(file="mine.parquet", row=3, column="confidence", found="1.5", expected="0..1 or null").to_text()
         'mine.parquet, row 3, confidence: found 1.5, expected 0..1 or null'
         """
@@ -60,11 +58,8 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
     `path` is a predictions file, or a run's folder of parts, where a newer row replaces an older one. It should answer
     the tasks and no others. Rows of a run's folder that state other queries are skipped (`set_aside` counts them).
-
-    Raises
-    ------
-    StoreError
-        If a file cannot be read at all, a task is of another version, or the folder holds runs of two matchers.
+    Raise StoreError if a file cannot be read at all, a task is of another version, or the folder holds runs of two
+    matchers.
     """
     prediction_files.check_one_matcher([path])
     queries = _asked_of(tasks)
@@ -102,12 +97,7 @@ def submission_faults(
 
     Tasks that the submission does not name are skipped; without tasks, rows are not checked. `board` is the board's id,
     empty if unknown. `places` are those of its split; if empty, declared training places are not checked. Files and
-    hashes are checked by `read_submission`.
-
-    Raises
-    ------
-    StoreError
-        If a file cannot be read, or a task is of another version.
+    hashes are checked by `read_submission`. Raise StoreError if a file cannot be read, or a task is of another version.
     """
     yield from _card_faults(submission, board, places)
     if tasks is None or submission.task_version not in TASK_VERSIONS:
@@ -160,10 +150,7 @@ def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iter
 def set_aside(path: Path, tasks: Sequence[Path]) -> int:
     """Return how many answers of a run's folder are to queries that the tasks do not hold in this form.
 
-    Raises
-    ------
-    StoreError
-        If a file cannot be read.
+    Raise StoreError if a file cannot be read.
     """
     asked = _asked(tasks)
     found: set[tuple[str, str]] = set()

@@ -38,8 +38,8 @@ def success_rate(errors, within_m):
     return weighted_mean(successes(errors, within_m))
 
 
-def success_auc(errors, **more):
-    return weighted_mean(area_values(errors, **more))
+def success_auc(errors):
+    return weighted_mean(area_values(errors))
 
 
 def only_position(position_m) -> PoseErrors:
@@ -114,12 +114,6 @@ def test_success_is_monotone_in_the_tolerance(errors_m) -> None:
     assert quantiles == sorted(quantiles)
 
 
-def test_the_area_asks_for_the_heading_unless_told_not_to() -> None:
-    errors = PoseErrors(position_m=np.zeros(2), yaw_deg=np.array([4.0, 90.0]), log_scale=np.zeros(2))
-    assert area_values(errors).tolist() == [1.0, 0.0]
-    assert success_auc(errors, within_deg=180.0) == 1.0
-
-
 def test_no_queries_have_no_success() -> None:
     nothing = pose_errors([], [])
     assert math.isnan(success_rate(nothing, 5.0))
@@ -132,8 +126,6 @@ def test_what_cannot_be_is_refused() -> None:
     for within_m in (math.inf, math.nan, -1.0):
         with pytest.raises(MetricError, match="tolerances"):
             successes(errors, within_m)
-    with pytest.raises(MetricError, match="positive and finite"):
-        area_values(errors, 0.0)
     with pytest.raises(MetricError, match="0 answers for 1 truths"):
         pose_errors([], [Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)])
     with pytest.raises(MetricError, match="not negative"):

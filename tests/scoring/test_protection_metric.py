@@ -99,7 +99,7 @@ def test_conformal_levels_are_exceeded_as_often_as_the_risk():
     [
         (lambda: conformal_factor([1.0], [0.0], 0.1), "scales positive"),
         (lambda: conformal_factor([1.0], [1.0], 0.0), r"risk must lie in \(0, 1\)"),
-        (lambda: statement(0, 9, risk=0.0), r"risk and confidence must lie in \(0, 1\)"),
+        (lambda: statement(0, 9, risk=0.0), r"risk must lie in \(0, 1\)"),
         (lambda: stanford_counts([1.0], [1.0], 0.0), "alert limit"),
     ],
 )

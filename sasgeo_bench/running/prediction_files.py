@@ -203,7 +203,7 @@ def read_key(folder: Path) -> str | None:
     return None if said is None else said.key
 
 
-def read_predictions(path: Path) -> Iterator[Prediction]:
+def read_predictions(path: str | Path) -> Iterator[Prediction]:
     """Predictions of a run's folder or of a file, newest first; of two for one query, the one that was written last.
 
     A folder holds two where a query was asked again, or was drawn anew and asked: `read_answers` tells them apart.
@@ -213,7 +213,7 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
     StoreError
         If there is none, or a file cannot be read.
     """
-    parts = parts_of(path)
+    parts = parts_of(Path(path))
     if not parts:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)

@@ -74,13 +74,13 @@ class TinyPlace:
         return self.folder / "regions" / self.region.manifest.id
 
 
-def tiny_place(folder: Path) -> TinyPlace:
+def tiny_place(path: str | Path) -> TinyPlace:
     """Make a small place to try a matcher on, in about a second; no file need be downloaded.
 
     Parameters
     ----------
-    folder : Path
-        Where the map, the queries and the truths are written; what was made there before is made anew.
+    path : str or Path
+        Folder for the map, the queries and the truths; earlier ones there are replaced.
 
     Returns
     -------
@@ -95,10 +95,11 @@ def tiny_place(folder: Path) -> TinyPlace:
     Examples
     --------
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     place = tiny_place(Path(folder))
+    ...     place = tiny_place(folder)
     >>> place.region.grid.shape, sorted({query.track for query in place.queries})
     ((1024, 1024), ['localization', 'retrieval'])
     """
+    folder = Path(path)
     build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent, with_preview=False)
     queries: list[Query] = []
     truths: list[Truth] = []

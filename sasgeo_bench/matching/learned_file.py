@@ -57,7 +57,8 @@ class TrainingRecord:
         is_sound = (
             isinstance(said, dict)
             and isinstance(said.get("key"), str)
-            and isinstance(said.get("file"), str | None)
+            and "file" in said
+            and isinstance(said["file"], str | None)
             and isinstance(places, list)
             and all(isinstance(place, str) for place in places)
             and type(said.get("pairs")) is int

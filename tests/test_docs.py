@@ -17,6 +17,7 @@ import typer
 import sasgeo_bench as sgb
 from docs.site import reference
 from sasgeo_bench.cli import program
+from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.running.prediction_rows import PART_SCHEMA
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
@@ -134,14 +135,22 @@ def resolves(parts):
     return hasattr(import_module(module), parts[-1]) or find_spec(".".join(parts)) is not None
 
 
-def test_the_perturbation_of_the_guide_keeps_to_its_rules():
-    (code,) = re.findall(r"^```python\n(.*?)^```$", read(DOCS / "howto" / "perturbation.md"), re.MULTILINE | re.DOTALL)
+def test_the_perturbations_of_the_guide_keep_to_its_rules():
+    codes = re.findall(r"^```python\n(.*?)^```$", read(DOCS / "howto" / "perturbation.md"), re.MULTILINE | re.DOTALL)
     made: dict[str, object] = {}
-    exec(code, made)  # noqa: S102 - of our own documents
+    for code in codes[:2]:
+        exec(code, made)  # noqa: S102 - of our own documents
     view = sgb.Evidence(classes=("water",), cells=np.zeros((1, 8, 4), dtype=np.uint8), cell_size_m=1.0)
     seen = made["Stripes"](share=0.5)(view, np.random.default_rng(0))  # type: ignore[operator]
     assert seen.unknown_share == 0.5
     assert made["Stripes"](share=0.0)(view, np.random.default_rng(0)) is view  # type: ignore[operator]
+    houses = sgb.Evidence(classes=("building",), cells=np.eye(9, dtype=np.uint8)[None, ::2, ::2], cell_size_m=1.0)
+    assert houses.cells.any()
+    for share, left in ((1.0, 0), (0.0, houses.cells.sum())):
+        seen = made["MissedBuildings"](share=share)(houses, np.random.default_rng(0))  # type: ignore[operator]
+        assert seen.cells.sum() == left
+    with pytest.raises(PerturbError, match=r"MissedBuildings: share lies between 0 and 1, got 2\.0"):
+        made["MissedBuildings"](share=2.0)  # type: ignore[operator]
 
 
 def test_the_readme_is_read_in_four_minutes():

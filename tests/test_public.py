@@ -82,13 +82,18 @@ def test_a_function_takes_the_words_of_the_flags_of_its_command(command, functio
 def test_a_town_is_driven_from_region_to_site_by_functions_alone(tmp_path, capfd):
     out, notes = tmp_path / "out", []
     (folder,) = sgb.build_region("town-grid", out=out)
-    region = sgb.read_region(folder)
+    region = sgb.read_region(str(folder))  # folders may be texts, as everywhere
     assert region.layers.any()
     tasks = sgb.make_tasks(suite="clean", regions="town-grid", n=2, out=str(out))
     assert tasks == (out / "tasks/clean/town-grid",)
+    assert sgb.read_task(str(tasks[0]))["suite"] == "clean"
+    truths = list(sgb.read_truths(str(out / "truth/clean/town-grid")))
+    assert [truth.query_id for truth in truths] == [query.query_id for query in sgb.read_queries(str(tasks[0]))]
     for matcher in (names := {"oracle_pose", "prior_centre"}):
         report = sgb.run(matcher=matcher, tasks=tasks, out=out, tell=notes.append)
         assert report.counts == {"ok": len(list(sgb.read_queries(tasks[0])))}
+        answers = list(sgb.read_predictions(str(report.folders[0])))
+        assert len(answers) == len(truths)
     assert any("ok" in line for line in notes)
     board = sgb.score(predictions=out / "runs", draws=100, cases=False, out=out)
     assert set(board.scores) == names

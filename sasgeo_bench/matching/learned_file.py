@@ -40,7 +40,8 @@ class TrainingRecord:
         is_sound = (
             isinstance(record, dict)
             and isinstance(record.get("key"), str)
-            and isinstance(record.get("file"), str | None)
+            and "file" in record
+            and isinstance(record["file"], str | None)
             and isinstance(places, list)
             and all(isinstance(place, str) for place in places)
             and type(record.get("pairs")) is int

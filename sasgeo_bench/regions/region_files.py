@@ -88,7 +88,7 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def read_region(folder: Path, *, around: Callable[[], AbstractContextManager[object]] = nullcontext) -> Region:
+def read_region(path: str | Path, *, around: Callable[[], AbstractContextManager[object]] = nullcontext) -> Region:
     """Read a region: its layers now, its features and graph when they are first used.
 
     All files are checked against their hashes now. `around` gives a context that is entered while features or graph
@@ -96,6 +96,7 @@ def read_region(folder: Path, *, around: Callable[[], AbstractContextManager[obj
     """
     from sasgeo_bench.regions.layer_file import read_layers  # noqa: PLC0415 - imports GDAL
 
+    folder = Path(path)
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])

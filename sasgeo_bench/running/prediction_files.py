@@ -138,7 +138,7 @@ def read_key(folder: Path) -> str | None:
     return None if record is None else record.key
 
 
-def read_predictions(path: Path) -> Iterator[Prediction]:
+def read_predictions(path: str | Path) -> Iterator[Prediction]:
     """Read predictions of a run's folder or a file, newest first; of two for one query, the one written last.
 
     A folder holds two where a query was asked again, or was drawn anew and asked: `read_answers` separates them.
@@ -148,7 +148,7 @@ def read_predictions(path: Path) -> Iterator[Prediction]:
     StoreError
         If there is none, or a file cannot be read.
     """
-    parts = parts_of(path)
+    parts = parts_of(Path(path))
     if not parts:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)

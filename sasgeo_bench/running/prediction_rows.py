@@ -104,11 +104,13 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
     [('message', 'nothing', 'string')]
     """
     found = {field.name: field.type for field in table.schema}
-    counts = {field: table.schema.names.count(field.name) for field in PREDICTION_SCHEMA}
+    # Rows of a run state the matcher's own time as well; a file of somebody else need not.
+    known = [*PREDICTION_SCHEMA, *([pa.field(MATCHER_S, pa.float64())] if MATCHER_S in found else [])]
+    counts = {field: table.schema.names.count(field.name) for field in known}
     twice = [(field.name, f"{count} columns", str(field.type)) for field, count in counts.items() if count > 1]
     return twice or [
         (field.name, str(found.get(field.name, "nothing")), str(field.type))
-        for field in PREDICTION_SCHEMA
+        for field in known
         if field.name not in found or not is_like(found[field.name], field.type)
     ]
 

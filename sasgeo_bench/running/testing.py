@@ -66,16 +66,18 @@ class TinyPlace:
         return self.folder / "regions" / self.region.manifest.id
 
 
-def tiny_place(folder: Path) -> TinyPlace:
+def tiny_place(path: str | Path) -> TinyPlace:
     """Make a small place to try a matcher on, in about a second, the same on every machine; nothing is downloaded.
 
-    Map, queries and truths go to `folder`, in place of earlier ones. Raise `StoreError` if it cannot be written.
+    Map, queries and truths go to the folder `path`, in place of earlier ones. Raise `StoreError` if it cannot be
+    written.
 
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     place = tiny_place(Path(folder))
+    ...     place = tiny_place(folder)
     >>> place.region.grid.shape, sorted({query.track for query in place.queries})
     ((1024, 1024), ['localization', 'retrieval'])
     """
+    folder = Path(path)
     build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent, with_preview=False)
     queries: list[Query] = []
     truths: list[Truth] = []

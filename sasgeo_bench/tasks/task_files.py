@@ -171,7 +171,7 @@ def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Qu
         yield batch
 
 
-def read_task(folder: Path) -> dict[str, Any]:
+def read_task(folder: str | Path) -> dict[str, Any]:
     """Read `task.json`; raise a StoreError if it is missing, damaged or of another version.
 
     Examples
@@ -181,7 +181,7 @@ def read_task(folder: Path) -> dict[str, Any]:
         ...
     sasgeo_bench.errors.StoreError: nowhere holds no task.json: make the queries first
     """
-    path = folder / TASK
+    path = Path(folder) / TASK
     if not path.is_file():
         message = f"{folder} holds no {TASK}: make the queries first"
         raise StoreError(message)
@@ -364,10 +364,11 @@ def read_view_bytes(folder: Path) -> dict[str, int]:
     return found
 
 
-def read_queries(folder: Path) -> Iterator[Query]:
+def read_queries(folder: str | Path) -> Iterator[Query]:
     """Yield the queries of a task in the order of their ids, a row group in memory at a time."""
-    for row in _rows(folder / QUERIES, QUERY_SCHEMA):
-        yield _made(folder / QUERIES, query_of, row)
+    path = Path(folder) / QUERIES
+    for row in _rows(path, QUERY_SCHEMA):
+        yield _made(path, query_of, row)
 
 
 def read_heads(folder: Path) -> Iterator[Head]:
@@ -378,10 +379,11 @@ def read_heads(folder: Path) -> Iterator[Head]:
             yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
 
 
-def read_truths(folder: Path) -> Iterator[Truth]:
+def read_truths(folder: str | Path) -> Iterator[Truth]:
     """Yield the truths of a task in the order of the query ids."""
-    for row in _rows(folder / TRUTH, TRUTH_SCHEMA):
-        yield _made(folder / TRUTH, truth_of, row)
+    path = Path(folder) / TRUTH
+    for row in _rows(path, TRUTH_SCHEMA):
+        yield _made(path, truth_of, row)
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:

@@ -629,6 +629,7 @@ def test_what_is_named_twice_counts_once(out, tmp_path):
             "matcher.tracks is 'x': Input should be a valid list",
         ),
         ({"learned": {"key": "x"}}, r"learned is \{'key': 'x'\}, expected key, file, trained_on and pairs"),
+        ({"learned": {"key": "x", "trained_on": [], "pairs": 1}}, "expected key, file, trained_on and pairs"),
     ],
 )
 def test_a_run_that_does_not_say_whose_it_is_gets_one_line(out, changes, words):

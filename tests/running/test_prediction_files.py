@@ -83,6 +83,15 @@ def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_ar
     assert not (tmp_path / "new.parquet").exists()
 
 
+def test_the_matchers_own_time_of_another_kind_or_twice_is_refused(rows, write):
+    """The column is not part of a submission, but rows of a run have it."""
+    text, number = pa.array(["odd"] * 2), pa.array([1.0] * 2)
+    odd = write(rows.append_column("matcher_s", text))
+    assert "(matcher_s: found string, expected double)" in refusal(everything, odd)
+    twice = rows.append_column("matcher_s", number).append_column("matcher_s", number)
+    assert "(matcher_s: found 2 columns, expected double)" in refusal(everything, write(twice))
+
+
 @pytest.mark.parametrize("name", ["query_id", "confidence"])
 def test_a_column_that_is_there_twice_is_refused(rows, write, name):
     path = write(rows.append_column(name, rows[name]))

@@ -6,17 +6,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_baselines.global_descriptor import Sums, first_apart, lattice_m
-from sasgeo_bench import (
-    WITHHELD,
-    Match,
-    MatcherCard,
-    Query,
-    Region,
-    at_place,
-    is_blind,
-    points_of,
-    ranked_candidates,
-)
+from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region, at_place, is_blind, points_of, ranked_candidates
 
 DRAWN: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 STEP_M: Final = 16.0

@@ -53,28 +53,11 @@ def proposals(
     scales: tuple[float, float] = (1.0, 1.0),
     prior: Prior | None = None,
 ) -> list[Proposal]:
-    """Propose poses from pairs of junctions whose arms agree.
+    """Propose up to `count` poses from pairs of junctions whose arms agree, the most votes first.
 
     Each pair of the view is looked up among those of the map by length, within the scales, and directions of arms. Each
-    hit votes for one pose, in closed form, with a weight that falls with the number of hits for that length.
-
-    Parameters
-    ----------
-    seen : ObservedGraph
-        The view.
-    mapped : MappedGraph
-        The map.
-    count : int
-        Poses at most.
-    scales : tuple of float
-        Least and greatest scale of the view.
-    prior : Prior, optional
-        Poses outside of its disc, or beyond three sigma of its heading, are dropped.
-
-    Returns
-    -------
-    list of Proposal
-        The most votes first; empty where the view shows no two junctions.
+    hit votes for one pose, in closed form, with a weight that falls with the number of hits for that length. Poses
+    outside the prior's disc, or beyond three sigma of its heading, are dropped.
 
     Raises
     ------
@@ -241,7 +224,7 @@ class Reading:
 
     @cached_property
     def age_years(self) -> float:
-        """Age of the map."""
+        """Return the age of the map."""
         return age_years(self.query, self.reader.region)
 
     @cached_property

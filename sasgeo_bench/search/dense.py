@@ -164,7 +164,7 @@ class _Peaks:
         return chosen
 
     def _is_near(self, at: int, other: int, turns: Turns) -> bool:
-        """Tell if two peaks have neighbouring headings and scales."""
+        """Return whether two peaks have neighbouring headings and scales."""
         off_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
         is_turned = off_deg >= _NEXT * turns.yaw_step_deg + _NOTHING
         return not is_turned and abs(self.scale[at] - self.scale[other]) < _NEXT * turns.scale_step + _NOTHING

@@ -60,15 +60,10 @@ class VotePlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Voted:
-    """Result of a search by votes.
+    """Result of a search by votes: modes, best first, or one for each candidate, None where the map shows too little.
 
-    Parameters
-    ----------
-    modes : list of Mode or None
-        Best places, best first; or one for each candidate, None where the map shows too little.
-    null_score : float
-        Standard deviations by which the best coarse score exceeds those of distant places, which are wrong if it is
-        right; 0 where there are none.
+    `null_score` is the lead of the best coarse score over distant places, which are wrong if it is right, in their
+    standard deviations; 0 where there are none.
     """
 
     modes: list[Mode | None]
@@ -96,14 +91,7 @@ class _Votes:
 
 
 def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
-    """Return headings and scales to search, as poses at the origin.
-
-    Examples
-    --------
-    >>> known = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=3.0, scale_sigma=0.0)
-    >>> [pose.yaw_deg for pose in turns(known, VotePlan())]
-    [354.0, 357.0, 0.0, 3.0, 6.0]
-    """
+    """Return headings and scales to search, as poses at the origin."""
     scales = [1 + offset for offset in _steps(min(_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
     yaws_deg = _yaws_deg(prior, plan)
     return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)

@@ -96,7 +96,7 @@ class Sums:
         return np.asarray(sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left])
 
 
-def first_apart(points_m: NDArray[np.float64], scores: NDArray[np.float64], *, apart_m: float, most: int) -> list[int]:
+def separate(points_m: NDArray[np.float64], scores: NDArray[np.float64], *, apart_m: float, most: int) -> list[int]:
     """Return indices of the best places, none nearer to a better one than a distance; ties keep their order."""
     left = scores.astype(np.float64)
     chosen: list[int] = []
@@ -154,7 +154,7 @@ class GlobalDescriptor:
             return ranked_candidates(query, kept, top_k=top_k, diagnostics=diagnostics)
         points_m = lattice_m(query.prior, self._region, step_m=STEP_M)
         scores = self._scores(self._sums, query, points_m)
-        chosen = first_apart(points_m, scores, apart_m=APART_M, most=top_k)
+        chosen = separate(points_m, scores, apart_m=APART_M, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
         return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=diagnostics)
 

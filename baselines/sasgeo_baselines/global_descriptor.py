@@ -96,14 +96,8 @@ class Sums:
         return np.asarray(sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left])
 
 
-def first_apart(points_m: NDArray[np.float64], scores: NDArray[np.float64], *, apart_m: float, most: int) -> list[int]:
-    """Return indices of the best places, none nearer to a better one than a distance; ties keep their order.
-
-    Examples
-    --------
-    >>> first_apart(np.array([(0.0, 0.0), (1.0, 0.0), (9.0, 0.0)]), np.array([1.0, 2.0, 0.0]), apart_m=5.0, most=2)
-    [1, 2]
-    """
+def separate(points_m: NDArray[np.float64], scores: NDArray[np.float64], *, apart_m: float, most: int) -> list[int]:
+    """Return indices of the best places, none nearer to a better one than a distance; ties keep their order."""
     left = scores.astype(np.float64)
     chosen: list[int] = []
     while len(chosen) < most:
@@ -160,7 +154,7 @@ class GlobalDescriptor:
             return ranked_candidates(query, kept, top_k=top_k, diagnostics=diagnostics)
         points_m = lattice_m(query.prior, self._region, step_m=STEP_M)
         scores = self._scores(self._sums, query, points_m)
-        chosen = first_apart(points_m, scores, apart_m=APART_M, most=top_k)
+        chosen = separate(points_m, scores, apart_m=APART_M, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
         return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=diagnostics)
 
@@ -177,13 +171,7 @@ class GlobalDescriptor:
 
 
 def shares(cells: NDArray[np.uint8]) -> list[float]:
-    """Return the share of the known cells in which each class is present; NaN where none is known.
-
-    Examples
-    --------
-    >>> shares(np.array([[[1, 0, 0, 2]], [[1, 1, 2, 2]]], dtype=np.uint8))
-    [0.3333333333333333, 1.0]
-    """
+    """Return the share of the known cells in which each class is present; NaN where none is known."""
     known = [int((layer != UNKNOWN).sum()) for layer in cells]
     present = [int((layer == PRESENT).sum()) for layer in cells]
     return [there / count if count else math.nan for there, count in zip(present, known, strict=True)]
@@ -207,15 +195,7 @@ class Descriptor:
 
     @classmethod
     def of(cls, things_m: Sequence[NDArray[np.float64]], *, reach_m: float) -> Self:
-        """Describe places of objects of each kind, shape (N, 2) each, metres; `reach_m` is the longest distance.
-
-        Examples
-        --------
-        >>> two = np.array([(0.0, 0.0), (8.0, 0.0)])
-        >>> found = Descriptor.of([two], reach_m=15.0)
-        >>> found.counts.tolist(), found.spread[0].argmax().item()
-        ([2.0], 8)
-        """
+        """Describe places of objects of each kind, shape (N, 2) each, metres; `reach_m` is the longest distance."""
         counts = np.array([len(places_m) for places_m in things_m], dtype=np.float64)
         spread = [distances(places_m, reach_m=reach_m) for places_m in things_m]
         return cls(counts=counts, spread=np.array(spread, dtype=np.float64).reshape(-1, BINS))
@@ -247,11 +227,6 @@ def distances(places_m: NDArray[np.float64], *, reach_m: float) -> NDArray[np.fl
     """Return the histogram of the distances of all pairs, shape (BINS,), of sum 1; zeros where there is no pair.
 
     Each distance is split between its two nearest bins, so that small moves make small differences.
-
-    Examples
-    --------
-    >>> distances(np.array([(0.0, 0.0), (0.5, 0.0)]), reach_m=15.0)[:3].tolist()
-    [0.5, 0.5, 0.0]
     """
     made = np.zeros(BINS)
     if len(places_m) > 1:

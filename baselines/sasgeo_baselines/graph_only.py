@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sasgeo_baselines.global_descriptor import Descriptor, components, first_apart, lattice_m
+from sasgeo_baselines.global_descriptor import Descriptor, components, lattice_m, separate
 from sasgeo_bench import (
     PRESENT,
     UNKNOWN,
@@ -145,7 +145,7 @@ class GraphOnly:
             kept = [float(score) if math.isfinite(score) else None for score in best]
             return ranked_candidates(query, kept, top_k=top_k, diagnostics=diagnostics)
         points_m, scores = _searched(view, query.prior)
-        chosen = first_apart(points_m, scores, apart_m=APART_M, most=top_k)
+        chosen = separate(points_m, scores, apart_m=APART_M, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
         return Match(poses=poses, scores=[float(scores[at]) for at in chosen], diagnostics=diagnostics)
 
@@ -225,7 +225,7 @@ def _searched(view: _ViewOnMap, prior: Prior) -> tuple[NDArray[np.float64], NDAr
     disc = Disc(center_m=prior.center_m, radius_m=prior.radius_m or 0.0)
     while step_m > NEAR_M:
         step_m /= 2
-        best = points_m[first_apart(points_m, scores, apart_m=APART_M, most=REFINED)]
+        best = points_m[separate(points_m, scores, apart_m=APART_M, most=REFINED)]
         near = (best[:, None] + step_m * _AROUND[_AROUND.any(axis=1)]).reshape(-1, 2)
         on_map = ((near >= (west_m, south_m)) & (near <= (east_m, north_m))).all(axis=1)
         near = near[on_map & disc.holds(near)]

@@ -5,18 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_baselines.global_descriptor import Sums, first_apart, lattice_m
-from sasgeo_bench import (
-    WITHHELD,
-    Match,
-    MatcherCard,
-    Query,
-    Region,
-    at_place,
-    is_blind,
-    points_of,
-    ranked_candidates,
-)
+from sasgeo_baselines.global_descriptor import Sums, lattice_m, separate
+from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region, at_place, is_blind, points_of, ranked_candidates
 
 DRAWN: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 STEP_M: Final = 16.0
@@ -62,6 +52,6 @@ class MapDensityPrior:
             return ranked_candidates(query, drawn.astype(np.float64).tolist(), top_k=top_k)
         points_m = lattice_m(query.prior, self._grid, step_m=STEP_M)
         drawn = self._sums.squares(points_m, side_m)[:-1].sum(axis=0).astype(np.float64)
-        chosen = first_apart(points_m, drawn, apart_m=APART_M, most=top_k)
+        chosen = separate(points_m, drawn, apart_m=APART_M, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
         return Match(poses=poses, scores=[float(drawn[at]) for at in chosen])

@@ -121,14 +121,8 @@ LIMITS: Final = (
 class Switches:
     """Settings in which the variants differ; all are off in variant 2.
 
-    Parameters
-    ----------
-    has_graph : bool
-        Add the graph descriptor to the score of each mode: see `verification.blended`.
-    is_stable : bool
-        Weigh each class by `stability`, else by 1.
-    is_unknown_silent : bool
-        Ignore unknown cells of the view; else they count as absent.
+    `has_graph` adds the graph descriptor to the score of each mode (`blended`), `is_stable` weighs each class by
+    `stability` instead of 1, `is_unknown_silent` ignores unknown cells of the view, which else count as absent.
     """
 
     has_graph: bool = False
@@ -137,15 +131,7 @@ class Switches:
 
 
 class RasterMatcher(DenseMatcher):
-    """Eqs. (7)-(8) with gains of 1; lines agree by proximity.
-
-    Parameters
-    ----------
-    reach_m : float
-        The tau of exp(-D^2 / 2 tau^2) for lines, metres.
-    plan : VotePlan, optional
-        Settings of the search.
-    """
+    """Eqs. (7)-(8) with gains of 1; lines agree by proximity, exp(-D^2 / 2 tau^2) with tau `reach_m`."""
 
     switches: ClassVar[Switches] = Switches()
 
@@ -189,13 +175,7 @@ class RasterMatcher(DenseMatcher):
 
 
 def stability(classes: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return the prior p_c of each class, shape (C,): Eq. (5) of the SASGeo paper with all other factors 1.
-
-    Examples
-    --------
-    >>> stability(("railway", "farmland")).tolist()
-    [0.97, 0.7]
-    """
+    """Return the prior p_c of each class, shape (C,): Eq. (5) of the SASGeo paper with all other factors 1."""
     taxonomy = load_taxonomy()
     return np.array([taxonomy[name].persistence.prior for name in classes], dtype=np.float64)
 

@@ -175,7 +175,7 @@ def best_poses(glance: Reading) -> tuple[Pose, ...]:
 
 def _scores(glance: Reading, poses: tuple[Pose, ...], views: tuple[Evidence, ...]) -> pd.DataFrame:
     classes = glance.reader.region.classes
-    by_class = glance.by_class(poses) * glance.reader.learnt.scaling
+    by_class = glance.by_class(poses) * glance.reader.model.scaling
     columns = {"share view": _shares(glance.query.evidence)}
     columns |= {f"share {name}": _shares(view) for name, view in zip(NAMES, views, strict=True)}
     columns |= {f"score {name}": row for name, row in zip(NAMES, by_class, strict=True)}

@@ -19,21 +19,11 @@ Weights = Literal["even", "hand", "fitted"]
 class Switches:
     """Settings in which the ablations differ; defaults are those of the full scorer.
 
-    Parameters
-    ----------
-    weights : {"even", "hand", "fitted"}
-        Equal weights; Eqs. 5 and 7 with the numbers of the taxonomy; likelihood ratios of fitted rates, each class
-        with a fitted scale of its evidence.
-    is_unknown_silent : bool
-        Ignore unknown cells of the view; else they count as absent.
-    has_graph : bool
-        Rank modes with Eq. 9, too.
-    is_distinctive : bool
-        Eq. 6: give rare configurations more weight.
-    is_stamped : bool
-        Eq. 5 for each feature: weigh features by the time since their last edit, with fitted weights.
-    knows_age : bool
-        Use the age of the map; else every map counts as new, which separates stability from fitted weights.
+    `weights` are "even"; by "hand", Eqs. 5 and 7 with the numbers of the taxonomy; or "fitted", log-likelihood ratios
+    of fitted rates, each class with a fitted scale of its evidence. `is_unknown_silent` ignores unknown cells of the
+    view, else they count as absent. `has_graph` ranks modes with Eq. 9, too. `is_distinctive`, Eq. 6, gives rare
+    configurations more weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit.
+    Unless it `knows_age`, every map counts as new, which separates stability from fitted weights.
     """
 
     weights: Weights = "fitted"
@@ -45,7 +35,7 @@ class Switches:
 
     @property
     def learns(self) -> bool:
-        """Tell if the scorer is fitted to training places."""
+        """Return whether the scorer is fitted to training places."""
         return self.weights == "fitted"
 
     def seen(self, evidence: Evidence) -> Evidence:
@@ -58,7 +48,7 @@ class Switches:
     def gains(self, model: ScorerModel, *, age_years: float, season: str = "") -> Gains:
         """Return the gains of Eq. 7 for the age of a map and a season, in the order of the classes of the model."""
         if self.weights == "even":
-            return even_gains(model.classes)
+            return even_gains(np.ones(len(model.classes)))
         age_years = age_years if self.knows_age else 0.0
         if self.weights == "hand":
             return hand_gains(model.classes, age_years=age_years, persists=by_hand(season, model.classes).tolist())

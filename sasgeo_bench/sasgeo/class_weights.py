@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights of classes as a map ages, and maps of these weights: Eqs. 5-7 of the SASGeo paper.
 
-Gains are nats a cell. Weights include the scale of the evidence and are nats for 100 m2 that are mapped and seen; by
-hand that is sigma of Eq. 5, since the scale is one cell in a hundred.
+Gains are nats a cell. Weights include the scale of the evidence: nats for 100 m2 that are mapped and seen. By hand that
+is sigma of Eq. 5, since the scale is one cell in a hundred.
 """
 
 import difflib
@@ -55,16 +55,9 @@ class Rarity:
     """Kinds of local configurations of a map and their rarity.
 
     A configuration is the share of each group of classes in the sectors of two rings around a cell, as magnitudes of
-    its Fourier series around the circle, which are invariant to rotation. Kinds are the clusters of k-means.
-
-    Parameters
-    ----------
-    middle, spread : ndarray of float, shape (D,)
-        Mean and standard deviation of configurations.
-    words : ndarray of float, shape (W, D)
-        Centre of each kind.
-    weight : ndarray of float, shape (W,)
-        -log(share of the kind + epsilon), Eq. 6, over its mean on the map.
+    its Fourier series around the circle, which are invariant to rotation. Kinds are the clusters of k-means; `words`,
+    shape (W, D), are their centres, after scaling by `middle` and `spread`, shape (D,). `weight`, shape (W,), is
+    -log(share of the kind + epsilon), Eq. 6, over its mean on the map.
     """
 
     middle: NDArray[np.float32]
@@ -74,16 +67,7 @@ class Rarity:
 
     @classmethod
     def of(cls, layers: NDArray[np.uint8], classes: Sequence[str], *, cell_size_m: float) -> Self:
-        """Find the kinds of configurations of a map around cells with any class.
-
-        Parameters
-        ----------
-        layers : ndarray of uint8, shape (C, rows, cols)
-            PRESENT, ABSENT, or more where nothing is known.
-        classes : sequence of str
-            Its bands.
-        cell_size_m : float
-            Side of a cell, metres.
+        """Find the kinds of configurations of a map, layers of shape (C, rows, cols), around cells with any class.
 
         Examples
         --------
@@ -100,8 +84,7 @@ class Rarity:
         found, drawn = _configurations(layers, classes, cell_size_m=cell_size_m)
         rows = found[drawn]
         if len(rows) == 0:
-            width = found.shape[-1]
-            flat = np.zeros(width, dtype=np.float32)
+            flat = np.zeros(found.shape[-1], dtype=np.float32)
             return cls(middle=flat, spread=flat + 1, words=flat[None], weight=np.ones(1, dtype=np.float32))
         middle, spread = rows.mean(axis=0), np.maximum(rows.std(axis=0), _NOTHING)
         standard = (rows - middle) / spread
@@ -148,8 +131,8 @@ def _configurations(
     kernels = _sectors(cell_size_m * factor)
     parts, drawn = [], np.zeros(size[::-1], dtype=bool)
     for group in GROUPS:
-        mine = [layer for name, layer in zip(classes, layers, strict=True) if name in group]
-        present = np.any([layer == PRESENT for layer in mine], axis=0) if mine else np.zeros(layers.shape[1:], bool)
+        own = [layer == PRESENT for name, layer in zip(classes, layers, strict=True) if name in group]
+        present = np.any(own, axis=0) if own else np.zeros(layers.shape[1:], bool)
         share = cv2.resize(present.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         drawn |= share > 0
         for ring in kernels:
@@ -167,13 +150,10 @@ def _sectors(cell_m: float) -> list[list[NDArray[np.float32]]]:
     kernels, inner_m = [], 0.0
     for outer_m in RINGS_M:
         ring = (far_m > inner_m) & (far_m <= outer_m)
-        kernels.append([_mean_of(ring & (sector == at)) for at in range(SECTORS)])
+        masks = [ring & (sector == at) for at in range(SECTORS)]
+        kernels.append([np.asarray(mask / max(mask.sum(), 1), dtype=np.float32) for mask in masks])
         inner_m = outer_m
     return kernels
-
-
-def _mean_of(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return np.asarray(mask / max(mask.sum(), 1), dtype=np.float32)
 
 
 AGES_YEARS: Final = (0.0, 2.0, 5.0, 10.0, 20.0)
@@ -192,15 +172,7 @@ def check_age(age_years: float) -> float:
 
 
 def check_season(season: str) -> str:
-    """Return the name of a season, "" for none, or raise ConfigError.
-
-    Examples
-    --------
-    >>> check_season("snw")
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.ConfigError: there is no season 'snw', did you mean 'snow'? (leaf_on, snow, low_water, harvest)
-    """
+    """Return the name of a season, "" for none, or raise ConfigError."""
     if season and season not in SEASONS:
         near = difflib.get_close_matches(season, SEASONS, n=1)
         hint = f", did you mean {near[0]!r}?" if near else ""
@@ -216,11 +188,6 @@ def check_classes(model: ScorerModel, classes: Sequence[str] = ()) -> ScorerMode
     ------
     ConfigError
         If the taxonomy lacks a class of the model, or the model a class of the map.
-
-    Examples
-    --------
-    >>> check_classes(ScorerModel.by_hand(["water", "railway"]), ["railway"]).classes
-    ('railway',)
     """
     strange = [name for name in (*model.classes, *classes) if name not in load_taxonomy().names]
     if strange:
@@ -252,28 +219,8 @@ def worth_table(
 ) -> pd.DataFrame:
     """Return weights, gains and information of each class as the map ages, a row for each class and age.
 
-    Parameters
-    ----------
-    model : ScorerModel
-        Rates of the classes.
-    arm : Switches
-        Weights by hand or fitted.
-    ages_years : sequence of float
-        Of the map.
-    season : str
-        Season of the view, "" if unknown.
-
-    Returns
-    -------
-    pandas.DataFrame
-        class, age_years; worth (see `worth_of`); agree, extra, missed, quiet (see `weights.Gains`), nats a cell;
-        information (see `weights.information`), nats a cell.
-
-    Examples
-    --------
-    >>> table = worth_table(ScorerModel.by_hand(["railway"]), HAND, ages_years=[0.0])
-    >>> table.loc[0, ["worth", "agree", "missed"]].tolist()
-    [0.97, 0.97, -0.97]
+    Columns: class, age_years; worth (see `worth_of`); agree, extra, missed, quiet (see `weights.Gains`) and information
+    (see `weights.information`), nats a cell.
     """
     persists = model.persists(season)
     parts = []
@@ -285,11 +232,8 @@ def worth_table(
         ]
         about = {"class": model.classes, "age_years": float(age), "order": range(len(model.classes))}
         worth = worth_of(model, arm, age_years=age, season=season)
-        parts.append(
-            pd.DataFrame(
-                about | {"worth": worth} | {name: getattr(gains, name) for name in GAINS} | {"information": nats}
-            )
-        )
+        columns = {name: getattr(gains, name) for name in GAINS}
+        parts.append(pd.DataFrame(about | {"worth": worth} | columns | {"information": nats}))
     rows = pd.concat(parts).sort_values(["order", "age_years"], kind="stable", ignore_index=True)
     return rows.drop(columns="order")
 
@@ -306,19 +250,8 @@ def weight_map(
 ) -> NDArray[np.float32]:
     """Return the weight of every cell of a map: w = sigma nu, summed over its classes as in Eq. 8.
 
-    Parameters
-    ----------
-    layers : ndarray of uint8, shape (C, rows, cols)
-        PRESENT, ABSENT, or more where nothing is known.
-    worth : ndarray of float, shape (C,)
-        From `worth_of`.
-    rarity : ndarray of float, shape (rows, cols)
-        From `rarity_map`.
-
-    Returns
-    -------
-    ndarray of float32, shape (rows, cols)
-        Nats for 100 m2; 0 where nothing is mapped, NaN where nothing is known.
+    `layers` have shape (C, rows, cols), `worth` (`worth_of`) shape (C,), `rarity` (`rarity_map`) and the result (rows,
+    cols). Nats for 100 m2; 0 where nothing is mapped, NaN where nothing is known.
 
     Examples
     --------
@@ -335,14 +268,7 @@ def weight_map(
 
 
 def side_by_side(tables: Mapping[str, pd.DataFrame], column: str) -> pd.DataFrame:
-    """Join one column of several tables: a row for each class, a column for each table and age.
-
-    Examples
-    --------
-    >>> table = worth_table(ScorerModel.by_hand(["railway"]), HAND, ages_years=[0.0])
-    >>> side_by_side({"hand": table}, "worth").columns.tolist()
-    [('hand', 0.0)]
-    """
+    """Join one column of several tables: a row for each class, a column for each table and age."""
     wide = {
         name: table.pivot_table(index="class", columns="age_years", values=column, sort=False)
         for name, table in tables.items()

@@ -38,25 +38,16 @@ class StampTally:
 
 
 def idle_years(edited: pd.Series, date: dt.date) -> NDArray[np.float64]:
-    """Return years from the last edit of each feature to the date of a map, shape (N,); 0 without a timestamp.
-
-    Examples
-    --------
-    >>> idle_years(pd.Series(["2015-06-01", None]), dt.date(2020, 6, 1)).round(1).tolist()
-    [5.0, 0.0]
-    """
+    """Return years from the last edit of each feature to the date of a map, shape (N,); 0 without a timestamp."""
     edited = pd.to_datetime(edited, utc=True).dt.tz_localize(None)
     days = (pd.Timestamp(date) - edited).dt.days.to_numpy(dtype=np.float64)
     return np.asarray(np.maximum(np.nan_to_num(days), 0.0) / _DAYS_PER_YEAR)
 
 
 def strata(region: Region) -> NDArray[np.uint8]:
-    """Return the stratum of the feature of each class in each cell, of several the last edited.
+    """Return the stratum of the feature of each class in each cell, of several the last edited, shape (C, rows, cols).
 
-    Returns
-    -------
-    ndarray of uint8, shape (C, rows, cols)
-        i below `IDLE_YEARS[i]`, the last above all, `NEVER` where the class is not.
+    i below `IDLE_YEARS[i]`, the last above all, `NEVER` where the class is not.
     """
     idle = idle_years(region.features["timestamp"], region.manifest.extract.date)
     stratum = np.searchsorted(IDLE_YEARS, idle, side="right")
@@ -73,14 +64,6 @@ def fit_trust(tallies: Sequence[StampTally]) -> NDArray[np.float64]:
 
     Like `rates.likeness` for distance: logarithms of the share of cells seen, scaled between the stratum seen most and
     cells far from the class. Strata with few cells are drawn to the mean of their class.
-
-    Examples
-    --------
-    >>> seen, missed = np.array([[9000, 0, 0, 3000]]), np.array([[1000, 0, 0, 7000]])
-    >>> far_seen, far_missed = np.array([100]), np.array([9900])
-    >>> one = StampTally(seen=seen * 99, missed=missed * 99, far_seen=far_seen * 99, far_missed=far_missed * 99)
-    >>> fit_trust([one]).round(2).tolist()
-    [[1.0, 0.91, 0.91, 0.76]]
     """
     seen, missed, far_seen, far_missed = (
         np.sum([getattr(one, name) for one in tallies], axis=0) / _CELLS_PER_WITNESS
@@ -98,16 +81,8 @@ def fit_trust(tallies: Sequence[StampTally]) -> NDArray[np.float64]:
 def stamp_tally(seen: NDArray[np.uint8], under: NDArray[np.uint8], stratum: NDArray[np.uint8], far: int) -> StampTally:
     """Count the cells of a view by the stratum of the map under it.
 
-    Parameters
-    ----------
-    seen : ndarray of uint8, shape (C, rows, cols)
-        PRESENT, ABSENT or UNKNOWN.
-    under : ndarray of uint8, shape (C, rows, cols)
-        `rates.rings` of the map, on the lattice of the view.
-    stratum : ndarray of uint8, shape (C, rows, cols)
-        `strata` of the map, likewise.
-    far : int
-        Index of the ring for cells far from a class.
+    All arrays have shape (C, rows, cols) on the lattice of the view: `seen` (PRESENT, ABSENT, UNKNOWN), `under`
+    (`rates.rings` of the map) and `stratum` (`strata`). `far` is the index of the ring far from a class.
 
     Examples
     --------
@@ -117,7 +92,6 @@ def stamp_tally(seen: NDArray[np.uint8], under: NDArray[np.uint8], stratum: NDAr
     """
 
     def count(state: int, where: NDArray[np.uint8], index: int) -> NDArray[np.int64]:
-        """Count cells of one state in one stratum, by class."""
         return np.asarray(((seen == state) & (where == index)).sum(axis=(1, 2)), dtype=np.int64)
 
     on = np.where(under == 0, stratum, np.uint8(NEVER))

@@ -3,7 +3,7 @@
 
 Every term is a log-likelihood ratio of a view from here against one from a similar place. A seen node that is mapped
 adds log(hit p(offset) / density), one that is not mapped log(extra), a mapped one that is not seen log(1 - hit);
-relations of neighbours add to this. Probabilities are set by hand (`kinds.KINDS`, `ratios.GraphRules`).
+relations of neighbours add to this. Probabilities are set by hand (`nodes.KINDS`, `GraphRules`).
 """
 
 from collections.abc import Sequence
@@ -21,71 +21,37 @@ from sasgeo_bench.sasgeo.observed import ObservedGraph
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphRules:
-    """Tolerances and likelihood ratios, set by hand.
+    """Tolerances and likelihood ratios, set by hand."""
 
-    Parameters
-    ----------
-    gate_m : float
-        Largest offset of a node: twice the errors of maps and detectors, and that of a search.
-    place_sigma_m : float
-        Standard deviation of the place of a node, each axis: 4 m of the map, 3 m of the pose, some metres of a warp.
-    warp_m, stretch_m : float
-        Largest common shift of neighbouring nodes, and its correlation length: after a first assignment the gate moves
-        with the neighbours. This tolerates warps of 15 m rms with waves of 60 m and more.
-    wander : float
-        Probability that the place, an arm or the area of a right match is an outlier.
-    arm_sigma_deg, area_sigma : float
-        Standard deviations of the direction of an arm, and of the logarithm of an area.
-    area_spread : float
-        Standard deviation of the logarithm of areas of different houses.
-    degrees : tuple of float
-        Log-likelihood ratios of degrees that are equal, differ by one, and by more.
-    edge_sigma_m, edge_strain : float
-        Standard deviation of the relative place of two neighbours: a constant, and a part of their distance. A warp of
-        10 m rms with waves of 90 m strains by 0.4, a heading error of 3 degrees by 0.05.
-    edge_weight : float
-        Weight of a pair of neighbours. A node has about six, which share its place.
-    link, false_link, lost_link : float
-        Log-likelihood ratios of a way between two nodes on both sides, in the view alone, on the map alone.
-    """
-
-    gate_m: float = 12.0
-    place_sigma_m: float = 6.0
+    gate_m: float = 12.0  # largest offset of a node: twice the errors of maps and detectors, and that of a search
+    place_sigma_m: float = 6.0  # each axis: 4 m of the map, 3 m of the pose, some metres of a warp
+    # Largest common shift of neighbouring nodes, and its correlation length: after a first assignment the gate moves
+    # with the neighbours. This tolerates warps of 15 m rms with waves of 60 m and more.
     warp_m: float = 20.0
     stretch_m: float = 35.0
-    wander: float = 0.05
+    wander: float = 0.05  # probability that the place, an arm or the area of a right match is an outlier
     arm_sigma_deg: float = 15.0
-    area_sigma: float = 0.2
-    area_spread: float = 0.8
-    degrees: tuple[float, float, float] = (0.4, -1.2, -2.5)
+    area_sigma: float = 0.2  # of the logarithm of an area
+    area_spread: float = 0.8  # standard deviation of the logarithm of areas of different houses
+    degrees: tuple[float, float, float] = (0.4, -1.2, -2.5)  # that are equal, differ by one, and by more
+    # Standard deviation of the relative place of two neighbours: a constant, and a part of their distance. A warp of
+    # 10 m rms with waves of 90 m strains by 0.4, a heading error of 3 degrees by 0.05.
     edge_sigma_m: float = 2.0
     edge_strain: float = 0.12
-    edge_weight: float = 0.25
-    link: float = 0.6
-    false_link: float = -1.5
-    lost_link: float = -0.7
+    edge_weight: float = 0.25  # of a pair of neighbours: a node has about six, which share its place
+    link: float = 0.6  # a way between two nodes on both sides
+    false_link: float = -1.5  # in the view alone
+    lost_link: float = -0.7  # on the map alone
 
 
 def by_degree(seen: Ints, mapped: Ints, rules: GraphRules) -> Floats:
-    """Return the ratios of degrees; 0 where either is unknown, shape (P,).
-
-    Examples
-    --------
-    >>> by_degree(np.array([3, 3, 0]), np.array([3, 4, 3]), GraphRules()).tolist()
-    [0.4, -1.2, 0.0]
-    """
+    """Return the ratios of degrees; 0 where either is unknown, shape (P,)."""
     off = np.minimum(np.abs(seen - mapped), len(rules.degrees) - 1)
     return np.where((seen > 0) & (mapped > 0), np.array(rules.degrees)[off], 0.0)
 
 
 def by_area(seen_m2: Floats, mapped_m2: Floats, rules: GraphRules) -> Floats:
-    """Return the ratios of equal against unrelated areas; 0 where there are none, shape (P,).
-
-    Examples
-    --------
-    >>> by_area(np.array([100.0, 100.0, np.nan]), np.array([100.0, 300.0, 50.0]), GraphRules()).round(1).tolist()
-    [1.7, -3.0, 0.0]
-    """
+    """Return the ratios of equal against unrelated areas; 0 where there are none, shape (P,)."""
     off = np.log(seen_m2 / mapped_m2)
     spread = 2**0.5 * rules.area_spread
     right = np.exp(-(off**2) / (2 * rules.area_sigma**2)) / rules.area_sigma
@@ -95,13 +61,7 @@ def by_area(seen_m2: Floats, mapped_m2: Floats, rules: GraphRules) -> Floats:
 
 
 def by_arms(seen_deg: Floats, mapped_deg: Floats, rules: GraphRules) -> Floats:
-    """Return the ratios of seen arms and the nearest mapped ones; 0 where either side has none, shape (P,).
-
-    Examples
-    --------
-    >>> by_arms(np.array([[10.0], [90.0]]), np.array([[0.0, 180.0]] * 2), GraphRules()).round(1).tolist()
-    [1.3, -3.0]
-    """
+    """Return the ratios of seen arms and the nearest mapped ones; 0 where either side has none, shape (P,)."""
     off_deg = np.abs(wrap_deg(seen_deg[:, :, None] - mapped_deg[:, None, :]))
     count = np.isfinite(mapped_deg).sum(axis=1, keepdims=True)
     nearest = np.where(np.isfinite(off_deg), off_deg, np.inf).min(axis=2, initial=np.inf)
@@ -123,20 +83,11 @@ _LEAST_MATCHED: Final = 3  # nodes needed to estimate a local shift
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphScore:
-    """Graph score of one pose, and its counts.
+    """Graph score of one pose, nats, and its counts; all 0 without evidence.
 
-    Parameters
-    ----------
-    score : float
-        Log-likelihood ratio, nats; 0 without evidence.
-    matched, unmatched_seen, unmatched_mapped : int
-        Matched nodes; nodes of the view without a match on known map; visible nodes of the map without a match.
-    agreeing, contradicting : int
-        Edges between matched nodes that agree on both sides, and that contradict.
-    consistency : float
-        Share of agreeing nodes and edges among all judged ones, 0..1; 0 without any.
-    rms_m : float
-        Root mean square offset of matched nodes; 0 without any.
+    Nodes are `matched`; unmatched in the view, on known map; or visible on the map and unmatched. Edges between matched
+    nodes agree on both sides or contradict. `consistency` is the share of agreeing nodes and edges among all judged
+    ones, `rms_m` the root mean square offset of matched nodes.
     """
 
     score: float = 0.0
@@ -149,26 +100,8 @@ class GraphScore:
     rms_m: float = 0.0
 
 
-def verify(
-    seen: ObservedGraph,
-    mapped: MappedGraph,
-    poses: Sequence[Pose],
-) -> list[GraphScore]:
+def verify(seen: ObservedGraph, mapped: MappedGraph, poses: Sequence[Pose]) -> list[GraphScore]:
     """Return the score of Eq. 9 of each pose, with its best correspondences.
-
-    Parameters
-    ----------
-    seen : ObservedGraph
-        The view.
-    mapped : MappedGraph
-        The map.
-    poses : sequence of Pose
-        Hypotheses.
-
-    Returns
-    -------
-    list of GraphScore
-        One for each pose.
 
     Examples
     --------
@@ -198,8 +131,8 @@ def verify(
 
 def _pull(places_m: Floats, stretch_m: float) -> Floats:
     """Return the influence of each node on the shift of others, shape (N, N), 0 on the diagonal."""
-    apart_2 = ((places_m[:, None] - places_m[None]) ** 2).sum(axis=2)
-    pull = np.exp(-apart_2 / (2 * stretch_m**2))
+    distance_2 = ((places_m[:, None] - places_m[None]) ** 2).sum(axis=2)
+    pull = np.exp(-distance_2 / (2 * stretch_m**2))
     np.fill_diagonal(pull, 0.0)
     return np.asarray(pull)
 
@@ -294,8 +227,8 @@ class _Judge:
         kind = ours.kind[row]
         pairs = _Pairs(seen=row, mapped=col, score=np.zeros(len(row)))
         sigma_m = np.hypot(rules.place_sigma_m, _SPREAD_M[kind])
-        apart_2 = (self._offsets_m(stage, pairs) ** 2).sum(axis=1)
-        dense = np.exp(-apart_2 / (2 * sigma_m**2)) / (2 * np.pi * sigma_m**2)
+        off_2 = (self._offsets_m(stage, pairs) ** 2).sum(axis=1)
+        dense = np.exp(-off_2 / (2 * sigma_m**2)) / (2 * np.pi * sigma_m**2)
         flat = 1 / (np.pi * gate_m[row] ** 2)
         place = np.log((1 - rules.wander) * dense + rules.wander * flat) - np.log(self.mapped.density_per_m2[kind])
         score = np.log(_HIT[kind]) + place
@@ -345,9 +278,9 @@ class _Judge:
         length_m = np.hypot(*(stage.places_m[near[:, 0]] - stage.places_m[near[:, 1]]).T)
         spread_2 = (_SPREAD_M[self.seen.nodes.kind[near]] ** 2).sum(axis=1)
         sigma_2 = rules.edge_sigma_m**2 + (rules.edge_strain * length_m) ** 2 + spread_2
-        apart_2 = ((off_m[ends[:, 0]] - off_m[ends[:, 1]]) ** 2).sum(axis=1)
+        strain_2 = ((off_m[ends[:, 0]] - off_m[ends[:, 1]]) ** 2).sum(axis=1)
         chance_2 = 2 * rules.place_sigma_m**2 + spread_2  # of two independent offsets
-        ratio = np.log(chance_2 / sigma_2) - apart_2 / 2 * (1 / sigma_2 - 1 / chance_2)
+        ratio = np.log(chance_2 / sigma_2) - strain_2 / 2 * (1 / sigma_2 - 1 / chance_2)
         ratio = np.where(sigma_2 < chance_2, np.maximum(ratio, np.log(rules.wander)), 0.0)
         return np.asarray(rules.edge_weight * ratio)
 
@@ -377,6 +310,5 @@ class _Judge:
 
 
 def _passes(links: dict[int, set[int]], one: int, two: int, *, matched: dict[int, int]) -> bool:
-    """Tell if a way leads from one node to another past an unmatched one."""
-    between = links.get(one, _NONE) & links.get(two, _NONE)
-    return any(node not in matched for node in between)
+    """Return whether a way leads from one node to another past an unmatched one."""
+    return any(node not in matched for node in links.get(one, _NONE) & links.get(two, _NONE))

@@ -20,20 +20,11 @@ APART_M: Final = 25.0  # the widest tolerance of the benchmark: nearer modes are
 RIVAL_SHARE: Final = 0.05  # least mass of a rival, relative to the chosen mode
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """A diagnostic of an answer.
+    """A diagnostic of an answer: key, unit ("1" where there is none) and meaning.
 
-    Parameters
-    ----------
-    name : str
-        Key in the diagnostics of an answer.
-    unit : str
-        As in "m", "nat"; "1" where there is none.
-    meaning : str
-        Description in one line.
-    is_wide : bool
-        It spans orders of magnitude, so models use its inverse hyperbolic sine.
+    `is_wide` ones span orders of magnitude, so models use their inverse hyperbolic sine.
     """
 
     name: str
@@ -44,62 +35,54 @@ class Diagnostic:
 
 EVIDENCE: Final = (
     Diagnostic(
-        name="margin_nats",
-        unit="nat",
-        meaning="score of the chosen mode less that of the best one outside the suppression radius of 25 m, or less "
+        "margin_nats",
+        "nat",
+        "score of the chosen mode less that of the best one outside the suppression radius of 25 m, or less "
         "that of none being right where there is no such mode",
         is_wide=True,
     ),
+    Diagnostic("posterior_entropy_nats", "nat", "entropy of the posterior over the modes and none of them being right"),
     Diagnostic(
-        name="posterior_entropy_nats",
-        unit="nat",
-        meaning="entropy of the posterior over the modes and none of them being right",
-    ),
-    Diagnostic(
-        name="modes_above",
-        unit="1",
-        meaning="how many modes there are: the chosen one, and those outside the suppression radius with at least 5 % "
+        "modes_above",
+        "1",
+        "how many modes there are: the chosen one, and those outside the suppression radius with at least 5 % "
         "of its posterior mass",
     ),
     Diagnostic(
-        name="spread_m",
-        unit="m",
-        meaning="root mean square distance of the modes from their mean place, weighted by posterior mass",
+        "spread_m",
+        "m",
+        "root mean square distance of the modes from their mean place, weighted by posterior mass",
         is_wide=True,
     ),
     Diagnostic(
-        name="null_z",
-        unit="1",
-        meaning="how far the best coarse score stands above those of all places, in their standard deviations",
+        "null_z",
+        "1",
+        "how far the best coarse score stands above those of all places, in their standard deviations",
     ),
     Diagnostic(
-        name="class_agreement",
-        unit="1",
-        meaning="of all that classes say about chosen mode against rival (or against nothing, without a rival), the "
+        "class_agreement",
+        "1",
+        "of all that classes say about chosen mode against rival (or against nothing, without a rival), the "
         "share that speaks for the chosen one",
     ),
     Diagnostic(
-        name="graph_consistency",
-        unit="1",
-        meaning="share of the nodes and edges seen that find their like in the map's graph at the chosen mode",
+        "graph_consistency",
+        "1",
+        "share of the nodes and edges seen that find their like in the map's graph at the chosen mode",
     ),
+    Diagnostic("unknown_share", "1", "share of the view that is unknown; an answer of which all is, is none"),
     Diagnostic(
-        name="unknown_share", unit="1", meaning="share of the view that is unknown; an answer of which all is, is none"
-    ),
-    Diagnostic(
-        name="information_nats",
-        unit="nat",
-        meaning="what the known cells can tell: cells by class, times mutual information with a map of that age, times "
-        "the class's exponent",
+        "information_nats",
+        "nat",
+        "what the known cells can tell: cells by class, times mutual information with a map of that age, "
+        "times the class's exponent",
         is_wide=True,
     ),
+    Diagnostic("map_age_years", "yr", "from the date of the map to that of the view; 0 for a younger map"),
     Diagnostic(
-        name="map_age_years", unit="yr", meaning="from the date of the map to that of the view; 0 for a younger map"
-    ),
-    Diagnostic(
-        name="vio_mahalanobis",
-        unit="1",
-        meaning="Mahalanobis norm of the step from the last fix against odometry; of single views there is none",
+        "vio_mahalanobis",
+        "1",
+        "Mahalanobis norm of the step from the last fix against odometry; of single views there is none",
         is_wide=True,
     ),
 )
@@ -113,17 +96,10 @@ _FROM_MATCHER: Final = frozenset(
 class Modes:
     """Modes of one search, the chosen one first, with scores by class.
 
-    Parameters
-    ----------
-    positions_m : ndarray of float, shape (M, 2)
-        Easting and northing.
-    by_class : ndarray of float, shape (M, C)
-        Scaled scores in nats, which sum to the score of the mode; other terms, such as the graph, count as classes.
-    none_nats : float
-        Score of no mode being right.
-    sigma_m : float
-        Standard deviation of a refined position along either axis, from the curvature of the score or measured on
-        training blocks.
+    `positions_m`, shape (M, 2), are easting and northing. `by_class`, shape (M, C), are scaled scores in nats, which
+    sum to the score of the mode; other terms, such as the graph, count as classes. `none_nats` is the score of no mode
+    being right. `sigma_m` is the standard deviation of a refined position along either axis, from the curvature of the
+    score or measured on training blocks.
 
     Raises
     ------
@@ -163,60 +139,35 @@ class Modes:
 
     @cached_property
     def scores(self) -> NDArray[np.float64]:
-        """Score of each mode, nats, shape (M,)."""
+        """Return the score of each mode, nats, shape (M,)."""
         return np.asarray(self.by_class.sum(axis=1))
 
     @cached_property
     def masses(self) -> NDArray[np.float64]:
-        """Posterior probability of each mode and, last, of none, shape (M + 1,)."""
+        """Return the posterior probability of each mode and, last, of none, shape (M + 1,)."""
         return posterior(self.scores.tolist(), null_score=self.none_nats)
 
     @cached_property
     def shares(self) -> NDArray[np.float64]:
-        """Posterior probability of each mode if one of them is right, shape (M,)."""
+        """Return the posterior probability of each mode if one of them is right, shape (M,)."""
         return np.asarray(special.softmax(self.scores))
 
     @cached_property
     def away_m(self) -> NDArray[np.float64]:
-        """Distance of each mode from the chosen one, metres, shape (M,)."""
+        """Return the distance of each mode from the chosen one, metres, shape (M,)."""
         return np.asarray(np.hypot(*(self.positions_m - self.positions_m[0]).T))
 
 
 def evidence_of(modes: Modes, *, null: Null | None = None, **given: float | None) -> dict[str, float]:
-    """Return the `EVIDENCE` of an answer that is available.
+    """Return the `EVIDENCE` of an answer that is available: finite numbers by name, in its order.
 
-    Parameters
-    ----------
-    modes : Modes
-        Of the search.
-    null : Null, optional
-        Coarse scores of all places.
-    given : float or None
-        Evidence not computed from the modes: `graph_consistency`, `unknown_share`, `information_nats`, `map_age_years`,
-        `vio_mahalanobis`. None and NaN are dropped.
-
-    Returns
-    -------
-    dict of str to float
-        Finite numbers by the names of `EVIDENCE`, in that order.
+    `null` are coarse scores of all places. `given` is evidence not computed from the modes: `graph_consistency`,
+    `unknown_share`, `information_nats`, `map_age_years`, `vio_mahalanobis`; None and NaN are dropped.
 
     Raises
     ------
     ShapeError
         If a name is unknown.
-
-    Examples
-    --------
-    >>> found = evidence_of(
-    ...     Modes(
-    ...         positions_m=np.array([[0.0, 0.0], [10.0, 0.0], [60.0, 80.0]]),
-    ...         by_class=np.array([[4.0, 1.0], [4.0, 0.5], [0.0, 2.0]]),
-    ...         sigma_m=2.0,
-    ...     ),
-    ...     unknown_share=0.25,
-    ... )
-    >>> found["margin_nats"], found["class_agreement"], found["modes_above"], found["unknown_share"]
-    (3.0, 0.8, 1.0, 0.25)
     """
     foreign = next((name for name in given if name not in _FROM_MATCHER), None)
     if foreign is not None:

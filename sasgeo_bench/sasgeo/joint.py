@@ -14,16 +14,7 @@ HALF_NODES: Final = 6.0  # a graph of so many nodes has half its weight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Blend:
-    """Weights of Eq. 11 for a graph with many nodes; single views have no odometry term (gamma).
-
-    Parameters
-    ----------
-    alpha : float
-        Weight of the raster.
-    beta : float
-        Weight of the graph.
-    eta : float
-        Weight of the contradiction.
+    """Weights of raster, graph and contradiction in Eq. 11; single views have no odometry term (gamma).
 
     Raises
     ------
@@ -48,11 +39,6 @@ def contradiction(by_class: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the sum of negative class scores of each mode, nats, shape (M,), from scores of shape (M, C).
 
     In the raster score a class that agrees can hide one that contradicts; here it cannot.
-
-    Examples
-    --------
-    >>> contradiction(np.array([[3.0, -1.0], [1.0, 1.0]])).tolist()
-    [1.0, 0.0]
     """
     return np.asarray(np.maximum(0.0, -by_class).sum(axis=1))
 
@@ -62,21 +48,9 @@ def columns(
 ) -> NDArray[np.float64]:
     """Return the terms of Eq. 11 for each mode, whose sum is the joint score: classes, graph, contradiction.
 
-    Parameters
-    ----------
-    by_class : ndarray of float, shape (M, C)
-        Scaled raster scores, nats.
-    graph : ndarray of float, shape (M,), optional
-        Scores of Eq. 9; without them the raster decides alone.
-    blend : Blend
-        Weights.
-    nodes : int
-        Number of nodes seen, which sets the weight of the graph.
-
-    Returns
-    -------
-    ndarray of float, shape (M, C) or (M, C + 2)
-        Nats.
+    `by_class`, shape (M, C), are scaled raster scores; `graph`, shape (M,), scores of Eq. 9, without which the raster
+    decides alone; `nodes` seen set the weight of the graph. The result, nats, has shape (M, C + 2), or (M, C) without a
+    graph.
 
     Examples
     --------

@@ -77,9 +77,7 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     if not lists:
         return model
     model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
-    if not switches.has_graph:
-        return model
-    return replace(model, blend=_fit_blend(lists, model.scaling))
+    return replace(model, blend=_fit_blend(lists, model.scaling)) if switches.has_graph else model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,9 +101,7 @@ def _fit_blend(lists: Sequence[_ScoredModes], scaling: NDArray[np.float64]) -> B
 
 
 def _pose(truth: Truth) -> Pose:
-    if truth.pose is None:
-        message = "a training view has a place"
-        raise AssertionError(message)
+    assert truth.pose is not None, "a training view has a place"  # noqa: S101
     return truth.pose
 
 
@@ -179,6 +175,5 @@ def _list(query: Query, pose: Pose, reader: Reader, plan: Plan) -> _ScoredModes:
     poses = [pose, *wrong]
     verified = reading.verified(poses)
     graph = None if verified is None else np.array([one.score for one in verified])
-    return _ScoredModes(
-        by_class=reading.by_class(poses), graph=graph, nodes=0 if graph is None else len(reading.observed.nodes)
-    )
+    nodes = 0 if graph is None else len(reading.observed.nodes)
+    return _ScoredModes(by_class=reading.by_class(poses), graph=graph, nodes=nodes)

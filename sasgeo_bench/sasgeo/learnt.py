@@ -30,17 +30,8 @@ def fit_scaling(
     fitted by conditional logit (McFadden 1974): the probability of the right mode among those of its search is the
     softmax of the sums. Exponents are positive, with a log-normal prior around `start`.
 
-    Parameters
-    ----------
-    choices : sequence of ndarray of float, shape (M, C) each
-        Scores by class of the modes of one search, the first of them the right one; M may differ.
-    start : float or sequence of float
-        Medians of the prior, shape (C,) or one for all.
-
-    Returns
-    -------
-    ndarray of float, shape (C,)
-        The exponents.
+    `choices` are the scores by class, shape (M, C), of the modes of each search, the right one first. The result has
+    shape (C,).
 
     Raises
     ------
@@ -69,7 +60,6 @@ def fit_scaling(
     owner = np.repeat(np.arange(len(choices)), [len(one) for one in choices])
 
     def loss(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Return the negative log posterior and its gradient."""
         exponents = np.exp(logs)
         sums = rows @ exponents
         highest = np.maximum.reduceat(sums, starts)
@@ -85,40 +75,26 @@ def fit_scaling(
 
 
 VERSION: Final = 1  # of the text
-DEFAULT_BLEND: Final = Blend()
 _DIGITS: Final = 6
+# Arrays of one class in the file, with their shapes.
+_ARRAYS: Final[Mapping[str, tuple[int, ...]]] = {
+    "likeness": (FAR + 1,),
+    "missed_share": (),
+    "temper": (),
+    "seasons": (len(SEASONS),),
+    "trust": (STRATA,),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScorerModel:
-    """Fitted numbers of each class, shape (C, ...) where an array.
+    """Fitted numbers of each class.
 
-    Parameters
-    ----------
-    classes : tuple of str
-        The classes.
-    rates : tuple of ClassRates
-        Rates of seeing, mapping and ageing.
-    likeness : ndarray of float, shape (C, FAR + 1)
-        Likeness of cells near a class on the map to cells on it.
-    missed_share : ndarray of float, shape (C,)
-        Share of `Gains.missed` for one degree of that likeness.
-    scaling : ndarray of float, shape (C,)
-        Scale of the score of each class, since neighbouring cells are not independent; `temper` in the file.
-    trust : ndarray of float, shape (C, STRATA)
-        Trust in features by edit age: see `edit_age.fit_trust`.
-    seasons : mapping of str to ndarray of float, shape (C,)
-        Visible share of a mapped class, by season.
-    blend : Blend
-        Weights of raster, graph and contradiction in the joint score.
-    views, blocks : int
-        Size of the training data; 0 for a model set by hand.
-
-    Examples
-    --------
-    >>> model = ScorerModel.by_hand(["railway", "water"])
-    >>> ScorerModel.from_text(model.to_text()) == model
-    True
+    `likeness`, shape (C, FAR + 1), is that of cells near a class on the map to cells on it; `missed_share`, shape (C,),
+    the share of `Gains.missed` for one degree of it. `scaling`, shape (C,), scales the score of each class, since
+    neighbouring cells are not independent (`temper` in the file). `trust`, shape (C, STRATA), is that in features by
+    edit age (`edit_age.fit_trust`); `seasons` the visible share of a mapped class, shape (C,), by season; `blend`
+    weighs the joint score. `views` and `blocks` are the size of the training data, 0 for a model set by hand.
     """
 
     classes: tuple[str, ...]
@@ -128,7 +104,7 @@ class ScorerModel:
     scaling: NDArray[np.float64]
     trust: NDArray[np.float64]
     seasons: Mapping[str, NDArray[np.float64]]
-    blend: Blend = DEFAULT_BLEND
+    blend: Blend = Blend()  # noqa: RUF009 - frozen
     views: int = 0
     blocks: int = 0
 
@@ -157,10 +133,7 @@ class ScorerModel:
     def of(cls, tallies: Mapping[str, Sequence[Tally]]) -> Self:
         """Fit rates, likeness and seasons; scales of evidence are fitted later, to searches with this model.
 
-        Parameters
-        ----------
-        tallies : mapping of str to sequence of Tally
-            By season; rates and likeness are fitted to views without one, "".
+        Tallies are by season; rates and likeness are fitted to views without one, "".
 
         Raises
         ------
@@ -209,13 +182,7 @@ class ScorerModel:
         )
 
     def to_text(self) -> str:
-        """Return the model as JSON, one class a line.
-
-        Examples
-        --------
-        >>> ScorerModel.by_hand(["water"]).to_text().splitlines()[0]
-        '{"version": 1, "views": 0, "blocks": 0, "blend": {"alpha": 1.0, "beta": 0.5, "eta": 0.1}, "classes": {'
-        """
+        """Return the model as JSON, one class a line."""
         rows = [
             f" {json.dumps(name)}: {json.dumps(_rounded(asdict(self.rates[at]) | self._shape(at)))}"
             for at, name in enumerate(self.classes)
@@ -243,23 +210,18 @@ class ScorerModel:
                 message = f"it is of version {stored['version']}, this program reads {VERSION}"
                 raise ConfigError(message)
             rows: dict[str, dict[str, Any]] = stored["classes"]
-            shapes = [
-                [row.pop(name) for name in ("likeness", "missed_share", "temper", "seasons", "trust")]
-                for row in rows.values()
-            ]
-            near = np.array([shape[0] for shape in shapes], dtype=np.float64).reshape(-1, FAR + 1)
-            shares, scaling = (np.array([shape[at] for shape in shapes], dtype=np.float64) for at in (1, 2))
-            seasons = np.array([shape[3] for shape in shapes], dtype=np.float64).reshape(-1, len(SEASONS))
-            trust = np.array([shape[4] for shape in shapes], dtype=np.float64).reshape(-1, STRATA)
-            _check(near, shares, scaling, seasons, trust)
+            arrays = {
+                name: np.array([row.pop(name) for row in rows.values()], dtype=np.float64).reshape(-1, *shape)
+                for name, shape in _ARRAYS.items()
+            }
+            scaling, seasons = arrays.pop("temper"), arrays.pop("seasons")
+            _check(scaling, arrays | {"a season": seasons})
             return cls(
                 classes=tuple(rows),
                 rates=tuple(ClassRates(**row) for row in rows.values()),
-                likeness=near,
-                missed_share=shares,
                 scaling=scaling,
-                trust=trust,
                 seasons=dict(zip(SEASONS, seasons.T, strict=True)),
+                **arrays,
                 blend=Blend(**stored["blend"]),
                 views=int(stored["views"]),
                 blocks=int(stored["blocks"]),
@@ -269,18 +231,12 @@ class ScorerModel:
             raise ConfigError(message) from error
 
 
-def _check(
-    near: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    scaling: NDArray[np.float64],
-    seasons: NDArray[np.float64],
-    trust: NDArray[np.float64],
-) -> None:
+def _check(scaling: NDArray[np.float64], shares: Mapping[str, NDArray[np.float64]]) -> None:
     """Raise ValueError for numbers out of range."""
     if not (np.isfinite(scaling).all() and (scaling >= 0).all()):
         message = "an exponent is negative or not finite"
         raise ValueError(message)
-    for name, values in (("likeness", near), ("missed_share", shares), ("a season", seasons), ("trust", trust)):
+    for name, values in shares.items():
         if not ((values >= 0) & (values <= 1)).all():
             message = f"{name} is not within 0..1"
             raise ValueError(message)

@@ -30,16 +30,9 @@ _ALL: Final = np.uint64((1 << SECTORS) - 1)
 
 @dataclass(frozen=True, kw_only=True)
 class JunctionPairs:
-    """Pairs of junctions of one kind, the nearest first.
+    """Pairs of junctions of one kind, the nearest first: T pairs of rows of nodes, with length and bearing.
 
-    Parameters
-    ----------
-    ends : ndarray of int64, shape (T, 2)
-        Rows of the nodes.
-    length_m, bearing_deg : ndarray of float64, shape (T,)
-        From the first to the second.
-    arms : ndarray of uint64, shape (T, 2)
-        Of either end, one bit for each of `SECTORS` with an arm, counted from that bearing.
+    `arms`, uint64 of shape (T, 2), has one bit for each of `SECTORS` with an arm, counted from that bearing.
     """
 
     ends: Ints
@@ -103,21 +96,11 @@ _APART_M: Final = 1e4  # much more than any gate
 
 @dataclass(frozen=True, kw_only=True)
 class MappedGraph:
-    """Nodes of a map as vectors and as masks show them.
+    """Nodes of a map (easting, northing) as vectors and as masks show them.
 
-    Parameters
-    ----------
-    nodes : Nodes
-        Places are easting and northing, metres.
-    tree : cKDTree
-        Of easting, northing and kind, a kind lying `_APART_M` from the next one.
-    density_per_m2 : ndarray of float64, shape (K,)
-        Mean density of nodes of a kind around one of them, for the chance of a random match; 0 for kinds that the map
-        lacks.
-    known : ndarray of bool, shape (rows, cols)
-        Cells known to the map.
-    grid : Grid
-        Its lattice.
+    `tree` holds easting, northing and kind, a kind lying `_APART_M` from the next one. `density_per_m2`, shape (K,), is
+    the mean density of nodes of a kind around one of them, for the chance of a random match; 0 for kinds that the map
+    lacks. `known`, shape (rows, cols), marks cells known to the map on `grid`.
     """
 
     nodes: Nodes
@@ -134,19 +117,7 @@ class MappedGraph:
 
     @classmethod
     def make(cls, graph: MapGraph, features: gpd.GeoDataFrame, *, known: Bools, grid: Grid) -> Self:
-        """Prepare a graph that was derived from features.
-
-        Examples
-        --------
-        >>> import shapely
-        >>> from sasgeo_bench.regions.graph import build_graph
-        >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
-        >>> house = as_features(vector_table([("building", 0, False, shapely.box(5, 5, 9, 9))]))
-        >>> grid = Grid(epsg=32632, west_m=0.0, north_m=20.0, cell_size_m=1.0, rows=20, cols=20)
-        >>> mapped = MappedGraph.make(build_graph(house), house, known=np.ones((20, 20), dtype=bool), grid=grid)
-        >>> [KINDS[kind].name for kind in mapped.nodes.kind]
-        ['building', 'building patch']
-        """
+        """Prepare a graph that was derived from features."""
         ways = features[features["class"].isin(list(LAYERS)).to_numpy()]
         parts = (nodes_of(graph, ways, "vectors"), nodes_of(graph, ways, "mask"), patches_of(features))
         nodes = Nodes.joined(parts)

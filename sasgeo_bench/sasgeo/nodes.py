@@ -85,7 +85,7 @@ _TOWARDS_DEG: Final = 45.0
 _PASSING: Final = 2
 _PLAIN_CROSSING: Final = 4  # arms of two roads that cross
 
-
+_BY_NODE: Final = ("places_m", "kind", "degree", "area_m2", "arms_deg", "feature")  # fields of `Nodes`
 _IN_A_MASK: Final = {
     "intersection": "mask intersection",
     "crossing": "mask intersection",
@@ -101,22 +101,11 @@ _IN_A_MASK: Final = {
 class Nodes:
     """Nodes and their relations.
 
-    Parameters
-    ----------
-    places_m : ndarray of float64, shape (N, 2)
-        Easting and northing of a map, (right, up) of a view.
-    kind : ndarray of int64, shape (N,)
-        Index into `KINDS`.
-    degree : ndarray of int64, shape (N,)
-        Roads that meet; 0 where none do or several junctions are one.
-    area_m2 : ndarray of float64, shape (N,)
-        Of buildings and patches; NaN elsewhere.
-    arms_deg : ndarray of float64, shape (N, MOST_ARMS)
-        Bearings of the roads that leave a junction or an end, NaN behind the last one.
-    pairs, relation : ndarray of int64, shapes (E, 2) and (E,)
-        Edges between nodes, and their index into `graph.RELATIONS`.
-    feature : ndarray of int64, shape (N,)
-        The `osm_id` of the feature of a node, -1 for several features.
+    `places_m`, shape (N, 2), are easting and northing of a map, (right, up) of a view; `kind` is an index into `KINDS`.
+    `degree` counts the roads that meet: 0 where none do or several junctions are one. `area_m2` is that of buildings
+    and patches, else NaN. `arms_deg`, shape (N, MOST_ARMS), are bearings of the roads that leave a junction or an end,
+    NaN behind the last one. `pairs`, shape (E, 2), are edges and `relation` their index into `graph.RELATIONS`.
+    `feature` is the `osm_id` of a node's feature, -1 for several.
     """
 
     places_m: Floats
@@ -147,35 +136,18 @@ class Nodes:
 
     def taken(self, keep: Bools) -> Self:
         """Return selected nodes and the edges between them."""
-        new = np.where(keep, np.cumsum(keep) - 1, -1)
-        pairs = new[self.pairs]
+        pairs = np.where(keep, np.cumsum(keep) - 1, -1)[self.pairs]
         stays = (pairs >= 0).all(axis=1)
-        return type(self)(
-            places_m=self.places_m[keep],
-            kind=self.kind[keep],
-            degree=self.degree[keep],
-            area_m2=self.area_m2[keep],
-            arms_deg=self.arms_deg[keep],
-            pairs=pairs[stays],
-            relation=self.relation[stays],
-            feature=self.feature[keep],
-        )
+        own = {name: getattr(self, name)[keep] for name in _BY_NODE}
+        return type(self)(**own, pairs=pairs[stays], relation=self.relation[stays])
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Join sets of nodes, with no edge between two sets."""
         starts = np.cumsum([0, *(len(part) for part in parts)])
         pairs = [part.pairs + start for part, start in zip(parts, starts[:-1], strict=True)]
-        return cls(
-            places_m=np.concatenate([part.places_m for part in parts]),
-            kind=np.concatenate([part.kind for part in parts]),
-            degree=np.concatenate([part.degree for part in parts]),
-            area_m2=np.concatenate([part.area_m2 for part in parts]),
-            arms_deg=np.concatenate([part.arms_deg for part in parts]),
-            pairs=np.concatenate(pairs),
-            relation=np.concatenate([part.relation for part in parts]),
-            feature=np.concatenate([part.feature for part in parts]),
-        )
+        own = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_BY_NODE, "relation")}
+        return cls(**own, pairs=np.concatenate(pairs))
 
 
 def nothing() -> Nodes:
@@ -187,7 +159,7 @@ def nothing() -> Nodes:
         degree=none,
         area_m2=np.zeros(0),
         arms_deg=np.zeros((0, MOST_ARMS)),
-        pairs=np.zeros((0, 2), dtype=np.int64),
+        pairs=none.reshape(0, 2),
         relation=none,
         feature=none,
     )
@@ -196,16 +168,8 @@ def nothing() -> Nodes:
 def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> Nodes:
     """Return the nodes of a graph as vectors or as a mask show them.
 
-    In a mask, crossing roads meet, junctions within a road's width merge, and buildings come from `patches_of`.
-
-    Parameters
-    ----------
-    graph : MapGraph
-        Derived from the features.
-    features : geopandas.GeoDataFrame
-        A feature table, for the arms of junctions.
-    drawing : {"vectors", "mask"}
-        Source of the nodes.
+    In a mask, crossing roads meet, junctions within a road's width merge, and buildings come from `patches_of`. The
+    arms of junctions come from `features`.
     """
     table = graph.nodes
     names = table["kind"].to_numpy(dtype=object)
@@ -214,17 +178,15 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
     renamed = _IN_A_MASK if drawing == "mask" else {kind.name: kind.name for kind in KINDS if kind.drawing == drawing}
     kind = np.array([INDEX[renamed[name]] if name in renamed else -1 for name in names], dtype=np.int64)
     places_m = np.asarray(shapely.get_coordinates(table.geometry.to_numpy())).reshape(-1, 2)
-    pairs = graph.edges[["source", "target"]].to_numpy(dtype=np.int64)
     code = {name: at for at, name in enumerate(RELATIONS)}
-    relation = np.array([code[name] for name in graph.edges["relation"]], dtype=np.int64)
     found = Nodes(
         places_m=places_m,
         kind=kind,
         degree=np.where(names == "crossing", _PLAIN_CROSSING, table["degree"].to_numpy(dtype=np.int64)),
         area_m2=np.where(names == "building", table["area_m2"].to_numpy(dtype=np.float64), np.nan),
         arms_deg=arms_of(features, places_m),
-        pairs=pairs,
-        relation=relation,
+        pairs=graph.edges[["source", "target"]].to_numpy(dtype=np.int64),
+        relation=np.array([code[name] for name in graph.edges["relation"]], dtype=np.int64),
         feature=table["osm_id"].to_numpy(dtype=np.int64),
     ).taken(kind >= 0)
     return _blurred(found) if drawing == "mask" else found
@@ -321,9 +283,8 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
     )
     vertex = chains.tips.T.ravel()
     away_m = np.concatenate([shapely.get_coordinates(part) for part in points]) - network.vertices[vertex]
-    table = _by_row(
-        vertex, bearing_deg(*away_m.T), len(network.vertices) + 1
-    )  # the last row: places that are no vertex
+    # The last row is for places that are no vertex.
+    table = _by_row(vertex, bearing_deg(*away_m.T), len(network.vertices) + 1)
     return np.asarray(table[network.lookup(places_m)])
 
 
@@ -350,7 +311,6 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
         area_m2: Floats = np.bincount(group, weights=shapely.area(shapes)).astype(np.float64)
         weight = shapely.area(shapes) / area_m2[group]
         middle = [np.bincount(group, weights=weight * part) for part in centroids(shapes).T]
-        some = nothing()
         count, is_one = len(area_m2), np.bincount(group) == 1
         last = np.full(count, -1)
         last[group] = features["osm_id"].to_numpy(dtype=np.int64)[chosen]
@@ -361,8 +321,8 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
                 degree=np.zeros(count, dtype=np.int64),
                 area_m2=area_m2,
                 arms_deg=np.full((count, MOST_ARMS), np.nan),
-                pairs=some.pairs,
-                relation=some.relation,
+                pairs=np.zeros((0, 2), dtype=np.int64),
+                relation=np.zeros(0, dtype=np.int64),
                 feature=np.where(is_one, last, -1),
             )
         )

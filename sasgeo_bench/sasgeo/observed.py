@@ -44,16 +44,7 @@ _FORK: Final = 3
 
 
 def lines_of_mask(evidence: Evidence) -> gpd.GeoDataFrame:
-    """Return the centre lines of `SKELETON_LAYERS` in a view as `Query.vectors`: (right, up) from its middle, metres.
-
-    Examples
-    --------
-    >>> cells = np.zeros((1, 64, 64), dtype=np.uint8)
-    >>> cells[0, 30:34] = cells[0, :30, 20:24] = 1
-    >>> view = Evidence(classes=("road_minor",), cells=cells, cell_size_m=1.0)
-    >>> len(lines_of_mask(view))  # a fork and its three arms
-    3
-    """
+    """Return the centre lines of `SKELETON_LAYERS` in a view, as `Query.vectors`."""
     rows = []
     for name, classes in SKELETON_LAYERS.items():
         layers = [evidence.layer(one) == PRESENT for one in classes if one in evidence.classes]
@@ -63,15 +54,7 @@ def lines_of_mask(evidence: Evidence) -> gpd.GeoDataFrame:
 
 
 def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.object_]:
-    """Return the centre lines of a mask in (right, up) from its middle, metres; they end at forks.
-
-    Examples
-    --------
-    >>> row = np.zeros((9, 40), dtype=bool)
-    >>> row[3:6] = True
-    >>> len(middle_lines(row, 1.0))
-    1
-    """
+    """Return the centre lines of a mask in (right, up) from its middle, metres; they end at forks."""
     closed = cv2.morphologyEx(present.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), dtype=np.uint8))
     thin = np.asarray(skeletonize(closed > 0), dtype=np.bool_)
     places_m = cell_offsets_m((present.shape[0], present.shape[1]), cell_size_m)
@@ -131,22 +114,12 @@ _FREE: Final = (INDEX["dead_end"], INDEX["mask dead_end"])
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedGraph:
-    """Nodes and relations in a view, in its own frame.
+    """Nodes and relations in a view, in its own frame: places are (right, up) from its middle, metres.
 
-    Parameters
-    ----------
-    nodes : Nodes
-        Places are (right, up) from the middle of the view, metres.
-    is_cut : ndarray of bool, shape (N,)
-        Nodes near the border of known cells, of which a part may be missing.
-    near : ndarray of int64, shape (P, 2)
-        Neighbours: pairs of the Delaunay triangulation within `NEAR_M`.
-    asked : ndarray of bool, shape (K,)
-        Kinds that are judged: a family of which nothing is seen is left to the raster score.
-    sight : ndarray of bool, shape (S, rows, cols)
-        Cells where nodes are visible, for each set of classes of a kind of node.
-    cell_size_m : float
-        Side of its cells.
+    `is_cut`, shape (N,), marks nodes near the border of known cells, of which a part may be missing; `near`, shape (P,
+    2), pairs of the Delaunay triangulation within `NEAR_M`; `asked`, shape (K,), judged kinds: a family of which
+    nothing is seen is left to the raster score; `sight`, shape (S, rows, cols), cells where nodes are visible, for each
+    set of classes of a kind of node.
     """
 
     nodes: Nodes
@@ -232,14 +205,7 @@ def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
 
 
 def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Return vectors with gaps of the detector closed: between facing ends of roads within 7 m.
-
-    Examples
-    --------
-    >>> halves = shapely.from_wkt(["LINESTRING (0 0, 47 0)", "LINESTRING (53 0, 99 0)"])
-    >>> len(bridged(vector_table([("road_minor", 0, False, half) for half in halves])))
-    3
-    """
+    """Return vectors with gaps of the detector closed: between facing ends of roads within 7 m."""
     features = as_features(vectors)
     network = make_network(features[features["class"].isin(list(LAYERS)).to_numpy()])
     free = np.flatnonzero(network.degree(ROAD) == 1)

@@ -24,22 +24,14 @@ METHODS: Final = {
 
 
 def level_name(method: str, risk: float) -> str:
-    """Return the name of the diagnostic of a protection level, metres.
-
-    Examples
-    --------
-    >>> level_name("separation", 1e-2)
-    'hpl_separation_0.01_m'
-    """
+    """Return the name of the diagnostic of a protection level, metres."""
     return f"hpl_{method}_{risk:g}_m"
 
 
 PROTECTION: Final = (
-    Diagnostic(name=SCALE, unit="m", meaning="standard deviation of the posterior about the chosen mode, longer axis"),
+    Diagnostic(SCALE, "m", "standard deviation of the posterior about the chosen mode, longer axis"),
     *(
-        Diagnostic(
-            name=level_name(method, risk), unit="m", meaning=f"protection level at a risk of {risk:g}: {meaning}"
-        )
+        Diagnostic(level_name(method, risk), "m", f"protection level at a risk of {risk:g}: {meaning}")
         for method, meaning in METHODS.items()
         for risk in RISKS
     ),
@@ -53,11 +45,6 @@ def sigmas(risk: float) -> float:
     ------
     ShapeError
         If the risk is not within (0, 1).
-
-    Examples
-    --------
-    >>> round(sigmas(1e-2), 2), round(sigmas(1e-3), 2)
-    (3.03, 3.72)
     """
     if not 0 < risk < 1:
         message = f"risk must lie in (0, 1), got {risk!r}"
@@ -70,26 +57,14 @@ def posterior_sigma_m(modes: Modes) -> float:
 
     It is taken about the chosen mode, whose error is bounded, not about the mean. The mass of no mode being right is
     ignored.
-
-    Examples
-    --------
-    >>> posterior_sigma_m(Modes(positions_m=np.zeros((1, 2)), by_class=np.array([[9.0]]), sigma_m=2.0))
-    2.0
     """
-    apart_m = modes.positions_m - modes.positions_m[0]
-    spread = (modes.shares[:, None] * apart_m).T @ apart_m
+    off_m = modes.positions_m - modes.positions_m[0]
+    spread = (modes.shares[:, None] * off_m).T @ off_m
     return float(np.sqrt(np.linalg.eigvalsh(spread)[-1].clip(0.0) + modes.sigma_m**2))
 
 
 def gauss_level(modes: Modes, risk: float) -> float:
-    """Return the protection level of the posterior as one Gaussian, metres.
-
-    Examples
-    --------
-    >>> one = Modes(positions_m=np.zeros((1, 2)), by_class=np.array([[9.0]]), sigma_m=2.0)
-    >>> round(gauss_level(one, 1e-2), 2)
-    6.07
-    """
+    """Return the protection level of the posterior as one Gaussian, metres."""
     return sigmas(risk) * posterior_sigma_m(modes)
 
 
@@ -98,12 +73,6 @@ def density_level(modes: Modes, risk: float) -> float:
 
     Half of the risk goes to modes beyond it, half to positions within a mode. It is infinite where the mass of no mode
     being right exceeds that.
-
-    Examples
-    --------
-    >>> two = Modes(positions_m=np.array([[0.0, 0.0], [50.0, 0.0]]), by_class=np.array([[9.0], [6.0]]), sigma_m=2.0)
-    >>> round(density_level(two, 1e-2), 1), density_level(two, 1e-4)
-    (56.5, inf)
     """
     order = np.argsort(modes.away_m, kind="stable")
     beyond = 1.0 - np.cumsum(modes.masses[order])
@@ -146,14 +115,8 @@ def separation_level(modes: Modes, risk: float) -> float:
 
 
 def levels_of(modes: Modes) -> dict[str, float]:
-    """Return the `PROTECTION` of an answer by name, metres, without infinite levels.
-
-    Examples
-    --------
-    >>> list(levels_of(Modes(positions_m=np.zeros((1, 2)), by_class=np.array([[9.0]]), sigma_m=2.0)))[:2]
-    ['sigma_m', 'hpl_gauss_0.01_m']
-    """
+    """Return the `PROTECTION` of an answer by name, metres, without infinite levels."""
     ways = {"separation": separation_level, "gauss": gauss_level, "density": density_level}
-    found = {level_name(method, risk): way(modes, risk) for method, way in ways.items() for risk in RISKS}
-    found = {SCALE: posterior_sigma_m(modes), **found}
+    levels = {level_name(method, risk): way(modes, risk) for method, way in ways.items() for risk in RISKS}
+    found = {SCALE: posterior_sigma_m(modes), **levels}
     return {name: value for name, value in found.items() if math.isfinite(value)}

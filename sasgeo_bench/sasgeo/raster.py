@@ -52,21 +52,8 @@ def read_field(
 ) -> Field:
     """Return a map for the search: the degree to which each cell is on a class or near it.
 
-    Parameters
-    ----------
-    region : Region
-        The map.
-    likeness : ndarray of float, shape (C, FAR + 1)
-        See `rates.likeness` and `likeness_by_hand`.
-    trust : ndarray of float, shape (C, STRATA), optional
-        Trust in features by edit age: see `edit_age.fit_trust`; 1 without it.
-    cell_size_m : float
-        Least side of a cell of the search, metres.
-
-    Returns
-    -------
-    Field
-        Its cells are a whole number of map cells a side.
+    `likeness`, shape (C, FAR + 1), is that of `rates.likeness` or `likeness_by_hand`; `trust`, shape (C, STRATA), that
+    of `edit_age.fit_trust`, 1 without it. Cells have a whole number of map cells a side, of about `cell_size_m`.
     """
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
@@ -110,13 +97,6 @@ def doubted(evidence: Evidence) -> Evidence:
     """Return a view with absent cells near a seen line as unknown: a line mapped there may be the same.
 
     This complements the distance transform of the map in `likeness_by_hand`.
-
-    Examples
-    --------
-    >>> row = np.zeros((1, 1, 12), dtype=np.uint8)
-    >>> row[0, 0, 0] = PRESENT
-    >>> doubted(Evidence(classes=("railway",), cells=row, cell_size_m=2.0)).cells[0, 0].tolist()
-    [1, 2, 2, 2, 2, 0, 0, 0, 0, 0, 0, 0]
     """
     cells = evidence.cells.copy()
     for name, layer in zip(evidence.classes, cells, strict=True):
@@ -136,16 +116,7 @@ class RasterView:
 
     @classmethod
     def of(cls, evidence: Evidence, classes: Sequence[str], gains: Gains) -> Self:
-        """Weigh the classes that a view shares with a map.
-
-        Examples
-        --------
-        >>> from sasgeo_bench.sasgeo.weights import hand_gains
-        >>> seen = Evidence(classes=("water",), cells=np.ones((1, 2, 2), dtype=np.uint8), cell_size_m=1.0)
-        >>> view = RasterView.of(seen, ["railway", "water"], hand_gains(["railway", "water"], age_years=0.0))
-        >>> view.weights.any(axis=(1, 2)).tolist()
-        [False, True]
-        """
+        """Weigh the classes that a view shares with a map."""
         shape = (len(classes), *evidence.shape)
         weights, known = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         for at, name in enumerate(classes):

@@ -30,29 +30,14 @@ _EDGE: Final = 1e-5  # least distance of probabilities from 0 and 1
 class ClassRates:
     """Rates of seeing, mapping and ageing of one class.
 
-    Parameters
-    ----------
-    hit, false_alarm : float
-        Probability that a cell is seen as the class where the class is, and where it is not.
-    missing : float
-        Probability that the class is on a cell where a map of age 0 lacks it.
-    vanish_per_year, appear_per_year : float
-        Yearly rates at which mapped cells vanish, and unmapped ones appear.
-    mapped : float
-        Share of cells on which the class is mapped.
+    `hit` and `false_alarm` are the probabilities that a cell is seen as the class where the class is, and where it is
+    not; `missing` that the class is on a cell where a map of age 0 lacks it. `vanish_per_year` and `appear_per_year`
+    are the yearly rates of mapped and unmapped cells. `mapped` is the share of cells on which the class is mapped.
 
     Raises
     ------
     ConfigError
         If a share is not within 0..1, a rate negative or not finite, or a false alarm likelier than a hit.
-
-    Examples
-    --------
-    >>> house = ClassRates(
-    ...     hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.002, mapped=0.1
-    ... )
-    >>> round(house.survival(10.0), 3)
-    0.905
     """
 
     hit: float
@@ -103,19 +88,9 @@ class Tally:
 
 
 def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]:
-    """Return the distance of each cell from its class, as the index of a ring.
+    """Return the distance of each cell from its class as the index of a ring, shape (C, rows, cols) as `layers`.
 
-    Parameters
-    ----------
-    layers : ndarray of uint8, shape (C, rows, cols)
-        PRESENT, ABSENT, or more where nothing is known.
-    cell_size_m : float
-        Side of a cell, metres.
-
-    Returns
-    -------
-    ndarray of uint8, shape (C, rows, cols)
-        0 on the class, i within `RINGS_M[i - 1]`, `FAR` beyond, `NOWHERE` where nothing is known.
+    0 on the class, i within `RINGS_M[i - 1]`, `FAR` beyond, `NOWHERE` where nothing is known.
 
     Examples
     --------
@@ -130,13 +105,7 @@ def rings(layers: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.uint8]
 
 
 def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.uint8]:
-    """Return the ring of each cell around the marked ones, shape (rows, cols).
-
-    Examples
-    --------
-    >>> ring_of(np.array([[True, False, False]]), cell_size_m=5.0).tolist()
-    [[0, 2, 3]]
-    """
+    """Return the ring of each cell around the marked ones, shape (rows, cols)."""
     if not is_there.any():
         return np.full(is_there.shape, FAR, dtype=np.uint8)
     distance = cv2.distanceTransform((~is_there).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -149,30 +118,9 @@ def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.ui
 def tally(
     classes: tuple[str, ...], seen: NDArray[np.uint8], under: NDArray[np.uint8], *, age_years: float, block: str
 ) -> Tally:
-    """Count the cells of a view against the map under it.
-
-    Parameters
-    ----------
-    classes : tuple of str
-        Bands of both.
-    seen : ndarray of uint8, shape (C, rows, cols)
-        PRESENT, ABSENT or UNKNOWN.
-    under : ndarray of uint8, shape (C, rows, cols)
-        `rings` of the map, on the lattice of the view.
-    age_years : float
-        From the map to the view.
-    block : str
-        Place of the view.
-
-    Examples
-    --------
-    >>> view = np.array([[[1, 1, 0, 2]]], dtype=np.uint8)
-    >>> tally(("water",), view, np.array([[[0, 4, 4, 0]]], dtype=np.uint8), age_years=1.0, block="a").seen.tolist()
-    [[1, 0, 0, 0, 1]]
-    """
+    """Count the cells of a view against `rings` of the map under it, both of shape (C, rows, cols)."""
 
     def count(state: int) -> NDArray[np.int64]:
-        """Count cells of one state by class and ring."""
         return np.stack(
             [
                 np.bincount(ring[view == state], minlength=NOWHERE + 1)[: FAR + 1]
@@ -188,13 +136,6 @@ def likeness(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
     In each ring it is the logarithm of the share seen present, scaled between cells on the class and far from it. This
     measures for all classes what the paper's exp(-D^2 / 2 tau^2) sets for lines. It never rises with distance.
-
-    Examples
-    --------
-    >>> seen, missed = np.array([[900, 300, 40, 20, 100]]), np.array([[100, 700, 960, 980, 9900]])
-    >>> one = Tally(classes=("building",), age_years=0.0, block="a", seen=seen * 99, missed=missed * 99)
-    >>> likeness([one]).round(1).tolist()
-    [[1.0, 0.8, 0.3, 0.2, 0.0]]
     """
     share = np.log(_seen_share(tallies))
     span = share[:, :1] - share[:, FAR:]
@@ -234,13 +175,7 @@ def _seen_share(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 
 def hand_rates(class_name: str) -> ClassRates:
-    """Return rates of a class by hand: yearly ones from the taxonomy, and a detector that is mostly right.
-
-    Examples
-    --------
-    >>> hand_rates("railway").vanish_per_year
-    0.003
-    """
+    """Return rates of a class by hand: yearly ones from the taxonomy, and a detector that is mostly right."""
     hand = load_taxonomy()[class_name].persistence
     return ClassRates(
         hit=0.85,
@@ -259,27 +194,10 @@ def fit_rates(tallies: Sequence[Tally]) -> dict[str, ClassRates]:
     views separate hits and false alarms from ageing. Cells are not independent: `_CELLS_PER_WITNESS` of them count as
     one against a weak prior around `hand_rates`, which decides alone without data.
 
-    Parameters
-    ----------
-    tallies : sequence of Tally
-        Of training places; all with the same classes.
-
-    Returns
-    -------
-    dict of str to ClassRates
-        By class.
-
     Raises
     ------
     ConfigError
         If there is no tally, or their classes differ.
-
-    Examples
-    --------
-    >>> seen, missed = np.array([[90_000, 0, 0, 0, 100]]), np.array([[10_000, 0, 0, 0, 900_000]])
-    >>> young = Tally(classes=("building",), age_years=0.0, block="a", seen=seen, missed=missed)
-    >>> round(fit_rates([young])["building"].hit, 2)
-    0.9
     """
     if not tallies:
         message = "no views to fit rates to: the train part is empty; choose another split, or weights by hand"
@@ -301,7 +219,6 @@ def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[n
     start = _to_vector(hand)
 
     def loss(vector: NDArray[np.float64]) -> float:
-        """Return the negative log posterior."""
         mapped, empty = _chances(vector, ages_years)
         chances = np.stack((mapped, 1 - mapped, empty, 1 - empty), axis=1)
         losses = np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS
@@ -335,10 +252,5 @@ def _to_rates(vector: NDArray[np.float64], *, mapped: float) -> ClassRates:
     hit, ratio, missing = special.expit(vector[:3]).tolist()
     vanish, appear = np.exp(vector[3:]).tolist()
     return ClassRates(
-        hit=hit,
-        false_alarm=hit * ratio,
-        missing=missing,
-        vanish_per_year=vanish,
-        appear_per_year=appear,
-        mapped=mapped,
+        hit=hit, false_alarm=hit * ratio, missing=missing, vanish_per_year=vanish, appear_per_year=appear, mapped=mapped
     )

@@ -53,28 +53,11 @@ def proposals(
     scales: tuple[float, float] = (1.0, 1.0),
     prior: Prior | None = None,
 ) -> list[Proposal]:
-    """Propose poses from pairs of junctions whose arms agree.
+    """Propose up to `count` poses from pairs of junctions whose arms agree, the most votes first.
 
     Each pair of the view is looked up among those of the map by length, within the scales, and directions of arms. Each
-    hit votes for one pose, in closed form, with a weight that falls with the number of hits for that length.
-
-    Parameters
-    ----------
-    seen : ObservedGraph
-        The view.
-    mapped : MappedGraph
-        The map.
-    count : int
-        Poses at most.
-    scales : tuple of float
-        Least and greatest scale of the view.
-    prior : Prior, optional
-        Poses outside of its disc, or beyond three sigma of its heading, are dropped.
-
-    Returns
-    -------
-    list of Proposal
-        The most votes first; empty where the view shows no two junctions.
+    hit votes for one pose, in closed form, with a weight that falls with the number of hits for that length. Poses
+    outside the prior's disc, or beyond three sigma of its heading, are dropped.
 
     Raises
     ------
@@ -202,27 +185,27 @@ def age_years(query: Query, region: Region) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Reader:
-    """A map prepared for one ablation; `learnt` is the model in the order of its classes."""
+    """A map prepared for one ablation; `model` is the model in the order of its classes."""
 
     region: Region
-    learnt: ScorerModel
+    model: ScorerModel
     switches: Switches
     field: Field
     graph: MappedGraph | None
     rarity: Rarity | None
 
     @classmethod
-    def of(cls, region: Region, learnt: ScorerModel, switches: Switches) -> Self:
+    def of(cls, region: Region, model: ScorerModel, switches: Switches) -> Self:
         """Prepare a map."""
-        learnt = learnt.of_classes(region.classes)
-        near = learnt.likeness if switches.learns else likeness_by_hand(region.classes)
+        model = model.of_classes(region.classes)
+        near = model.likeness if switches.learns else likeness_by_hand(region.classes)
         cell_m = region.grid.cell_size_m
         is_rare = switches.is_distinctive
         return cls(
             region=region,
-            learnt=learnt,
+            model=model,
             switches=switches,
-            field=read_field(region, near, trust=learnt.trust if switches.is_stamped else None),
+            field=read_field(region, near, trust=model.trust if switches.is_stamped else None),
             graph=MappedGraph.of(region) if switches.has_graph else None,
             rarity=Rarity.of(region.layers, region.classes, cell_size_m=cell_m) if is_rare else None,
         )
@@ -241,14 +224,14 @@ class Reading:
 
     @cached_property
     def age_years(self) -> float:
-        """Age of the map."""
+        """Return the age of the map."""
         return age_years(self.query, self.reader.region)
 
     @cached_property
     def view(self) -> RasterView:
         """Return the view weighed by gains per square metre, so that scales of evidence hold for any cell size."""
         reader, seen = self.reader, self.reader.switches.seen(self.query.evidence)
-        gains = reader.switches.gains(reader.learnt, age_years=self.age_years, season=self.query.season)
+        gains = reader.switches.gains(reader.model, age_years=self.age_years, season=self.query.season)
         view = RasterView.of(seen, reader.region.classes, gains).times(np.float32(seen.cell_size_m**2))
         if reader.rarity is None:
             return view
@@ -257,7 +240,7 @@ class Reading:
     @cached_property
     def template(self) -> Template:
         """Return the template of the search."""
-        return self.view.scaled(self.reader.learnt.scaling).template()
+        return self.view.scaled(self.reader.model.scaling).template()
 
     @cached_property
     def observed(self) -> ObservedGraph:
@@ -283,10 +266,10 @@ class Reading:
 
     def terms(self, poses: Sequence[Pose], verified: Sequence[GraphScore] | None) -> NDArray[np.float64]:
         """Return terms of Eq. 11 of each pose: see `joint.columns`."""
-        scaled = self.by_class(poses) * self.reader.learnt.scaling
+        scaled = self.by_class(poses) * self.reader.model.scaling
         graph = None if verified is None else np.array([one.score for one in verified])
         nodes = 0 if graph is None else len(self.observed.nodes)
-        return columns(scaled, graph, self.reader.learnt.blend, nodes=nodes)
+        return columns(scaled, graph, self.reader.model.blend, nodes=nodes)
 
     def sigma_m(self, pose: Pose) -> float:
         """Return the standard deviation of a refined position from the curvature of the raster score, metres."""
@@ -295,16 +278,16 @@ class Reading:
             replace(pose, easting_m=pose.easting_m + east_m, northing_m=pose.northing_m + north_m)
             for east_m, north_m in steps
         ]
-        here, east, west, north, south = (self.by_class(poses) * self.reader.learnt.scaling).sum(axis=1).tolist()
+        here, east, west, north, south = (self.by_class(poses) * self.reader.model.scaling).sum(axis=1).tolist()
         bend = min(2 * here - east - west, 2 * here - north - south) / _STEP_M**2
         return float(np.clip(1 / math.sqrt(bend), LEAST_SIGMA_M, MOST_SIGMA_M)) if bend > 0 else MOST_SIGMA_M
 
     @cached_property
     def information_nats(self) -> float:
         """Return the information in known cells: cells by class, times mutual information and scale of evidence."""
-        learnt, seen = self.reader.learnt, self.query.evidence
+        model, seen = self.reader.model, self.query.evidence
         known = {name: float((layer <= PRESENT).sum()) for name, layer in zip(seen.classes, seen.cells, strict=True)}
         return sum(
             known.get(name, 0.0) * information(rates, age_years=self.age_years) * float(scaling)
-            for name, rates, scaling in zip(learnt.classes, learnt.rates, learnt.scaling, strict=True)
+            for name, rates, scaling in zip(model.classes, model.rates, model.scaling, strict=True)
         )

@@ -3,9 +3,9 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyp
 from sasgeo_bench.matching.rejector import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.conformal import upper_rate
-from sasgeo_bench.sasgeo.integrity import APART_M, EVIDENCE
+from sasgeo_bench.sasgeo.integrity import APART_M, EVIDENCE, Diagnostic
 
 Rows = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ _SURE: Final = 1e-6  # least distance of a confidence from 0 and 1
 
 
 def is_none(prediction: Prediction) -> bool:
-    """Tell if an answer has no candidate, or its view was wholly unknown."""
+    """Return whether an answer has no candidate, or its view was wholly unknown."""
     return not prediction.candidates or 1.0 <= prediction.diagnostics.get("unknown_share", 0.0) < math.inf
 
 
@@ -35,24 +35,14 @@ def lead(prediction: Prediction) -> float:
     """Return the score of the first candidate less that of the best one outside the suppression radius.
 
     Without one outside, less that of the last candidate: a rival that was not returned scores no better.
-
-    Examples
-    --------
-    >>> from sasgeo_bench.geometry.pose import Pose
-    >>> places = [Pose(easting_m=x, northing_m=0.0, yaw_deg=0.0) for x in (0.0, 10.0, 40.0)]
-    >>> lead(Prediction(query_id="a", candidates=tuple(zip(places, (5.0, 4.0, 2.0)))))
-    3.0
     """
     (first, best), *others = prediction.candidates
-    rival = next(
-        (
-            score
-            for pose, score in others
-            if math.hypot(pose.easting_m - first.easting_m, pose.northing_m - first.northing_m) >= APART_M
-        ),
-        prediction.candidates[-1][1],
+    away = (
+        score
+        for pose, score in others
+        if math.hypot(pose.easting_m - first.easting_m, pose.northing_m - first.northing_m) >= APART_M
     )
-    return _clipped(best) - _clipped(rival)
+    return _clipped(best) - _clipped(next(away, prediction.candidates[-1][1]))
 
 
 def _clipped(value: float) -> float:
@@ -61,19 +51,24 @@ def _clipped(value: float) -> float:
 
 def features(answers: Sequence[Prediction]) -> Rows:
     """Return features of answers, shape (N, 2 + evidence): lead, confidence, then `EVIDENCE`; NaN where missing."""
-    return np.array([_row(item) for item in answers], dtype=np.float64).reshape(-1, 2 + len(EVIDENCE))
-
-
-def _row(answer: Prediction) -> list[float]:
-    given = [answer.diagnostics.get(item.name, math.nan) for item in EVIDENCE]
-    scaled = [
-        math.asinh(_clipped(value)) if item.is_wide else _clipped(value)
-        for item, value in zip(EVIDENCE, given, strict=True)
+    rows = [
+        [math.asinh(lead(item)), _logit(item.confidence), *(_evidence(item, one) for one in EVIDENCE)]
+        for item in answers
     ]
-    gaps = [math.nan if not math.isfinite(raw) else value for raw, value in zip(given, scaled, strict=True)]
-    sure = math.nan if answer.confidence is None else min(max(answer.confidence, _SURE), 1.0 - _SURE)
-    is_given = answer.confidence is not None and math.isfinite(answer.confidence)
-    return [math.asinh(lead(answer)), float(special.logit(sure)) if is_given else math.nan, *gaps]
+    return np.array(rows, dtype=np.float64).reshape(-1, 2 + len(EVIDENCE))
+
+
+def _logit(confidence: float | None) -> float:
+    if confidence is None or not math.isfinite(confidence):
+        return math.nan
+    return float(special.logit(min(max(confidence, _SURE), 1.0 - _SURE)))
+
+
+def _evidence(answer: Prediction, item: Diagnostic) -> float:
+    value = answer.diagnostics.get(item.name, math.nan)
+    if not math.isfinite(value):
+        return math.nan
+    return math.asinh(_clipped(value)) if item.is_wide else _clipped(value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,12 +112,8 @@ _FOLDS: Final = 4
 _PER_TREE: Final = 500  # answers of one tree at most: more cost time and gain nothing at this depth
 
 
-class Model(Protocol):
-    """Model from rows of features without gaps to log-odds of a false fix."""
-
-    def log_odds(self, rows: Rows) -> NDArray[np.float64]:
-        """Return log-odds, shape (N,), of rows of shape (N, F)."""
-        ...
+# From rows of features without gaps, shape (N, F), to log-odds of a false fix, shape (N,).
+LogOdds = Callable[[Rows], NDArray[np.float64]]
 
 
 class _Fitted(ABC):
@@ -135,7 +126,7 @@ class _Fitted(ABC):
         self._rule: _FittedModel | Counted | None = None
 
     @abstractmethod
-    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
+    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> LogOdds:
         """Fit the model."""
 
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
@@ -146,7 +137,7 @@ class _Fitted(ABC):
         false = int(truth.sum())
         self.remark = ""
         if min(false, len(truth) - false) < FEW:
-            self._rule = Counted.of(np.array([lead(item) for item in answers]), truth)
+            self._rule = Counted(margins=np.sort([lead(item) for item in answers]), false=false)
             self.remark = (
                 f"{false} of {len(truth)} calibration answers are false, a fit needs {FEW} of each kind: "
                 "ranked by margin, with the bounds that the counts support"
@@ -154,7 +145,7 @@ class _Fitted(ABC):
         else:
             raw = features(answers)
             frame = Frame.of(raw)
-            self._rule = _FittedModel(frame=frame, model=self.learn(frame.filled(raw), truth), answers=len(truth))
+            self._rule = _FittedModel(frame=frame, log_odds=self.learn(frame.filled(raw), truth), answers=len(truth))
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
         """Return the probability of a false fix, shape (N,); 1 where there is no answer."""
@@ -194,9 +185,10 @@ class SasgeoLogistic(_Fitted):
         limits=f"Linear in its features; {_LIMITS}",
     )
 
-    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
+    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> LogOdds:
         """Fit the weights."""
-        return _Logistic.of(rows, is_false)
+        fitted: LogOdds = _logistic(rows, is_false).decision_function
+        return fitted
 
 
 class SasgeoBoosted(_Fitted):
@@ -216,9 +208,19 @@ class SasgeoBoosted(_Fitted):
         limits=f"Parts are drawn over answers, not over blocks; {_LIMITS}",
     )
 
-    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> Model:
-        """Fit the trees and the line."""
-        return _Boosted.of(rows, is_false)
+    def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> LogOdds:
+        """Fit each tree to three of four parts, and the line that recalibrates them to the parts left out."""
+        fold = np.empty(len(rows), dtype=np.int64)
+        for kind in (False, True):  # stratified by kind
+            at = np.flatnonzero(is_false == kind)
+            fold[at] = np.arange(len(at)) % _FOLDS
+        trees = [_trees(rows[fold != part], is_false[fold != part]) for part in range(_FOLDS)]
+        unseen = np.empty(len(rows))
+        for part, tree in enumerate(trees):
+            unseen[fold == part] = tree.decision_function(rows[fold == part])
+        line = _logistic(unseen[:, None], is_false)
+        slope, shift = float(line.coef_[0, 0]), float(line.intercept_[0])
+        return lambda new: np.asarray(slope * np.mean([tree.decision_function(new) for tree in trees], axis=0) + shift)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,12 +228,12 @@ class _FittedModel:
     """A frame of features and the model fitted in it."""
 
     frame: Frame
-    model: Model
+    log_odds: LogOdds
     answers: int
 
     def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
         """Return the probability of a false fix, shape (N,)."""
-        chance = special.expit(self.model.log_odds(self.frame.filled(features(answers))))
+        chance = special.expit(self.log_odds(self.frame.filled(features(answers))))
         return np.asarray((self.answers * chance + 1.0) / (self.answers + 2.0))
 
 
@@ -247,18 +249,6 @@ class Counted:
 
     margins: NDArray[np.float64]
     false: int
-
-    @classmethod
-    def of(cls, margins: NDArray[np.float64], is_false: NDArray[np.bool_]) -> Self:
-        """Sort margins and count false answers.
-
-        Examples
-        --------
-        >>> clean = Counted.of(np.arange(300.0), np.zeros(300, dtype=bool))
-        >>> clean.chance(np.array([1e9, 299.0, -1.0])).round(3).tolist()
-        [0.01, 0.01, 1.0]
-        """
-        return cls(margins=np.sort(margins), false=int(is_false.sum()))
 
     def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
         """Return the probability of a false fix, shape (N,)."""
@@ -277,49 +267,8 @@ class Counted:
         return np.array([upper_rate(min(self.false, below), below) for below in passed.tolist()])
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Logistic:
-    """Logistic regression."""
-
-    weights: LogisticRegression
-
-    @classmethod
-    def of(cls, rows: Rows, is_false: NDArray[np.bool_]) -> Self:
-        """Fit the weights."""
-        weights = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000)
-        return cls(weights=weights.fit(rows, is_false))
-
-    def log_odds(self, rows: Rows) -> NDArray[np.float64]:
-        """Return log-odds of a false fix, shape (N,)."""
-        return np.asarray(self.weights.decision_function(rows), dtype=np.float64)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Boosted:
-    """Trees fitted to different parts, and the line that recalibrates them."""
-
-    trees: tuple[GradientBoostingClassifier, ...]
-    slope: float
-    shift: float
-
-    @classmethod
-    def of(cls, rows: Rows, is_false: NDArray[np.bool_]) -> Self:
-        """Fit each tree to three of four parts, and the line to the parts left out."""
-        fold = np.empty(len(rows), dtype=np.int64)
-        for kind in (False, True):  # stratified by kind
-            at = np.flatnonzero(is_false == kind)
-            fold[at] = np.arange(len(at)) % _FOLDS
-        trees = tuple(_trees(rows[fold != part], is_false[fold != part]) for part in range(_FOLDS))
-        unseen = np.empty(len(rows))
-        for part, tree in enumerate(trees):
-            unseen[fold == part] = tree.decision_function(rows[fold == part])
-        line = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000).fit(unseen[:, None], is_false)
-        return cls(trees=trees, slope=float(line.coef_[0, 0]), shift=float(line.intercept_[0]))
-
-    def log_odds(self, rows: Rows) -> NDArray[np.float64]:
-        """Return log-odds of a false fix, shape (N,)."""
-        odds = np.mean([tree.decision_function(rows) for tree in self.trees], axis=0)
-        return np.asarray(self.slope * odds + self.shift, dtype=np.float64)
+def _logistic(rows: Rows, is_false: NDArray[np.bool_]) -> LogisticRegression:
+    return LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000).fit(rows, is_false)
 
 
 def _trees(rows: Rows, is_false: NDArray[np.bool_]) -> GradientBoostingClassifier:

@@ -32,33 +32,13 @@ _HAND_WITNESSES: Final = 20.0  # weight of a factor by hand
 
 
 def by_hand(season: str, classes: Sequence[str]) -> NDArray[np.float64]:
-    """Return the factors of a season set by hand, shape (C,); 1 for an unknown season.
-
-    Examples
-    --------
-    >>> by_hand("snow", ["building", "path_track"]).tolist(), by_hand("", ["water"]).tolist()
-    ([1.0, 0.3], [1.0])
-    """
+    """Return the factors of a season set by hand, shape (C,); 1 for an unknown season."""
     factors = HAND.get(season, {})
     return np.array([factors.get(name, 1.0) for name in classes], dtype=np.float64)
 
 
 def fit_season(season: str, tallies: Sequence[Tally], rates: Sequence[ClassRates]) -> NDArray[np.float64]:
     """Fit the factors of one season: mapped cells that were seen, over those expected without a season.
-
-    Parameters
-    ----------
-    season : str
-        Of `SEASONS`.
-    tallies : sequence of Tally
-        Views of that season; all of the same classes.
-    rates : sequence of ClassRates
-        Rates of these classes, fitted to views without a season.
-
-    Returns
-    -------
-    ndarray of float, shape (C,)
-        0..1; drawn to the factors by hand where few cells were seen.
 
     Examples
     --------

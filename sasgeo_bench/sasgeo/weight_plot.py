@@ -51,26 +51,14 @@ class WeightSheet:
 
 
 def top_of(weights: Sequence[NDArray[np.float32]]) -> float:
-    """Return a common end of the colours of several maps: a high percentile of all positive weights.
-
-    Examples
-    --------
-    >>> top_of([np.array([[0.0, 1.0, np.nan]], dtype=np.float32)])
-    1.0
-    """
+    """Return a common end of the colours of several maps: a high percentile of all positive weights."""
     drawn = [one[one > 0] for one in weights]
     found = np.concatenate(drawn) if drawn else np.zeros(0)
     return float(np.percentile(found, _TOP_PERCENTILE)) if len(found) else 1.0
 
 
 def shrunk(layers: NDArray[np.uint8], *, most_cells: int = _MOST_CELLS) -> NDArray[np.uint8]:
-    """Return layers, shape (C, rows, cols), of limited size: a class is present where any cell of a square has it.
-
-    Examples
-    --------
-    >>> shrunk(np.array([[[0, 1, 0, 0]]], dtype=np.uint8), most_cells=2).tolist()
-    [[[1, 0]]]
-    """
+    """Return layers, shape (C, rows, cols), of limited size: a class is present where any cell of a square has it."""
     factor = _factor(layers.shape[1:], most_cells)
     known = [np.where(layer == PRESENT, 2, np.where(layer > PRESENT, 0, 1)).astype(np.uint8) for layer in layers]
     most = np.stack([_blocks(layer, factor).max(axis=(1, 3)) for layer in known])

@@ -6,7 +6,7 @@ ratios, which tend to 0 as a class loses its information.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Final, Self
 
 import numpy as np
@@ -34,61 +34,25 @@ class Gains:
 
     def only(self, at: int) -> Self:
         """Return the gains of one class."""
-        return type(self)(
-            agree=self.agree[at : at + 1],
-            extra=self.extra[at : at + 1],
-            missed=self.missed[at : at + 1],
-            quiet=self.quiet[at : at + 1],
-        )
-
-    def scaled(self, weights: NDArray[np.float64]) -> Self:
-        """Return the gains times a weight for each class."""
-        parts = (self.agree, self.extra, self.missed, self.quiet)
-        agree, extra, missed, quiet = (part * weights for part in parts)
-        return type(self)(agree=agree, extra=extra, missed=missed, quiet=quiet)
+        return type(self)(**{item.name: getattr(self, item.name)[at : at + 1] for item in fields(self)})
 
     def softened(self, shares: NDArray[np.float64]) -> Self:
         """Return the gains with losses for misses reduced to shares, shape (C,): see `rates.missed_share`."""
-        missed = self.quiet + shares * (self.missed - self.quiet)
-        return type(self)(agree=self.agree, extra=self.extra, missed=missed, quiet=self.quiet)
+        return replace(self, missed=self.quiet + shares * (self.missed - self.quiet))
 
 
-def even_gains(classes: Sequence[str]) -> Gains:
-    """Return the gains of Eq. 7 with all lambdas 1."""
-    one = np.ones(len(classes))
-    return Gains(agree=one, extra=-one, missed=-one, quiet=np.zeros(len(classes)))
+def even_gains(weights: NDArray[np.float64]) -> Gains:
+    """Return the gains of Eq. 7 with all lambdas 1, times weights of the classes."""
+    return Gains(agree=weights, extra=-weights, missed=-weights, quiet=np.zeros(len(weights)))
 
 
 def likelihood_gains(rates: Sequence[ClassRates], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
-    """Return log-likelihood ratios of the view of each class with and without the map.
+    """Return log-likelihood ratios of the view of each class with and without the map, nats a cell.
 
     With S the probability that a mapped class still exists, B that it exists where it is not mapped, t and f hit and
     false alarm: P(seen | mapped) = S t + (1 - S) f, P(seen | not mapped) = B t + (1 - B) f, and their mean by the share
-    of the ground that is mapped is the reference.
-
-    Parameters
-    ----------
-    rates : sequence of ClassRates
-        One for each class.
-    age_years : float
-        From the map to the view; a map younger than the view has age 0.
-    persists : sequence of float, optional
-        Seasonal factor of each class on S, 0..1; 1 unless given.
-
-    Returns
-    -------
-    Gains
-        Nats a cell.
-
-    Examples
-    --------
-    A class without information has gain 0:
-
-    >>> volatile = ClassRates(
-    ...     hit=0.9, false_alarm=0.1, missing=0.0, vanish_per_year=9.9, appear_per_year=0.0, mapped=0.2
-    ... )
-    >>> abs(float(likelihood_gains([volatile], age_years=50.0).agree[0])) < 1e-9
-    True
+    of the ground that is mapped is the reference. `persists`, 0..1, is a seasonal factor of each class on S. A map
+    younger than the view has age 0.
     """
     factors = list(persists) or [1.0] * len(rates)
     rows = [_ratios(one, age_years, factor) for one, factor in zip(rates, factors, strict=True)]
@@ -105,11 +69,9 @@ def _ratios(rates: ClassRates, age_years: float, persists: float) -> tuple[float
         for share in (survival, unmapped)
     )
     either = rates.mapped * mapped + (1 - rates.mapped) * empty
-    seen, unseen = (
-        np.log([mapped / either, empty / either]),
-        np.log([(1 - mapped) / (1 - either), (1 - empty) / (1 - either)]),
-    )
-    return float(seen[0]), float(seen[1]), float(unseen[0]), float(unseen[1])
+    agree, extra = np.log([mapped / either, empty / either]).tolist()
+    missed, quiet = np.log([(1 - mapped) / (1 - either), (1 - empty) / (1 - either)]).tolist()
+    return agree, extra, missed, quiet
 
 
 def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
@@ -123,24 +85,13 @@ def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[f
     taxonomy = load_taxonomy()
     hand = [taxonomy[name].persistence for name in classes]
     decay = np.array([one.prior * np.exp(-one.vanish_per_year * max(age_years, 0.0)) for one in hand], dtype=np.float64)
-    return even_gains(classes).scaled(decay * (np.array(persists, dtype=np.float64) if persists else 1.0))
+    return even_gains(decay * (np.array(persists, dtype=np.float64) if persists else 1.0))
 
 
 def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the linear form of Eq. 8: factors of the classes of the map and of its known cells.
+    """Return the linear form of Eq. 8: factors of map classes and of known map cells, as in `search.field.Template`.
 
-    Parameters
-    ----------
-    cells : ndarray of uint8, shape (C, rows, cols)
-        PRESENT, ABSENT or UNKNOWN.
-    gains : Gains
-        Of the same classes.
-
-    Returns
-    -------
-    weights : ndarray of float32, shape (C, rows, cols)
-    known : ndarray of float32, shape (rows, cols)
-        See `search.field.Template`. Unknown cells are 0 in both.
+    `cells` and the first factors have shape (C, rows, cols), the second (rows, cols). Unknown cells are 0 in both.
 
     Examples
     --------
@@ -163,14 +114,6 @@ def information(rates: ClassRates, *, age_years: float, persists: float = 1.0) -
     """Return the mutual information between the map and the view of a class, nats a cell.
 
     `persists` is the seasonal factor of the class, as in `likelihood_gains`.
-
-    Examples
-    --------
-    >>> rail = ClassRates(
-    ...     hit=0.9, false_alarm=0.01, missing=0.0, vanish_per_year=0.1, appear_per_year=0.01, mapped=0.1
-    ... )
-    >>> information(rail, age_years=0.0) > information(rail, age_years=5.0) > information(rail, age_years=50.0)
-    True
     """
     agree, extra, missed, quiet = _ratios(rates, age_years, persists)
     survival, unmapped = rates.survival(age_years) * persists, rates.unmapped(age_years)

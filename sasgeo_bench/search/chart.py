@@ -23,16 +23,8 @@ _DECIMALS: Final = 6  # of a place within its cell: the same on every copy of a 
 class Chart:
     """Layers of a map as a dense matcher reads them.
 
-    Parameters
-    ----------
-    grid : Grid
-        The map's lattice.
-    classes : tuple of str
-        Class names in band order.
-    degree : ndarray of uint8, shape (C, rows, cols)
-        0 where a class is absent or the map is unknown, `FULL` where it is present.
-    known : ndarray of uint8, shape (rows, cols)
-        `FULL` where the map is known, else 0.
+    `degree`, uint8 of shape (C, rows, cols), is 0 where a class is absent or the map is unknown, `FULL` where it is
+    present. `known`, uint8 of shape (rows, cols), is `FULL` where the map is known, else 0.
     """
 
     grid: Grid
@@ -143,13 +135,7 @@ def block_max(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def fade(present: NDArray[np.bool_], *, reach_cells: float) -> NDArray[np.float32]:
-    """Return exp(-D^2 / (2 reach^2)) of the distance D to the nearest present cell, shape (rows, cols); 0 without any.
-
-    Examples
-    --------
-    >>> fade(np.array([[True, False, False]]), reach_cells=1.0).round(2).tolist()
-    [[1.0, 0.6100000143051147, 0.14000000059604645]]
-    """
+    """Return exp(-D^2 / (2 reach^2)) of the distance D to the nearest present cell; 0 without any."""
     if not present.any():
         return np.zeros(present.shape, dtype=np.float32)
     distance = cv2.distanceTransform(

@@ -38,7 +38,6 @@ def dense(
     locks = [Lock() for _ in tiles]
 
     def peaks_of(base: Pose) -> list[tuple[int, _Peaks]]:
-        """Return the peaks of one heading on every tile; update the highest score of each place."""
         found = []
         for at, turn, score in votes.scores(base):
             score[~tiles[at].allowed] = _LOW
@@ -80,7 +79,6 @@ class _Votes:
 
     @classmethod
     def of(cls, level: Level, template: Template, tiles: Sequence[Tile], turns: Turns) -> Self:
-        """Transform the map under each tile, once for all headings."""
         step_m, largest = level.grid.cell_size_m, max(base.scale for base in turns.bases)
         half = math.ceil(template.reach_m * largest / step_m) + 1
         shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)
@@ -164,7 +162,7 @@ class _Peaks:
         return chosen
 
     def _is_near(self, at: int, other: int, turns: Turns) -> bool:
-        """Tell if two peaks have neighbouring headings and scales."""
+        """Return whether two peaks have neighbouring headings and scales."""
         off_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
         is_turned = off_deg >= _NEXT * turns.yaw_step_deg + _NOTHING
         return not is_turned and abs(self.scale[at] - self.scale[other]) < _NEXT * turns.scale_step + _NOTHING

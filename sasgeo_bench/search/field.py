@@ -51,14 +51,9 @@ class Level:
 class Field:
     """Layers of a map for the bands of a template.
 
-    Parameters
-    ----------
-    grid : Grid
-        Lattice of the map.
-    layers : ndarray of uint8, shape (K, rows, cols)
-        Degree to which the map holds each class, 0..FULL; 0 where it is unknown.
-    known : ndarray of uint8, shape (rows, cols)
-        FULL where the map is known, else 0. Beyond the grid it is unknown.
+    `layers`, uint8 of shape (K, rows, cols), are the degrees to which the map holds each class, 0..FULL; 0 where it is
+    unknown. `known`, uint8 of shape (rows, cols), is FULL where the map is known, else 0. Beyond the grid it is
+    unknown.
 
     Raises
     ------
@@ -95,18 +90,9 @@ class Template:
     """Weights of a view for each class and cell: the linear form of Eqs. 7-8.
 
     The score of a pose sums `weights * layers + known * (map is known)` over the cells of the view, with the map
-    interpolated linearly at their centres. With gains l+ for seen and mapped, l- for seen and not mapped, l0 for mapped
-    and seen to be absent, `weights` is (l+ + l-) z_present - l0 z_absent, and `known` the sum over classes of
-    -l- z_present. Unknown cells are 0 in both.
-
-    Parameters
-    ----------
-    weights : ndarray of float32, shape (K, rows, cols)
-        Factors of the layers of the map.
-    known : ndarray of float32, shape (rows, cols)
-        Factors of known map cells.
-    cell_size_m : float
-        Side of a cell of the view at scale 1.
+    interpolated linearly at their centres; `weights` have shape (K, rows, cols), `known` (rows, cols). With gains l+
+    for seen and mapped, l- for seen and not mapped, l0 for mapped and seen to be absent, `weights` is (l+ + l-)
+    z_present - l0 z_absent, and `known` the sum over classes of -l- z_present. Unknown cells are 0 in both.
 
     Raises
     ------
@@ -130,12 +116,12 @@ class Template:
 
     @property
     def side_m(self) -> float:
-        """Longer side at scale 1, metres."""
+        """Return the longer side at scale 1, metres."""
         return float(max(self.known.shape) * self.cell_size_m)
 
     @property
     def reach_m(self) -> float:
-        """Half a diagonal at scale 1, metres."""
+        """Return half a diagonal at scale 1, metres."""
         return math.hypot(*self.known.shape) * self.cell_size_m / 2
 
     @cached_property

@@ -43,28 +43,11 @@ def search(
     count: int = 10,
     starts: Sequence[Pose] = (),
 ) -> Found:
-    """Find the best modes within a prior, coarse to fine.
+    """Find the best modes within a prior, coarse to fine: at most `count`, best first.
 
-    Parameters
-    ----------
-    field : Field
-        The map.
-    template : Template
-        The view.
-    prior : Prior
-        Allowed places, headings and scales; without limits the whole map.
-    plan : Plan, optional
-        Settings of the search.
-    count : int
-        Largest number of modes.
-    starts : sequence of Pose
-        Proposed poses, refined like those of the search if they score as well.
-
-    Returns
-    -------
-    Found
-        Modes at least `apart_m` from each other, best first; none for an empty template or a prior beyond the map.
-        Modes that the beam dropped keep the order of a coarser level, below all refined ones.
+    Poses in `starts` are refined like those of the search if they score as well. Modes lie at least `plan.apart_m` from
+    each other; there are none for an empty template or a prior beyond the map. Modes that the beam dropped keep the
+    order of a coarser level, below all refined ones.
 
     Examples
     --------

@@ -17,22 +17,11 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 class Plan:
     """Settings of a search.
 
-    Parameters
-    ----------
-    cells : int
-        Least number of cells of the coarsest level along the longer side of the view.
-    beam : tuple of int
-        Modes kept at the coarsest level, then at each finer one; the last number holds for all further levels.
-    each : int
-        Modes that each candidate starts with.
-    spread : float
-        Searched range of heading and scale, standard deviations.
-    apart_m : float
-        Least distance between two modes of a result.
-    around_m : float
-        Radius around a candidate within which the view may lie.
-    threads : int
-        Threads of one search; they change its time alone.
+    `cells` is the least number of cells of the coarsest level along the longer side of the view; `beam` are the modes
+    kept at the coarsest level, then at each finer one, the last number for all further levels; `each` candidate starts
+    with so many modes. Headings and scales are searched within `spread` standard deviations, modes of a result are
+    `apart_m` from each other, and a view may lie within `around_m` of its candidate. The number of `threads` changes
+    the time alone.
     """
 
     cells: int = 16
@@ -91,12 +80,7 @@ def thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
 def posterior(scores: Sequence[float], *, null_score: float = 0.0) -> NDArray[np.float64]:
     """Return the probability of each mode and, last, of none of them: a softmax, shape (len(scores) + 1,).
 
-    Parameters
-    ----------
-    scores : sequence of float
-        Scores of modes, logarithms of likelihood ratios.
-    null_score : float
-        Score of none of them.
+    Scores are logarithms of likelihood ratios.
 
     Examples
     --------
@@ -159,13 +143,7 @@ class Disc:
     radius_m: float
 
     def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which places, shape (N, 2), lie within.
-
-        Examples
-        --------
-        >>> Disc(center_m=(0.0, 0.0), radius_m=5.0).holds(np.array([(3.0, 4.0), (4.0, 4.0)])).tolist()
-        [True, False]
-        """
+        """Return which places, shape (N, 2), lie within."""
         if self.center_m is None:
             return np.ones(len(points_m), dtype=bool)
         return np.asarray(np.hypot(*(points_m - self.center_m).T) <= self.radius_m)

@@ -43,7 +43,7 @@ class View:
 
     @property
     def reach_m(self) -> float:
-        """Half a diagonal at scale 1, metres."""
+        """Return half a diagonal at scale 1, metres."""
         return math.hypot(self.grid.rows, self.grid.cols) * self.grid.cell_size_m / 2
 
     def blurred(self, size_m: float) -> NDArray[np.float32]:

@@ -30,20 +30,10 @@ _SOME_CELLS: Final = 96  # a side: enough for the first steps
 class VotePlan:
     """Settings of a search by votes.
 
-    Parameters
-    ----------
-    coarse_m, coarse_wide_m, wide_m2 : float
-        Side of a coarse cell, up to an area of `wide_m2` and beyond it, metres and square metres.
-    yaw_step_deg, scale_step : float
-        Largest step between searched headings and scales.
-    apart_m : float
-        Least distance between two modes.
-    least_overlap : float
-        Share of the cells known to the view that the map must know at a pose.
-    modes, finals : int
-        Modes that are refined on coarse cells, and of them on the map's own.
-    around_m : float
-        Radius around a candidate within which the view may lie.
+    A coarse cell has a side of `coarse_m`, for areas beyond `wide_m2` of `coarse_wide_m`. Headings and scales are
+    searched in steps of at most `yaw_step_deg` and `scale_step`. Modes lie `apart_m` from each other, and the map must
+    know a share `least_overlap` of the cells known to the view. `modes` are refined on coarse cells, and `finals` of
+    them on the map's own. A view may lie within `around_m` of its candidate.
     """
 
     coarse_m: float = 4.0
@@ -60,15 +50,10 @@ class VotePlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Voted:
-    """Result of a search by votes.
+    """Result of a search by votes: modes, best first, or one for each candidate, None where the map shows too little.
 
-    Parameters
-    ----------
-    modes : list of Mode or None
-        Best places, best first; or one for each candidate, None where the map shows too little.
-    null_score : float
-        Standard deviations by which the best coarse score exceeds those of distant places, which are wrong if it is
-        right; 0 where there are none.
+    `null_score` is the lead of the best coarse score over distant places, which are wrong if it is right, in their
+    standard deviations; 0 where there are none.
     """
 
     modes: list[Mode | None]
@@ -96,14 +81,7 @@ class _Votes:
 
 
 def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
-    """Return headings and scales to search, as poses at the origin.
-
-    Examples
-    --------
-    >>> known = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=3.0, scale_sigma=0.0)
-    >>> [pose.yaw_deg for pose in turns(known, VotePlan())]
-    [354.0, 357.0, 0.0, 3.0, 6.0]
-    """
+    """Return headings and scales to search, as poses at the origin."""
     scales = [1 + offset for offset in _steps(min(_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
     yaws_deg = _yaws_deg(prior, plan)
     return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)
@@ -355,7 +333,7 @@ class VoteSearch:
 
         @cache
         def score_of(pose: Pose) -> float:
-            """Score a pose, NOWHERE beyond the neighbourhood; some poses are visited twice."""
+            """Score a pose; return NOWHERE beyond the neighbourhood. Some poses are visited twice."""
             if not (low <= pose.scale <= high and near.has(pose) and disc.has(pose)):
                 return NOWHERE
             return patch.score(level.samples, pose, least_overlap=self.plan.least_overlap)

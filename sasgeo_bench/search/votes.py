@@ -34,22 +34,12 @@ class VoteGains:
 def make_template(
     seen: NDArray[np.uint8], gains: VoteGains, *, near: NDArray[np.float32] | None = None
 ) -> NDArray[np.float64]:
-    """Return the factors of the map in Eq. (8), which is linear in the map.
+    """Return the factors of the map in Eq. (8), which is linear in the map, shape (C + 2, rows, cols).
 
-    Parameters
-    ----------
-    seen : ndarray of uint8, shape (C, rows, cols)
-        ABSENT, PRESENT or UNKNOWN.
-    gains : VoteGains
-        Weights of the classes.
-    near : ndarray of float, shape (C, rows, cols), optional
-        Proximity, 0..1, of the class in the view: it reduces the loss for mapped cells that are seen to be absent.
-
-    Returns
-    -------
-    ndarray of float, shape (C + 2, rows, cols)
-        C bands for the degree to which the map holds each class; one for known map cells (the loss of what is seen,
-        regained where it is mapped); one that counts the classes known in the view.
+    `seen` has shape (C, rows, cols). C bands are for the degree to which the map holds each class; one for known map
+    cells (the loss of what is seen, regained where it is mapped); the last counts the classes known in the view.
+    `near`, 0..1, is the proximity of the class in the view: it reduces the loss for mapped cells that are seen to be
+    absent.
 
     Examples
     --------
@@ -103,7 +93,7 @@ class ByPlanes:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows and columns of a transform."""
+        """Return rows and columns of a transform."""
         side = fft.next_fast_len(self.places + self.high - 1, real=True)
         return side, side
 
@@ -148,7 +138,7 @@ class ByRows:
 
     @property
     def size(self) -> int:
-        """Columns of a transform."""
+        """Return columns of a transform."""
         return int(fft.next_fast_len(self.places + self.high - 1, real=True))
 
     def at_once(self, bands: int) -> int:

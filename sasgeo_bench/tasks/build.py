@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import geopandas as gpd
 import numpy as np
@@ -39,6 +39,8 @@ from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
 from sasgeo_bench.tasks.twin import paste
 
+_SKIP: Final = " (--skip passes on to the next suite)"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
@@ -50,9 +52,7 @@ class Made:
 
 
 def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
-    """Draw the queries of one suite on one region and write a task for each searched map.
-
-    There is one map, and for real ageing each older one. `tell` receives a line for every step.
+    """Draw a suite's queries on a region; write a task for each searched map, for real ageing each older one.
 
     Raises
     ------
@@ -66,11 +66,11 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
 
 def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
     """Lock a request from start to end, since a second run of it would change the map that this one uses."""
-    suite = find_suite(request.suite)
+    find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
     # The lock is where maps are built, so that a refused request leaves nothing among tasks.
-    return locked(request.out / "regions" / f"{request.region.id}+{suite.card.name}.request", tell=tell)
+    return locked(request.out / "regions" / f"{request.region.id}+{request.suite}.request", tell=tell)
 
 
 def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
@@ -123,22 +123,15 @@ def _records(request: Request) -> dict[str, dict[str, Any]]:
 
 
 def is_of_region(name: str, region: str) -> bool:
-    """Return whether a map is that of a region, or an older date or an edit of it.
-
-    Examples
-    --------
-    >>> [is_of_region(name, "vaduz") for name in ("vaduz", "vaduz@2021-10-28", "vaduz+alias", "vaduz-north")]
-    [True, True, True, False]
-    """
+    """Return whether a map is that of a region, or an older date or an edit of it."""
     return base_of(name) == region
 
 
 def _request_sha256(request: Request) -> str:
-    elsewhere = None if request.elsewhere is None else request.elsewhere.model_dump(mode="json")
     content = {
         "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
         "region": request.region.model_dump(mode="json"),
-        "elsewhere": elsewhere,
+        "elsewhere": request.elsewhere and request.elsewhere.model_dump(mode="json"),
         # Halves decide only where methods train, so changing them redraws nothing.
         "split": request.split.spec.model_dump(mode="json", exclude={"place": {"__all__": {"half"}}}),
         "count": [request.count, request.may_be_fewer],
@@ -159,9 +152,7 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     scene, base = read_scene(request, suite, tell)
     reason = suite.lack(scene)
     if reason is not None:
-        message = (
-            f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason} (--skip passes on to the next suite)"
-        )
+        message = f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason}{_SKIP}"
         raise ConfigError(message)
     group = request.group or suite.card.group
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
@@ -279,7 +270,6 @@ def _nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]
 def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
     """Return a state that is seen and never searched: layers in memory, no graph."""
     paint = make_paint(features, base.classes, base.coverage)
-    empty = build_graph(features.iloc[:0])
     return State(
         region=base.manifest.id,
         date=base.manifest.extract.date,
@@ -287,7 +277,7 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
         classes=base.classes,
         bits=LayerBits.of(burn_layers(paint, base.grid)),
         features=features,
-        graph=empty,
+        graph=build_graph(features.iloc[:0]),
     )
 
 
@@ -368,14 +358,11 @@ def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site],
     state = drawer.scene.state(region)
     manifest = region_files.read_manifest(request.out / "regions" / region)
     spec = request.split.spec
+    texts = ("title", "what", "separates", "falsifier", "strength_unit")
     return {
         "suite": card.name,
         "suite_version": card.version,
-        "title": card.title,
-        "what": card.what,
-        "separates": card.separates,
-        "falsifier": card.falsifier,
-        "strength_unit": card.strength_unit,
+        **{name: getattr(card, name) for name in texts},
         "region": region,
         "map_date": state.date.isoformat(),
         **task_files.map_of(manifest),
@@ -432,5 +419,5 @@ def _carry_out(request: Request) -> Drawn:
     try:
         folders = ensure_tasks(request, tell=lines.append)
     except ConfigError as error:
-        return Drawn(lines=tuple(lines), lack=str(error).removesuffix(" (--skip passes on to the next suite)"))
+        return Drawn(lines=tuple(lines), lack=str(error).removesuffix(_SKIP))
     return Drawn(lines=tuple(lines), folders=folders)

@@ -53,7 +53,7 @@ def panels(
         if not chosen:
             message = f"{task_folder} holds no query {query_id!r}"
             raise ConfigError(message)
-    wanted = {truth.query_id for truth in chosen}
+    ids = {truth.query_id for truth in chosen}
     queries = {}
     rivals: dict[Pose, tuple[Pose, ...]] = {}
     poses = {truth.pose for truth in chosen}
@@ -61,11 +61,11 @@ def panels(
         truth = truths.get(query.query_id)
         if truth is None:
             raise strangers
-        if query.query_id in wanted:
+        if query.query_id in ids:
             queries[query.query_id] = query
         if query.candidates and truth.pose in poses and truth.pose is not None:
             rivals.setdefault(truth.pose, _others(query, truth))
-    if wanted != set(queries):
+    if ids != set(queries):
         raise strangers
     return tuple(_panel(queries[truth.query_id], truth, state, rivals) for truth in chosen)
 
@@ -102,7 +102,6 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
     size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
 
     def view(pose: Pose) -> Evidence:
-        """Return the map at a pose, for the classes that were looked for."""
         return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
 
     at_truth = view(truth.pose)

@@ -94,12 +94,6 @@ def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None
         If both are given, or the text is not a seed.
     StoreError
         If the file cannot be read, others can read it, or it has another suffix.
-
-    Examples
-    --------
-    >>> environ = {"SASGEO_SEED": "3f" * 16}
-    >>> take_seed(None, environ).bits, environ
-    (128, {})
     """
     text = (os.environ if environ is None else environ).pop(VARIABLE, None)
     if file is not None and text is not None:

@@ -151,7 +151,6 @@ class Drawer:
         )
 
         def share(center_m: tuple[float, float], radius_m: float) -> float:
-            """Return the mapped fraction of evenly spread points."""
             row, col = state.grid.to_cells(center_m + radius_m * spiral).T
             inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
             return float(state.known[row[inside], col[inside]].sum()) / _SAMPLES

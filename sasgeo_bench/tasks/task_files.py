@@ -2,8 +2,10 @@
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -114,9 +116,8 @@ def write_task(
     `pairs` are in the order of the query ids, which reveals nothing about the answers. `about` and `hidden` are the
     contents of `task.json` and `truth.json` besides counts and hashes. Return the number of queries.
     """
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     groups: set[str] = set()
-    total = 0
     frozen = hashlib.sha256()
     with ExitStack() as stack:
         queries, truths = (
@@ -129,16 +130,15 @@ def write_task(
             queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
             for query, _ in part:
-                counts[query.track] = counts.get(query.track, 0) + 1
+                counts[query.track] += 1
                 groups.add(query.prior_group)
                 frozen.update(query.query_id.encode() + _candidate_bytes(query))
-            total += len(part)
     record = file_record(task_folder / QUERIES)
     content = {
         "schema_version": SCHEMA_VERSION,
         "task_version": TASK_VERSION,
         **about,
-        "counts": counts,
+        "counts": dict(counts),
         "prior_groups": sorted(groups),
         "candidates_sha256": frozen.hexdigest(),
         "files": {QUERIES: record.model_dump()},
@@ -147,7 +147,7 @@ def write_task(
     }
     _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **(hidden or {})})
     _write_json(task_folder / TASK, content)
-    return total
+    return counts.total()
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
@@ -161,26 +161,13 @@ def _candidate_bytes(query: Query) -> bytes:
 
 
 def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Query, Truth]]]:
-    batch: list[tuple[Query, Truth]] = []
-    for pair in pairs:
-        batch.append(pair)
-        if len(batch) == _ROWS:
-            yield batch
-            batch = []
-    if batch:
+    left = iter(pairs)
+    while batch := list(islice(left, _ROWS)):
         yield batch
 
 
 def read_task(folder: str | Path) -> dict[str, Any]:
-    """Read `task.json`; raise a StoreError if it is missing, damaged or of another version.
-
-    Examples
-    --------
-    >>> read_task(Path("nowhere"))
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: nowhere holds no task.json: make the queries first
-    """
+    """Read `task.json`; raise a StoreError if it is missing, damaged or of another version."""
     path = Path(folder) / TASK
     if not path.is_file():
         message = f"{folder} holds no {TASK}: make the queries first"
@@ -242,11 +229,8 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     if found.model_dump() != recorded:  # its contents need no check
         was = f"{recorded['bytes']} bytes, {recorded['sha256']}"
         return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}", *faults]
-    counts: dict[str, int] = {}
-    names = []
-    for query in read_queries(task_folder):
-        counts[query.track] = counts.get(query.track, 0) + 1
-        names.append(query.query_id)
+    asked = [(query.query_id, query.track) for query in read_queries(task_folder)]
+    names, counts = [name for name, _ in asked], dict(Counter(track for _, track in asked))
     if counts != about["counts"]:
         faults.append(f"{QUERIES}: holds {counts}, {TASK} says {about['counts']}")
     if (truth_folder / TRUTH).is_file():
@@ -324,14 +308,14 @@ def _asked_of(row: Mapping[str, Any], about: Mapping[str, str]) -> str:
     return asked_sha256(row, about) if recorded is None else str(recorded)
 
 
-def read_some(folder: Path, wanted: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
+def read_some(folder: Path, ids: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
     """Yield queries of some ids, each with its bytes for a matcher's process and its hash; a row group at a time."""
     about = _map_hashes(read_task(folder))
     with open_table(folder / QUERIES, mend=_MEND, is_whole=False) as source:
         for batch in source.iter_batches(batch_size=_ROWS):
             sent = batch.select([name for name in batch.schema.names if name != ASKED])
             for at, name in enumerate(batch["query_id"].to_pylist()):
-                if name in wanted:
+                if name in ids:
                     row = batch.slice(at, 1).to_pylist()[0]
                     yield _made(folder / QUERIES, query_of, row), stream_of(sent.slice(at, 1)), _asked_of(row, about)
 
@@ -422,8 +406,8 @@ def _check_columns(path: Path, found: pa.Schema, needed: Sequence[str]) -> None:
 def _is_known(field: pa.Field) -> bool:
     """Return whether a column has the type that it has in our files or in a release."""
     schemas = (FILE_SCHEMA, TRUTH_SCHEMA, PLAIN_TRUTH_SCHEMA)
-    wanted = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
-    return not wanted or any(is_like(field.type, kind) for kind in wanted)
+    types = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
+    return not types or any(is_like(field.type, kind) for kind in types)
 
 
 def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:

@@ -204,11 +204,6 @@ def asked_sha256(row: Mapping[str, Any], map_hashes: Mapping[str, str]) -> str:
     """Return the hash of all that decides an answer: the row of a query, and what `task.json` holds of its map.
 
     Fields that are null, or not in `QUERY_SCHEMA`, do not count.
-
-    Examples
-    --------
-    >>> asked_sha256({"query_id": "a", "season": None}, {}) == asked_sha256({"query_id": "a", "more": 1}, {})
-    True
     """
     fields = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
     text = json.dumps([_ASKED_VERSION, dict(map_hashes), fields], sort_keys=True, default=_plain)
@@ -304,7 +299,7 @@ _LIKE: Final = (  # a kind of column, and the kinds that can be read as it
 )
 
 
-def is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
+def is_like(found: pa.DataType, expected: pa.DataType) -> bool:
     """Return whether a column can be read as another type: floats and strings of any size, null for anything.
 
     Examples
@@ -312,17 +307,17 @@ def is_like(found: pa.DataType, wanted: pa.DataType) -> bool:
     >>> is_like(pa.int16(), pa.float64()), is_like(pa.string(), pa.float64())
     (True, False)
     """
-    if pa.types.is_null(found) or found.equals(wanted):
+    if pa.types.is_null(found) or found.equals(expected):
         return True
-    if pa.types.is_list(wanted):
+    if pa.types.is_list(expected):
         is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
-        return is_list and _is_like_inside(found.value_type, wanted.value_type)
-    return any(kind(wanted) and any(other(found) for other in others) for kind, others in _LIKE)
+        return is_list and _is_like_inside(found.value_type, expected.value_type)
+    return any(kind(expected) and any(other(found) for other in others) for kind, others in _LIKE)
 
 
-def _is_like_inside(found: pa.DataType, wanted: pa.DataType) -> bool:
+def _is_like_inside(found: pa.DataType, expected: pa.DataType) -> bool:
     """Return whether items of a list can be read as another type; structs may have more fields."""
-    if not pa.types.is_struct(wanted):
-        return is_like(found, wanted)
+    if not pa.types.is_struct(expected):
+        return is_like(found, expected)
     names = [field.name for field in found] if pa.types.is_struct(found) else []
-    return all(names.count(field.name) == 1 and is_like(found.field(field.name).type, field.type) for field in wanted)
+    return all(names.count(field.name) == 1 and is_like(found.field(field.name).type, field.type) for field in expected)

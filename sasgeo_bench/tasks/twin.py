@@ -104,11 +104,11 @@ def _cut(features: "gpd.GeoDataFrame", area: shapely.Geometry, *, keep_inside: b
 def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> NDArray[np.object_]:
     """Drop the points and lines that a cut leaves of areas, and the points that it leaves of lines."""
     found = np.empty(len(shapes), dtype=object)
-    wanted = shapely.get_dimensions(like)
+    kinds = shapely.get_dimensions(like)
     for at, shape in enumerate(shapes):
         parts = shapely.get_parts(shapely.get_parts(shape))
-        parts = [part for part in parts if shapely.get_dimensions(part) == wanted[at] and not shapely.is_empty(part)]
-        gather = shapely.MultiPolygon if wanted[at] == 2 else shapely.MultiLineString  # noqa: PLR2004
+        parts = [part for part in parts if shapely.get_dimensions(part) == kinds[at] and not shapely.is_empty(part)]
+        gather = shapely.MultiPolygon if kinds[at] == 2 else shapely.MultiLineString  # noqa: PLR2004
         found[at] = parts[0] if len(parts) == 1 else gather(parts)  # of none it makes an empty one
     return found
 

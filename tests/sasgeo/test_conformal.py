@@ -85,7 +85,7 @@ def test_the_bound_of_counts_is_that_of_the_figures():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"p_false": [0.5, np.nan]}, "no probability"),
+        ({"p_false": [0.5, np.nan]}, "no probabilities"),
         ({"is_false": [True]}, r"is_false \(1,\)"),
         ({"blocks": ["a"]}, "blocks 1"),
         ({"alpha": 0.0}, "alpha and delta"),

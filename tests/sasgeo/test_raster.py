@@ -63,7 +63,7 @@ def test_noise_free_views_are_found_on_a_town(tiny, field):
     assert len(whole) >= 3
     for query, pose in whole:
         seen = doubted(query.evidence)
-        view = RasterView.of(seen, tiny.region.classes, even_gains(tiny.region.classes))
+        view = RasterView.of(seen, tiny.region.classes, even_gains(np.ones(len(tiny.region.classes))))
         best = search(field, view.template(), query.prior).modes[0].pose
         assert (
             np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) < 3.0

@@ -175,11 +175,11 @@ def test_a_remark_goes_with_the_next_fit_and_nothing_at_all_says_one(rule, calib
     asked=st.lists(st.floats(-2, 12), min_size=2, max_size=6),
 )
 def test_counted_chances_keep_the_order_of_margins_and_are_chances(margins, false, asked):
-    rule = Counted.of(np.array(margins, dtype=float), np.arange(len(margins)) < false)
+    rule = Counted(margins=np.sort(np.array(margins, dtype=float)), false=min(false, len(margins)))
     found = rule.chance(np.sort(asked))
     assert (np.diff(found) <= 1e-12).all()
     assert ((found >= 0) & (found <= 1)).all()
-    clean = Counted.of(np.array(margins, dtype=float), np.zeros(len(margins), dtype=bool))
+    clean = Counted(margins=np.sort(np.array(margins, dtype=float)), false=0)
     assert clean.chance(np.array([99.0]))[0] == pytest.approx(upper_rate(0, len(margins)))
 
 

@@ -18,13 +18,7 @@ Values = NDArray[np.float64]
 
 
 def with_withheld(predictions: Sequence[Prediction], rule: Callable[[Sequence[Prediction]], Values]) -> Values:
-    """Return a rule's values for answers with candidates, and 1 for those without, shape (N,).
-
-    Examples
-    --------
-    >>> with_withheld([Prediction(query_id="a")], lambda answers: np.zeros(len(answers))).tolist()
-    [1.0]
-    """
+    """Return a rule's values for answers with candidates, and 1 for those without, shape (N,)."""
     found = np.ones(len(predictions))
     at = answered(predictions)
     if len(at):
@@ -79,11 +73,5 @@ def _place(pose: Pose) -> tuple[float, float]:
 
 
 def base_rate(is_false: NDArray[np.bool_]) -> float:
-    """Return the share of false fixes with one more of each kind (Laplace): never 0 or 1.
-
-    Examples
-    --------
-    >>> base_rate(np.array([True, True]))
-    0.75
-    """
+    """Return the share of false fixes with one more of each kind (Laplace): never 0 or 1."""
     return float((is_false.sum() + 1) / (len(is_false) + 2))

@@ -53,18 +53,9 @@ def rates_by_hand() -> dict[str, Rates]:
 class Ageing:
     """Let years pass between the map and the view.
 
-    Parameters
-    ----------
-    years : float
-        Age of the map at the time of the view.
-    rates : mapping of str to Rates
-        By class; a class without rates does not age.
-    place, measured_in : str, tuple of str
-        Where the view is, and where the rates were measured.
-    redrawn : float
-        Fraction of the remaining objects that are shifted because they were redrawn; only if years pass.
-    shift_m : float
-        Standard deviation of that shift in each direction, metres.
+    `rates` are by class; a class without them does not age. The view is in `place`, the rates were measured in
+    `measured_in`. If years pass, the fraction `redrawn` of the remaining objects is shifted because they were redrawn,
+    with standard deviation `shift_m` in each direction.
 
     Raises
     ------
@@ -78,12 +69,6 @@ class Ageing:
     is Poisson with mean (exp(appear * years) - 1) * objects. Each is a rotated copy of one of its class, placed nearby
     where no building, water, road or railway is. One without a free place after twelve tries is dropped, so dense
     places grow less.
-
-    Examples
-    --------
-    >>> Ageing(years=5.0, rates={}, place="vaduz", measured_in=("vaduz",))
-    Traceback (most recent call last):
-    sasgeo_bench.errors.PerturbError: Ageing: the rates come from 'vaduz' itself, take those of other places
     """
 
     years: float

@@ -46,26 +46,13 @@ def with_cells(evidence: Evidence, cells: NDArray[np.uint8]) -> Evidence:
 
 
 def hide(evidence: Evidence, mask: Mask) -> Evidence:
-    """Make the cells of a mask unknown; its shape is (rows, cols) for all classes or (C, rows, cols).
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("water",), cells=np.array([[[0, 1]]], dtype=np.uint8), cell_size_m=1.0)
-    >>> hide(view, np.array([[False, True]])).cells.tolist()
-    [[[0, 2]]]
-    """
+    """Make the cells of a mask unknown; its shape is (rows, cols) for all classes or (C, rows, cols)."""
     return evidence.replace(np.maximum(evidence.cells, mask.view(np.uint8) * np.uint8(UNKNOWN)), evidence.confidence)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Occlusion(ABC):
-    """Base of the perturbations that make a fraction of the view unknown.
-
-    Parameters
-    ----------
-    share : float
-        Fraction of the cells to hide, 0 to 1.
-    """
+    """Base of the perturbations that make a fraction `share` of the view unknown."""
 
     share: float
 

@@ -139,12 +139,6 @@ def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
     """Fill each cell from the place (`right_m`, `up_m`) metres from the middle; UNKNOWN if that is outside the view.
 
     Both places broadcast to shape (rows, cols). Confidence moves with its cell and is 0 outside the view.
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("water",), cells=np.array([[[0, 1]]], dtype=np.uint8), cell_size_m=1.0)
-    >>> resample(view, np.array([[0.5, 1.5]]), np.zeros((1, 2))).cells.tolist()
-    [[[1, 2]]]
     """
     rows, cols = evidence.shape
     col = np.floor(right_m / evidence.cell_size_m + cols / 2).astype(np.intp)
@@ -158,13 +152,7 @@ def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
 
 
 def shifted(layer: NDArray[Value], rows: int, cols: int, *, beyond: int) -> NDArray[Value]:
-    """Move a layer down and right by whole cells; cells from outside the view get the value `beyond`.
-
-    Examples
-    --------
-    >>> shifted(np.array([[1, 0], [0, 0]], dtype=np.uint8), 0, 1, beyond=2).tolist()
-    [[2, 1], [2, 0]]
-    """
+    """Move a layer down and right by whole cells; cells from outside the view get the value `beyond`."""
     height, width = layer.shape
     out = np.full_like(layer, beyond)
     if abs(rows) < height and abs(cols) < width:

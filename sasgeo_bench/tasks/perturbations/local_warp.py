@@ -24,10 +24,7 @@ _STEPS: Final = 30  # of the iteration; ten suffice for a gentle field
 class LocalWarp:
     """Move cells by a smooth displacement field with mean 0 and a mean wavelength of 90 m.
 
-    Parameters
-    ----------
-    rms_m : float
-        Root mean square length of the displacement, metres; exact in every view.
+    `rms_m` is the root mean square length of the displacement, metres; exact in every view.
 
     Notes
     -----

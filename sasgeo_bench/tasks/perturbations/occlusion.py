@@ -32,16 +32,16 @@ class Rectangles(Occlusion):
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
         """Return the cells that the rectangles cover, shape (rows, cols)."""
         covered = np.zeros(evidence.shape, dtype=bool)
-        wanted = round(self.share * covered.size)
-        left = wanted
+        target = round(self.share * covered.size)
+        left = target
         while left > 0:
             for row, col, height, width in _draw(covered.shape, rng):
-                if left == wanted or not covered[row, col]:
+                if left == target or not covered[row, col]:
                     left -= _cover(covered[row : row + height, col : col + width], left)
                 if left <= 0:
                     return covered
             # Little is free: cover the remaining cells in order instead of drawing more rectangles.
-            if left < covered.size * 0.001 or left > 0.97 * (covered.size - wanted + left):
+            if left < covered.size * 0.001 or left > 0.97 * (covered.size - target + left):
                 covered.ravel()[np.flatnonzero(~covered)[:left]] = True
                 return covered
         return covered
@@ -239,14 +239,7 @@ def depth(shape: tuple[int, int]) -> Field:
 
 
 class CentralCrop(Occlusion):
-    """Hide all but a rectangle in the middle; `share` is reached to within one ring of cells.
-
-    Examples
-    --------
-    >>> view = Evidence(classes=("water",), cells=np.zeros((1, 4, 4), dtype=np.uint8), cell_size_m=1.0)
-    >>> CentralCrop(share=0.75)(view, np.random.default_rng(0)).cells[0, 1].tolist()
-    [2, 0, 0, 2]
-    """
+    """Hide all but a rectangle in the middle; `share` is reached to within one ring of cells."""
 
     def mask(self, evidence: Evidence, _rng: np.random.Generator) -> Mask:
         """Return all cells but the middle."""

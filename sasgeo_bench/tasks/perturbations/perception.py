@@ -38,31 +38,15 @@ SEEN_ANYWHERE: Final = 0.2  # fraction of the false alarms that occur whether or
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassErrors:
-    """Errors of a detector on one class.
+    """Errors of a detector on one class."""
 
-    Parameters
-    ----------
-    f1 : float
-        Score in domain, pixel by pixel; for line classes with one cell of tolerance.
-    confused_with : str, optional
-        Class that it is confused with.
-    confused : float
-        Fraction of the lost cells that become that class; the others become absent.
-    dropped, frayed : float
-        Fractions of the lost cells that go by whole objects and at edges; the others go in patches. Areas only.
-    usual_share : float
-        Fraction of a usual view that the class covers; sets the false alarms in views without it.
-    width_m : float
-        Width of a false line; line classes only.
-    """
-
-    f1: float
+    f1: float  # in domain, pixel by pixel; for line classes with one cell of tolerance
     confused_with: str | None = None
-    confused: float = 0.0
-    dropped: float = 0.4
-    frayed: float = 0.4
-    usual_share: float = 0.01
-    width_m: float = 3.0
+    confused: float = 0.0  # fraction of the lost cells that become that class; the others become absent
+    dropped: float = 0.4  # of areas, fractions of the lost cells lost as whole objects and, `frayed`, at edges;
+    frayed: float = 0.4  # the others are lost in patches
+    usual_share: float = 0.01  # of a usual view that the class covers; sets the false alarms in views without it
+    width_m: float = 3.0  # of a false line
 
 
 # Building, road, water, tree and agriculture have the scores of U-Net-EfficientNet-B4 on OpenEarthMap. The others are
@@ -97,11 +81,8 @@ _STUB_SPENDS: Final = 0.85  # of the cells of a false line; the others are prese
 class Perception:
     """See a clean view with a detector's errors.
 
-    Parameters
-    ----------
-    error_factor : float
-        Multiplies 1 - F1 of every class: 0 is a perfect detector, 1 one in its own domain, 1.5 to 2 one in another
-        domain. At most 0.95 of a class goes wrong.
+    `error_factor` multiplies 1 - F1 of every class: 0 is a perfect detector, 1 one in its own domain, 1.5 to 2 one in
+    another domain. At most 0.95 of a class goes wrong.
 
     Notes
     -----
@@ -172,12 +153,10 @@ class _Look:
     mixed_up: Field
 
     def noise(self, width_m: float, rng: np.random.Generator) -> Field:
-        """Return smooth noise of the shape of the view."""
         return self.pool.take(width_m / self.cell_size_m, rng)
 
     @property
     def is_thin(self) -> bool:
-        """Return whether the class is a line."""
         return self.name in thin_classes()
 
     def lose(self, rng: np.random.Generator) -> tuple[Mask, Mask | None]:

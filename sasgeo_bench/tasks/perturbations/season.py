@@ -30,23 +30,12 @@ _REGROWN: Final = 0.3  # ratio of the fraction of green that looks like fields t
 class Season:
     """See the ground in a season that the map does not know.
 
-    Parameters
-    ----------
-    kind : {"leaf_on", "snow", "low_water", "harvest"}
-        `leaf_on`: paths, minor roads, streams and hedges within green disappear. `snow`: paths and field boundaries
-        disappear, fields, green and car parks become unknown. `low_water`: the waterline retreats, streams fall dry.
-        `harvest`: fields look like green, some green looks like fields, boundaries between them disappear.
-    strength : float
-        0 to 1: fraction that changes of what the season can change; of 12 m for the retreat of the waterline.
+    `leaf_on`: paths, minor roads, streams and hedges within green disappear. `snow`: paths and field boundaries
+    disappear, fields, green and car parks become unknown. `low_water`: the waterline retreats, streams fall dry.
+    `harvest`: fields look like green, some green looks like fields, boundaries between them disappear.
 
-    Examples
-    --------
-    >>> cells = np.ones((2, 1, 4), dtype=np.uint8)
-    >>> view = Evidence(classes=("path_track", "green"), cells=cells, cell_size_m=1.0)
-    >>> Season(kind="leaf_on", strength=1.0)(view, np.random.default_rng(0)).cells[:, 0].tolist()
-    [[0, 0, 0, 0], [1, 1, 1, 1]]
-    >>> Season(kind="snow", strength=1.0)(view, np.random.default_rng(0)).cells[:, 0].tolist()
-    [[0, 0, 0, 0], [2, 2, 2, 2]]
+    `strength`, 0 to 1, is the fraction that changes of what the season can change; of 12 m for the retreat of the
+    waterline.
     """
 
     kind: Kind

@@ -141,12 +141,6 @@ class Choice:
     """A selection of a suite's variants; an empty field selects all.
 
     `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected.
-
-    Examples
-    --------
-    >>> choice = Choice(kinds=("U2",))
-    >>> [choice.takes(Variant(role="stress", kind=kind), "retrieval") for kind in ("U1 rectangles", "U2 glare")]
-    [False, True]
     """
 
     views_cells: tuple[int, ...] = ()
@@ -171,8 +165,8 @@ class Choice:
             "kinds": (self.kinds, sorted({variant.kind for variant in stresses})),
             "tracks": (self.tracks, sorted({track for item in suite.variants for track in suite.tracks(item)})),
         }
-        for name, (wanted, known) in there.items():
-            lost = next((item for item in wanted if not any(_begins(one, item) for one in known)), None)
+        for name, (chosen, known) in there.items():
+            lost = next((item for item in chosen if not any(_begins(one, item) for one in known)), None)
             if lost is not None:
                 return f"suite {suite.card.name!r} has nothing of {name} {lost!r}: it has {', '.join(map(str, known))}"
         some = any(self.takes(item, track) for item in stresses for track in suite.tracks(item))
@@ -182,8 +176,8 @@ class Choice:
 EVERYTHING: Final = Choice()
 
 
-def _begins(known: object, wanted: object) -> bool:
-    return known.startswith(wanted) if isinstance(known, str) and isinstance(wanted, str) else known == wanted
+def _begins(known: object, chosen: object) -> bool:
+    return known.startswith(chosen) if isinstance(known, str) and isinstance(chosen, str) else known == chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -365,11 +359,7 @@ class Shot:
         return self.variant.view(state or self.scene.world, self.site.pose)
 
     def perceived(self, clean: Evidence | None = None, *, error_factor: float = 1.0) -> Evidence:
-        """Return a clean view, that of the world unless given, with errors of perception.
-
-        They are the same in every variant of a site with this view, so a control differs from its stress by the stress
-        alone.
-        """
+        """Return a clean view (of the world unless given) with errors, which are equal in all variants of a site."""
         rng = self.seeds.rng("perception", self.variant.view_cells, self.variant.cell_size_m)
         return Perception(error_factor=error_factor)(self.clean() if clean is None else clean, rng)
 
@@ -378,15 +368,6 @@ def changed_share(first: Evidence, second: Evidence) -> float:
     """Return the fraction of the cells present in either view, over all classes, that are present in only one.
 
     Unknown cells do not count.
-
-    Examples
-    --------
-    >>> one, two = (
-    ...     Evidence(classes=("a",), cells=np.array([[row]], dtype=np.uint8), cell_size_m=1.0)
-    ...     for row in ([1, 1, 0, 2], [1, 0, 0, 1])
-    ... )
-    >>> changed_share(one, two)
-    0.5
     """
     known = (first.cells != UNKNOWN) & (second.cells != UNKNOWN)
     one, two = first.cells == PRESENT, second.cells == PRESENT

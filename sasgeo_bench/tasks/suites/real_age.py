@@ -10,7 +10,7 @@ from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, State, Suite, Sui
 
 AGES_YEARS: Final = (2.0, 5.0, 10.0)
 DAYS_PER_YEAR: Final = 365.25
-_NEAR_ENOUGH: Final = 0.6  # least ratio of the age of an extract to the wanted age, or of the wanted age to it
+_NEAR_ENOUGH: Final = 0.6  # least ratio of the age of an extract to that of the variant, or the other way round
 
 
 class RealAgeSuite(Suite):
@@ -47,7 +47,7 @@ def age_years(old: State, new: State) -> float:
 
 
 def map_of_age(scene: Scene, years: float) -> State:
-    """Return the older state whose age has the ratio nearest to 1 to the wanted one."""
+    """Return the older state whose age is nearest to the given one by ratio."""
     return min(
         scene.others, key=lambda state: (abs(np.log(max(age_years(state, scene.world), 0.01) / years)), state.date)
     )

@@ -149,7 +149,7 @@ def test_a_card_that_needs_training_is_not_applicable_without(request_of):
 def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
     plan, report, folder = carry_out(request_of(spec="hostile:Plain"))
     assert (plan.training_set, report.counts) == (None, {"ok": 2})
-    assert "does not learn" in plan.to_text()
+    assert "has no learn()" in plan.to_text()
     assert prediction_files.read_run(folder)["learned"] is None
 
 
@@ -202,7 +202,7 @@ def test_a_task_without_truths_or_queries_teaches_nothing(tasks, tmp_path):
 def test_two_maps_of_one_name_are_refused(tasks, tmp_path):
     out = Path(shutil.copytree(tasks, tmp_path / "other"))
     train = [tasks / "tasks" / CLEAN, out / "tasks" / "absent" / "town-riverside"]
-    with pytest.raises(ConfigError, match=r"another task in .*: leave one of them out"):
+    with pytest.raises(ConfigError, match=r"another task on .*: leave one of them out"):
         plan_training(train, asked=[], split=None, most=5)
 
 
@@ -218,7 +218,7 @@ def test_a_training_set_is_the_same_whatever_order_its_tasks_are_named_in(tasks)
 @given(st.lists(st.tuples(*(st.sampled_from("abc") for _ in range(3))), min_size=1, max_size=40), st.randoms())
 def test_every_beginning_is_spread_over_places_then_suites_and_knows_no_order(drawn, chance):
     pairs = [
-        _Pair(place=place, suite=suite, site=site, query_id=str(at), task=Path(), said=("", ""))
+        _Pair(place=place, suite=suite, site=site, query_id=str(at), task=Path(), hashes=("", ""))
         for at, (place, suite, site) in enumerate(drawn)
     ]
     by = (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site)
@@ -251,7 +251,7 @@ def test_regions_of_one_place_and_blocks_within_the_buffer_are_refused():
     with pytest.raises(ConfigError, match="is of place 'two', and so is"):
         check_apart({"there": task}, {"beyond": task}, two_parts(5000.0))
     with pytest.raises(
-        ConfigError, match=r"blocks here/0-0 and there/0-0, .* are 1199 m apart, split 'near' wants 1200"
+        ConfigError, match=r"blocks here/0-0 and there/0-0, .* are 1199 m apart, split 'near' needs 1200 m"
     ):
         check_apart({"here": task}, {"there": task}, two_parts(1199.0))
     check_apart({"here": task}, {"there": task}, two_parts(1200.0))

@@ -92,7 +92,7 @@ def test_a_query_whose_content_changed_is_asked_again_and_both_answers_stay(draw
     assert len(list(validate(folder, [task]))) == len(after)
     part, asked = ask(task)
     assert (asked, part.aside) == (len(after), len(before))
-    with pytest.raises(StoreError, match="and to what it was when it was drawn otherwise: name the tasks with --tasks"):
+    with pytest.raises(StoreError, match="and to an earlier version of it: name the tasks with --tasks"):
         prediction_files.merge_runs([folder], tmp_path / "both.parquet")
     assert prediction_files.merge_runs([folder], tmp_path / "mine.parquet", asked=after) == len(after)
     assert list(validate(tmp_path / "mine.parquet", [task])) == []

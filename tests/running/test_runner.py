@@ -206,7 +206,7 @@ def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypa
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(prediction_files, "write_table", full)
-    with pytest.raises(StoreError, match=r"No space left on device.*it goes on there"):
+    with pytest.raises(StoreError, match=r"No space left on device.*it continues there"):
         run_all(request_of(task, tmp_path, limit=4))
     monkeypatch.undo()
     assert table(folder) == before

@@ -48,8 +48,8 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.reading import Reader
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.find import exhaustive, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan

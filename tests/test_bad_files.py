@@ -29,7 +29,7 @@ from sasgeo_bench.ageing.files import read_ageing
 from sasgeo_bench.ageing.measure import DTYPES
 from sasgeo_bench.config import parse_toml, shipped_dir
 from sasgeo_bench.errors import MOST_MESSAGE, SasgeoError
-from sasgeo_bench.files.file_manifest import check_site
+from sasgeo_bench.files.folders import check_site
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
@@ -49,7 +49,7 @@ from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.running.testing import TinyPlace
-from sasgeo_bench.sasgeo.learnt import ScorerModel as Learnt
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel as Learnt
 from sasgeo_bench.scoring.entries import find_entries
 from sasgeo_bench.scoring.submission_files import read_card, read_submission, write_submission
 from sasgeo_bench.tasks import task_files

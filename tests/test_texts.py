@@ -27,7 +27,7 @@ from sasgeo_bench.leaderboard.board_files import write_board
 from sasgeo_bench.leaderboard.board_plots import Page, page
 from sasgeo_bench.leaderboard.case_plot import pixels_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
-from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.site import _environment
 from sasgeo_bench.publishing.site_files import svg_fault

@@ -33,7 +33,7 @@ from sasgeo_bench.sasgeo.class_weights import (
     worth_of,
     worth_table,
 )
-from sasgeo_bench.sasgeo.learnt import ScorerModel
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.

@@ -13,9 +13,8 @@ from sasgeo_bench.leaderboard.private_board import OnPrivate
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.failures import LOG, Failures
 from sasgeo_bench.scoring.contrasts import Contrast, Finding
-from sasgeo_bench.scoring.controls import Verdict
+from sasgeo_bench.scoring.controls import Falsifier, Verdict
 from sasgeo_bench.scoring.entries import Entry
-from sasgeo_bench.scoring.falsifiers import Falsifier
 from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.split import Split

@@ -11,13 +11,21 @@ import pyarrow as pa
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import FIGURE_FILES, PICTURE_FILES, SITE, SITE_FOLDERS, check_known, check_site
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import (
+    FIGURE_FILES,
+    PICTURE_FILES,
+    SITE,
+    SITE_FOLDERS,
+    check_known,
+    check_site,
+    fresh_folder,
+    locked,
+)
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.scoring import falsifiers, protection
+from sasgeo_bench.scoring import controls, protection
 from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.rows import Row
@@ -173,7 +181,7 @@ _FINDING: Final = {item.name: item.type for item in fields(Finding)}
 _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
     "leaderboard": {item.name: item.type for item in fields(Row)},
     "contrasts": _FINDING,
-    "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in falsifiers.COLUMNS},
+    "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in controls.COLUMNS},
     "controls": {item.name: item.type for item in fields(Verdict)},
     "protection": {name: str if name in _TEXTS else float for name in protection.COLUMNS},
     "scores": {

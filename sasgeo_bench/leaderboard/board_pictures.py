@@ -28,7 +28,7 @@ from sasgeo_bench.leaderboard.plot_tables import shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, read_picture, said_of
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.layer_file import read_overview
+from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running.failures import Failures, stops_all
 from sasgeo_bench.scoring.contrasts import Contrast

@@ -18,7 +18,7 @@ from sasgeo_bench.leaderboard.board_files import PROTECTION, Extra, check_board,
 from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
-from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions.region import DATA_VERSION
@@ -32,10 +32,16 @@ from sasgeo_bench.scoring.contestants import (
     score_entries,
 )
 from sasgeo_bench.scoring.contrasts import contrast_frame, hold_contrasts
-from sasgeo_bench.scoring.controls import failed_controls, hold_controls, is_control, verdict_frame
+from sasgeo_bench.scoring.controls import (
+    failed_controls,
+    falsifier_frame,
+    hold_controls,
+    hold_falsifiers,
+    is_control,
+    verdict_frame,
+)
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out, set_apart
-from sasgeo_bench.scoring.falsifiers import falsifier_frame, hold_falsifiers
 from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.scoring.protection import protection_frame
 from sasgeo_bench.scoring.rejection import OWN, RejectionTask, Rule, apply_rejectors, remarks_of, rules_of

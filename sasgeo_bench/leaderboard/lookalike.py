@@ -17,8 +17,8 @@ from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import rarity_map, weight_map, worth_of
-from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.reading import Reader, Reading
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import top_of
 from sasgeo_bench.search.find import rank
 from sasgeo_bench.tasks.query import Query

@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.scoring.base import Floats, Ints
-from sasgeo_bench.scoring.calibration import equal_mass_bins, stanford
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.decisions import Answers, equal_mass_bins, stanford
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import effective_count, wilson_share
 from sasgeo_bench.scoring.protection import ProtectionLevels

@@ -19,8 +19,7 @@ from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
 from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_means, effective_count, seed_of_text, share_interval
 from sasgeo_bench.scoring.metrics import primary_of, ranks_of
-from sasgeo_bench.scoring.pose import rank_pose
-from sasgeo_bench.scoring.ranking import Ranks, hits
+from sasgeo_bench.scoring.pose import Ranks, hits, rank_pose
 from sasgeo_bench.scoring.rejection import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE

@@ -23,8 +23,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
-from sasgeo_bench.regions.layer_file import read_layers
-from sasgeo_bench.regions.layers import PRESENT
+from sasgeo_bench.regions.layers import PRESENT, read_layers
 from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.running import prediction_files

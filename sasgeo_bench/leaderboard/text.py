@@ -15,8 +15,7 @@ from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.contrasts import Finding
-from sasgeo_bench.scoring.controls import Verdict, verdict_frame
-from sasgeo_bench.scoring.falsifiers import Falsifier
+from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdict_frame
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT
 from sasgeo_bench.scoring.strata import ALL
 from sasgeo_bench.texts import markdown, markdown_item, tex

@@ -22,7 +22,7 @@ from sasgeo_bench.leaderboard.tables import (
     text_cells,
 )
 from sasgeo_bench.scoring.contrasts import Finding
-from sasgeo_bench.scoring.falsifiers import Falsifier
+from sasgeo_bench.scoring.controls import Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES
 
 _CONTROLS_NOTE: Final = (

@@ -13,8 +13,7 @@ from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import MatchError
 
 if TYPE_CHECKING:
-    from sasgeo_bench.matching.matcher import Matcher
-    from sasgeo_bench.matching.rejector import Rejector
+    from sasgeo_bench.matching.matcher import Matcher, Rejector
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
@@ -133,7 +132,7 @@ def rejector_maker(spec: str) -> "Callable[[], Rejector]":
 
 
 def _rejector(spec: str, target: Callable[[], Any]) -> "Rejector":
-    from sasgeo_bench.matching.rejector import RejectorCard  # noqa: PLC0415 - as in load_matcher
+    from sasgeo_bench.matching.matcher import RejectorCard  # noqa: PLC0415 - as in load_matcher
 
     rejector: Rejector = _made(spec, target)
     _check(spec, rejector, RejectorCard, "rejector", ("fit", "p_false"))

@@ -17,7 +17,7 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.files.file_manifest import sha256_of
+from sasgeo_bench.files.folders import sha256_of
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 _SILENT_S: Final = 30.0  # between two parts of a download

@@ -19,8 +19,7 @@ import pyarrow.compute as pc
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import SITE_FOLDERS, hashes_of, list_files, resolve_link
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import SITE_FOLDERS, fresh_folder, hashes_of, list_files, locked, resolve_link
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import MOST_VALUES, read_table, write_table
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES

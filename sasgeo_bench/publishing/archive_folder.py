@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.files.file_manifest import (
+from sasgeo_bench.files.folders import (
     FIGURE_FILES,
     PICTURE_FILES,
     SITE,

@@ -13,7 +13,7 @@ from typing import Any, Final
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.file_manifest import SITE, resolve_link
+from sasgeo_bench.files.folders import SITE, resolve_link
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOARD, check_shape, read_board
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.publishing.croissant import QUERY_TEXTS, TRUTH_TEXTS, cite_as
 from sasgeo_bench.publishing.release_files import (
     COPYRIGHT_URL,
     LICENCE_URL,
@@ -16,6 +15,7 @@ from sasgeo_bench.publishing.release_files import (
     ReleaseTask,
     places_of,
 )
+from sasgeo_bench.publishing.release_metadata import QUERY_TEXTS, TRUTH_TEXTS, cite_as
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.texts import markdown, markdown_code, quoted
 

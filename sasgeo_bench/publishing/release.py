@@ -14,7 +14,6 @@ from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.publishing.croissant import write_croissant
 from sasgeo_bench.publishing.dataset_card import CARD, DATASHEET, card_text, datasheet_text
 from sasgeo_bench.publishing.release_files import (
     Release,
@@ -30,9 +29,9 @@ from sasgeo_bench.publishing.release_files import (
     write_sums,
     write_texts,
 )
-from sasgeo_bench.publishing.stac import write_stac
+from sasgeo_bench.publishing.release_metadata import write_croissant, write_stac
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.layer_file import cog_faults
+from sasgeo_bench.regions.layers import cog_faults
 from sasgeo_bench.regions.region import LICENCE, Manifest
 from sasgeo_bench.regions.region_spec import find_region_file
 from sasgeo_bench.tasks import task_files

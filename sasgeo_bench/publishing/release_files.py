@@ -13,8 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import FileRecord, file_record
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import FileRecord, file_record, fresh_folder, locked
 from sasgeo_bench.files.parquet import open_table, read_table, table_writer
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
 from sasgeo_bench.regions.region_files import MANIFEST

@@ -16,9 +16,8 @@ import pyarrow as pa
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import IMAGES, SITE_FOLDERS, check_site, list_files
-from sasgeo_bench.files.file_manifest import SITE_MANIFEST as MANIFEST
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import IMAGES, SITE_FOLDERS, check_site, fresh_folder, list_files, locked
+from sasgeo_bench.files.folders import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record

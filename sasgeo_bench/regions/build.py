@@ -18,8 +18,7 @@ import geopandas as gpd
 import shapely
 
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import file_record, sha256_of
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import file_record, fresh_folder, locked, sha256_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.locate import Extract, find_extract
@@ -31,8 +30,7 @@ from sasgeo_bench.osm.taxonomy import Taxonomy, load_taxonomy
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.layer_file import PaintWindow, read_overview, write_layers
-from sasgeo_bench.regions.layers import burn_layers, make_paint
+from sasgeo_bench.regions.layers import PaintWindow, burn_layers, make_paint, read_overview, write_layers
 from sasgeo_bench.regions.region import (
     ATTRIBUTION,
     DATA_VERSION,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from sasgeo_bench.config import Document
-from sasgeo_bench.files.file_manifest import FileRecord
+from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.texts import FOLDER

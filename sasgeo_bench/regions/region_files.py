@@ -11,7 +11,7 @@ import shapely
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, GridError, StoreError
-from sasgeo_bench.files.file_manifest import FileRecord, file_record, sha256_of
+from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
 from sasgeo_bench.osm.features import check_features
@@ -94,7 +94,7 @@ def read_region(path: str | Path, *, around: Callable[[], AbstractContextManager
     All files are checked against their hashes now. `around` gives a context that is entered while features or graph
     are read. Raise `StoreError` if a file is missing, changed or unreadable.
     """
-    from sasgeo_bench.regions.layer_file import read_layers  # noqa: PLC0415 - imports GDAL
+    from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
 
     folder = Path(path)
     manifest = read_manifest(folder)

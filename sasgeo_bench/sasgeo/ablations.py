@@ -7,10 +7,9 @@ from typing import Literal
 import numpy as np
 
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.raster import doubted
-from sasgeo_bench.sasgeo.seasons import by_hand
-from sasgeo_bench.sasgeo.weights import Gains, even_gains, hand_gains, likelihood_gains
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
+from sasgeo_bench.sasgeo.weights import Gains, by_hand, even_gains, hand_gains, likelihood_gains
 
 Weights = Literal["even", "hand", "fitted"]
 

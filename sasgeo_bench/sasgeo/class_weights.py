@@ -23,9 +23,8 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.learnt import ScorerModel
-from sasgeo_bench.sasgeo.seasons import SEASONS
-from sasgeo_bench.sasgeo.weights import information
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
+from sasgeo_bench.sasgeo.weights import SEASONS, information
 
 CELL_M: Final = 4.0  # of a configuration: each sector of a ring holds some cells
 RINGS_M: Final = (16.0, 48.0)  # a junction; a junction and the next houses

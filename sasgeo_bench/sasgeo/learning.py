@@ -16,11 +16,11 @@ from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.edit_age import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.sasgeo.joint import Blend, columns
-from sasgeo_bench.sasgeo.learnt import ScorerModel, fit_scaling
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel, fit_scaling
+from sasgeo_bench.sasgeo.weights import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.query import Query, Truth

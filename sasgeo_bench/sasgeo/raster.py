@@ -13,9 +13,8 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.sasgeo.edit_age import STRATA, strata
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
-from sasgeo_bench.sasgeo.weights import Gains, weigh
+from sasgeo_bench.sasgeo.weights import STRATA, Gains, strata, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 
 THIN: Final = frozenset(

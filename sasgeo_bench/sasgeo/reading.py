@@ -19,11 +19,11 @@ from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import Rarity
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.joint import columns
-from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.tasks.query import Query

@@ -13,7 +13,7 @@ from scipy import special
 from sklearn.ensemble import GradientBoostingClassifier  # type: ignore[import-untyped, unused-ignore]
 from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
 
-from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.conformal import upper_rate
 from sasgeo_bench.sasgeo.integrity import APART_M, EVIDENCE, Diagnostic

@@ -13,12 +13,12 @@ from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard, Training
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
+from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.graph import GraphScore
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.learning import learn
-from sasgeo_bench.sasgeo.learnt import ScorerModel
-from sasgeo_bench.sasgeo.protection import levels_of
 from sasgeo_bench.sasgeo.reading import Reader, Reading
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.search.find import rank, search
 from sasgeo_bench.search.plan import Mode, Null, Plan
 from sasgeo_bench.tasks.query import Query

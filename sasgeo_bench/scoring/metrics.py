@@ -14,11 +14,9 @@ import pandas as pd
 
 from sasgeo_bench.scoring import cost
 from sasgeo_bench.scoring.base import Bools, Floats
-from sasgeo_bench.scoring.calibration import brier, calibration_error
-from sasgeo_bench.scoring.decisions import COST_RATIOS, decision_cost
+from sasgeo_bench.scoring.decisions import COST_RATIOS, brier, calibration_error, decision_cost
 from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc, false_fix_rate
-from sasgeo_bench.scoring.pose import PoseErrors, area_values, successes
-from sasgeo_bench.scoring.ranking import Ranks, hits, reciprocal_ranks
+from sasgeo_bench.scoring.pose import PoseErrors, Ranks, area_values, hits, reciprocal_ranks, successes
 
 RISKS: Final = (0.01, 0.05)  # of a false fix among accepted answers; thresholds are chosen for them
 TRACKS: Final = ("localization", "retrieval")

@@ -13,9 +13,9 @@ from statsmodels.stats.proportion import proportion_confint
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.sasgeo.protection import METHODS, RISKS, SCALE, level_name
+from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.base import Bools, Floats, check_column, weighted_mean
-from sasgeo_bench.scoring.calibration import stanford
+from sasgeo_bench.scoring.decisions import stanford
 from sasgeo_bench.scoring.intervals import LEVEL, Interval, effective_count, wilson_share
 from sasgeo_bench.scoring.rejection import turns
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE

@@ -13,8 +13,8 @@ import pandas as pd
 
 from sasgeo_bench.bounds import message_of
 from sasgeo_bench.errors import ConfigError, MatchError, counted
+from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import rejector_maker
-from sasgeo_bench.matching.rejector import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.parallel import spread
 from sasgeo_bench.scoring.base import Bools, Floats, weighted_mean

@@ -12,8 +12,7 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.pose import first_pose, pose_errors
-from sasgeo_bench.scoring.ranking import MISS, Rank, rank_candidate, rank_of
+from sasgeo_bench.scoring.pose import MISS, Rank, first_pose, pose_errors, rank_candidate, rank_of
 from sasgeo_bench.tasks.query import Head, Truth, base_of
 
 SCORER_VERSION: Final = 4  # raise it if the same predictions get other scores; a board has one version

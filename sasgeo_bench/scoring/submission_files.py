@@ -14,8 +14,7 @@ import pyarrow as pa
 from sasgeo_bench.bounds import MOST_MESSAGE
 from sasgeo_bench.config import check_document, parse_toml
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.file_manifest import file_record
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import file_record, fresh_folder, locked
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction

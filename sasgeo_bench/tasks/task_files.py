@@ -17,7 +17,7 @@ from pydantic import Field
 
 from sasgeo_bench.config import Document, check_document
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.file_manifest import file_record, sha256_of
+from sasgeo_bench.files.folders import file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE

@@ -20,8 +20,8 @@ from sasgeo_baselines.rejectors.margin_nms import MarginNms
 from sklearn.isotonic import IsotonicRegression
 
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
-from sasgeo_bench.matching.rejector import check_p_false
 from sasgeo_bench.matching.results import Prediction
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))

@@ -7,7 +7,7 @@ import pytest
 from matplotlib import image
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.sasgeo.learnt import ScorerModel as Learnt
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel as Learnt
 
 TOWN = "town-riverside"
 

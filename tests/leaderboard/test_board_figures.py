@@ -24,9 +24,9 @@ from sasgeo_bench.leaderboard.plot_tables import (
 )
 from sasgeo_bench.leaderboard.plots import draw_steps
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.sasgeo.protection import level_name
-from sasgeo_bench.scoring.calibration import calibration_error
+from sasgeo_bench.sasgeo.conformal import level_name
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
+from sasgeo_bench.scoring.decisions import calibration_error
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import protection_frame, protection_levels
 from sasgeo_bench.scoring.rejection import answers_of

@@ -23,7 +23,7 @@ from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import Extra, read_board
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
-from sasgeo_bench.matching.rejector import RejectorCard
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running import prediction_files

@@ -10,7 +10,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.lookalike import find_lookalike, find_pair
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.class_weights import HAND
-from sasgeo_bench.sasgeo.learnt import ScorerModel
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.tasks.suites.mining import RINGS, Windows, min_distance_m
 
 

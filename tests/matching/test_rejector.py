@@ -6,8 +6,8 @@ import pytest
 
 from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
-from sasgeo_bench.matching.rejector import Rejector, RejectorCard, check_p_false
 from sasgeo_bench.matching.results import Prediction
 
 SAID = {"name": "half", "version": "1", "title": "Half", "source": "original", "ours": "all", "licence": "MIT"}
@@ -54,7 +54,7 @@ def test_a_rejector_is_found_by_module_and_class():
     ("name", "words"),
     [
         ("NoVerbs", "NoVerbs is not a rejector, it has no fit and no p_false"),
-        ("NoCard", "card is a NoneType, expected a sasgeo_bench.matching.rejector.RejectorCard"),
+        ("NoCard", "card is a NoneType, expected a sasgeo_bench.matching.matcher.RejectorCard"),
         ("Raises", "cannot be made .*ValueError: first line second line"),
         ("Missing", "cannot be imported"),
     ],

@@ -15,8 +15,8 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
-from sasgeo_bench.files import file_manifest
-from sasgeo_bench.files.file_manifest import sha256_of
+from sasgeo_bench.files import folders
+from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import build as boards
 from sasgeo_bench.leaderboard.board import ScoreRequest
@@ -527,7 +527,7 @@ def test_what_cannot_be_written_is_told_before_anything_is_scored(own, mistake, 
     def refuse(*_, **__):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr(file_manifest.tempfile, "TemporaryDirectory", refuse)
+    monkeypatch.setattr(folders.tempfile, "TemporaryDirectory", refuse)
     line = mistake("score", "--predictions", own, "--results", tmp_path / "results")
     assert "cannot be written (Read-only file system): check your rights, or name another folder" in line
 

@@ -25,11 +25,11 @@ from PIL import Image
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rio_cogeo.cogeo import cog_validate
 
-from sasgeo_bench.files.file_manifest import file_record
+from sasgeo_bench.files.folders import file_record
 from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.release_files import Release, open_release
-from sasgeo_bench.regions.layer_file import read_overview
+from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest

@@ -18,7 +18,7 @@ from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regio
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import SiteSource, Spot
 from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame
-from sasgeo_bench.scoring.falsifiers import Falsifier, falsifier_frame
+from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
 from tests.handmade import HOSTILE, MARKUP, about_of, asked, card_of, entry_of, many_rows
 
 FINDING = Finding(

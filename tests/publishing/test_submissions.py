@@ -14,7 +14,7 @@ import pytest
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.file_manifest import file_record
+from sasgeo_bench.files.folders import file_record
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.build import make_board

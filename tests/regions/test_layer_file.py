@@ -10,9 +10,16 @@ import shapely
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.regions import layer_file
-from sasgeo_bench.regions.layer_file import overview_factors, read_layers, read_overview, write_layers
-from sasgeo_bench.regions.layers import OUTSIDE, Paint, burn_layers
+from sasgeo_bench.regions import layers
+from sasgeo_bench.regions.layers import (
+    OUTSIDE,
+    Paint,
+    burn_layers,
+    overview_factors,
+    read_layers,
+    read_overview,
+    write_layers,
+)
 
 CLASSES = ("building", "water", "bridge")
 GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_200_000.0, cell_size_m=2.0, rows=2300, cols=4700)
@@ -123,5 +130,5 @@ def test_a_file_that_cannot_be_written_or_read_is_told(tmp_path):
 
 
 def test_memory_of_a_window_does_not_grow_with_the_raster():
-    largest = max(window.rows * window.cols for _, _, window in GRID.windows(layer_file.WINDOW_CELLS))
-    assert largest <= layer_file.WINDOW_CELLS**2
+    largest = max(window.rows * window.cols for _, _, window in GRID.windows(layers.WINDOW_CELLS))
+    assert largest <= layers.WINDOW_CELLS**2

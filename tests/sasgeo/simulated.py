@@ -7,8 +7,8 @@ import numpy as np
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
-from sasgeo_bench.sasgeo.protection import levels_of
 from sasgeo_bench.search.plan import Null
 
 CLASSES, MODES, SIGMA_M = 4, 6, 3.0

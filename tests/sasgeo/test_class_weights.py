@@ -19,10 +19,9 @@ from sasgeo_bench.sasgeo.class_weights import (
     worth_of,
     worth_table,
 )
-from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.rates import ClassRates
-from sasgeo_bench.sasgeo.seasons import by_hand
-from sasgeo_bench.sasgeo.weights import information
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
+from sasgeo_bench.sasgeo.weights import by_hand, information
 
 NAMES = load_taxonomy().names
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.regions.evidence import PRESENT
-from sasgeo_bench.sasgeo.edit_age import NEVER, STRATA, StampTally, fit_trust, idle_years, strata
 from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.weights import NEVER, STRATA, StampTally, fit_trust, idle_years, strata
 
 
 def dated(region, years):

@@ -6,7 +6,7 @@ import pytest
 from scipy.special import softmax
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.sasgeo.learnt import START, fit_scaling
+from sasgeo_bench.sasgeo.scorer_model import START, fit_scaling
 
 TRUE = np.array([0.03, 0.002, 0.01])
 

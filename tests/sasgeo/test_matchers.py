@@ -10,9 +10,9 @@ import pytest
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_match
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.sasgeo.conformal import PROTECTION
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
-from sasgeo_bench.sasgeo.learnt import ScorerModel
-from sasgeo_bench.sasgeo.protection import PROTECTION
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.variants import (
     Sasgeo,
     SasgeoAgeless,

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.sasgeo.integrity import Modes
-from sasgeo_bench.sasgeo.protection import (
+from sasgeo_bench.sasgeo.conformal import (
     PROTECTION,
     RISKS,
     density_level,
@@ -18,6 +17,7 @@ from sasgeo_bench.sasgeo.protection import (
     separation_level,
     sigmas,
 )
+from sasgeo_bench.sasgeo.integrity import Modes
 
 SIGMA_M = 2.0
 

@@ -6,8 +6,7 @@ import pytest
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally
-from sasgeo_bench.sasgeo.seasons import HAND, SEASONS, by_hand, fit_season
-from sasgeo_bench.sasgeo.weights import likelihood_gains
+from sasgeo_bench.sasgeo.weights import HAND, SEASONS, by_hand, fit_season, likelihood_gains
 
 RATES = ClassRates(hit=0.9, false_alarm=0.01, missing=0.01, vanish_per_year=0.03, appear_per_year=0.01, mapped=0.1)
 

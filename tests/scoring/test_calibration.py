@@ -12,12 +12,12 @@ from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.calibration import (
+from sasgeo_bench.scoring.decisions import (
+    Answers,
     brier,
     calibration_error,
     stanford,
 )
-from sasgeo_bench.scoring.decisions import Answers
 
 ROWS = st.lists(st.tuples(st.integers(0, 8).map(lambda n: n / 8), st.booleans()), min_size=1, max_size=15)
 METRES = st.one_of(st.integers(0, 4).map(float), st.just(math.inf))

@@ -7,7 +7,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.validity_tables import falsifier_table
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.falsifiers import COLUMNS, falsifier_frame, hold_falsifiers
+from sasgeo_bench.scoring.controls import COLUMNS, falsifier_frame, hold_falsifiers
 from tests.scoring.test_tables import scores
 
 CONTRAST = Contrast(name="graph", first="with", second="without", suites=("occlusion",), kinds=("U2",))

@@ -15,14 +15,15 @@ from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.base import weighted_mean, weighted_quantile
 from sasgeo_bench.scoring.pose import (
+    MISS,
     PoseErrors,
+    Rank,
     area_values,
     first_pose,
     pose_errors,
     rank_pose,
     successes,
 )
-from sasgeo_bench.scoring.ranking import MISS, Rank
 
 POSES = st.builds(
     Pose,

@@ -8,7 +8,7 @@ import pytest
 
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.site_pages import protection_tables
-from sasgeo_bench.sasgeo.protection import METHODS, RISKS, SCALE, level_name
+from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.protection import ALERT_LIMITS_M, COLUMNS, CONFORMAL, protection_frame
 from tests.scoring.test_integrity import split_of

@@ -14,7 +14,7 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.base import weighted_mean
-from sasgeo_bench.scoring.ranking import (
+from sasgeo_bench.scoring.pose import (
     MISS,
     Rank,
     Ranks,

@@ -16,7 +16,7 @@ from sasgeo_bench.scoring.decisions import Answers
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import Interval, wilson_mean
 from sasgeo_bench.scoring.metrics import ranks_of
-from sasgeo_bench.scoring.ranking import hits, reciprocal_ranks
+from sasgeo_bench.scoring.pose import hits, reciprocal_ranks
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL

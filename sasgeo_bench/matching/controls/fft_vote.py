@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.controls.answers import is_blind, ranked_candidates
+from sasgeo_bench.matching.controls.blind import is_blind, ranked_candidates
 from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region

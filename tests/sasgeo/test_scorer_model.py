@@ -8,8 +8,8 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.sasgeo.joint import Blend
-from sasgeo_bench.sasgeo.learnt import ScorerModel
 from sasgeo_bench.sasgeo.rates import FAR, hand_rates
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 
 
 def learnt(**changes):

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.sasgeo.edit_age import STRATA
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
-from sasgeo_bench.sasgeo.seasons import SEASONS, by_hand, fit_season
+from sasgeo_bench.sasgeo.weights import SEASONS, STRATA, by_hand, fit_season
 
 START: Final = 0.01  # default: one cell in a hundred is independent
 _WIDTH: Final = 1.0  # of the prior, in logarithms

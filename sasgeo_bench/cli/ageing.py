@@ -39,12 +39,12 @@ def measure_ageing_command(
 def compare_ageing_command(
     folder: Annotated[list[Path], typer.Argument(help="folders that measure-ageing wrote")],
     control: Annotated[
-        list[Path] | None, typer.Option(help="folder of maps a day apart: told of beside the places, never as a rate")
+        list[Path] | None, typer.Option(help="folder of maps a day apart: reported next to the places, never as a rate")
     ] = None,
     rates: Annotated[Path | None, typer.Option(help="also write the rates of the places into this TOML file")] = None,
     out: Annotated[Path, typer.Option(help="the Markdown file to write")] = Path("ageing-summary.md"),
 ) -> None:
-    """Put the measured rates of several places beside each other, class by class."""
+    """Put the measured rates of several places side by side, class by class."""
     places, controls = ([read_ageing(item) for item in items] for items in (folder, control or ()))
     say(write_summary(out, places, controls))
     if rates is not None:

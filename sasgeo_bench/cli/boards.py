@@ -56,7 +56,7 @@ Rejectors = Annotated[
 ]
 Submissions = Annotated[
     list[Path] | None,
-    typer.Option(help="a submission, or a folder of them, beside stored results; those for their board are scored"),
+    typer.Option(help="a submission, or a folder of them, for stored results; those for their board are scored"),
 ]
 Private = Annotated[
     Path | None,
@@ -78,9 +78,7 @@ class ScoreOptions(Options):
     tasks: Annotated[
         list[Path] | None, typer.Option(help="task folder; may be repeated; default: all that are answered")
     ] = None
-    truth: Annotated[Path | None, typer.Option(help="folder of the truths, beside the tasks; default: OUT/truth")] = (
-        None
-    )
+    truth: Annotated[Path | None, typer.Option(help="folder of the truths of the tasks; default: OUT/truth")] = None
     name: Annotated[str, typer.Option(help="of the board: OUT/boards/NAME")] = "board"
     split: Annotated[
         str | None,

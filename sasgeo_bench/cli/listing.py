@@ -54,6 +54,6 @@ def _list(kind: str, group: str, own: Mapping[str, tuple[str, str]]) -> None:
         for name, point in list_entry_points(group).items()
     }
     table = Table(kind, "package", "class", box=None, pad_edge=False)
-    for name, told in sorted((rows | dict(own)).items()):
-        table.add_row(name, *told)
+    for name, cells in sorted((rows | dict(own)).items()):
+        table.add_row(name, *cells)
     print_table(table)

@@ -141,9 +141,9 @@ def main() -> None:
     except SasgeoError as error:
         tell(f"sasgeo-bench: {error}")
         sys.exit(EXIT_USER)
-    except OSError as error:  # whatever nobody has put in words of their own, as of a name that is too long
-        said = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
-        tell(f"sasgeo-bench: {one_line(said)}")
+    except OSError as error:  # any fault without a message of its own, such as a name that is too long
+        line = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
+        tell(f"sasgeo-bench: {one_line(line)}")
         sys.exit(EXIT_USER)
     except SystemExit as leaving:
         if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word

@@ -47,9 +47,7 @@ class RunOptions(Options):
     ] = Limits().scratch_bytes // 10**6
     train: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="task folder to learn from, its truths beside it, of a place that is not asked; may be repeated"
-        ),
+        typer.Option(help="task folder to learn from, with its truths, of a place that is not asked; may be repeated"),
     ] = None
     most_trained: Annotated[
         int, typer.Option(help="queries to learn from at most, evenly over places, suites and sites")
@@ -132,7 +130,7 @@ def run(options: RunOptions) -> RunReport:
 
 def run_command(options: RunOptions) -> None:
     """Ask a matcher every query of some tasks; goes on where an earlier run was cut off."""
-    lines: list[object] = []  # said when the bars are gone, which would draw stdout to stderr
+    lines: list[object] = []  # printed once the progress bars are gone: they redirect stdout to stderr
     with shown_progress() as progress:
         report = run(**vars(options) | {"say": lines.append, "tell": tell, "progress": progress})
     for line in lines:
@@ -169,6 +167,6 @@ def merge_command(
     ] = None,
 ) -> None:
     """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
-    asked = {name: said for task in tasks or () for name, said in read_asked(task).items()}
+    asked = {name: asked for task in tasks or () for name, asked in read_asked(task).items()}
     count = merge_runs(runs, into, asked=asked if tasks else None)
     say(f"{into}: {counted(count, 'prediction')}")

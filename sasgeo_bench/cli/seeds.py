@@ -30,7 +30,7 @@ def private_seed(file: Path | None, *, tell: Tell, public: int | None = None) ->
         raise ConfigError(message)
     tell(f"drawing by a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}, into OUT/{PRIVATE_ROOT}")
     if seed.bits < LEAST_BITS:
-        tell(f"warning: {seed.bits} bits are no secret: whoever sees a query can find the seed; use 32 hex digits")
+        tell(f"warning: {seed.bits} bits are no secret: anyone who sees a query can find the seed; use 32 hex digits")
     elif seed.bits < REPRODUCING_BITS:
         tell(f"warning: a board of this seed makes no row reproduced: that takes {REPRODUCING_BITS} bits")
     return seed

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for whoever hands in answers: holding them against tasks, and making a submission of them."""
+"""Commands for authors of answers: validate them against tasks, and make a submission of them."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -90,13 +90,13 @@ def _show(faults: Iterable[Violation], predictions: Path) -> None:
 
 
 def _validate_submission(folder: Path, tasks: list[Path]) -> None:
-    """Of a submission queries without a row are no faults: they are misses, and said."""
-    said, found = hold_submission(folder, tasks)
+    """Validate a submission: queries without a row are no faults but misses, which are reported."""
+    submission, found = hold_submission(folder, tasks)
     _show([fault for fault in found if not fault.is_missing_row], folder)
     missing = len(found)
     misses = f", {counted(missing, 'query', 'queries')} without a row count as misses" if missing else ""
     against = "" if tasks else "; its rows were held against no queries (--for names the stored results of its board)"
     say(
-        f"{folder}: a sound submission of {said.card.name} {said.card.version} to {said.board}, "
-        f"{counted(len(said.tasks), 'task')}{misses}{against}"
+        f"{folder}: a sound submission of {submission.card.name} {submission.card.version} to {submission.board}, "
+        f"{counted(len(submission.tasks), 'task')}{misses}{against}"
     )

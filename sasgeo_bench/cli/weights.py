@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that show what classes and places are worth to the SASGeo scorer."""
+"""Commands that show the weights of classes and places in the SASGeo scorer."""
 
 import difflib
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
 WORTH: Final = (
     "worth",
-    "worth of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
+    "weight of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
     1,
     2,
 )
@@ -51,7 +51,7 @@ GAINS: Final = (
     ("quiet", "gain where neither mapped nor seen: nats a cell", 1, 2),
 )
 Learned = Annotated[
-    Path | None, typer.Option(help="what a matcher has learnt: out/runs/<matcher>/<hash>/learned/<sha>.json")
+    Path | None, typer.Option(help="the text that a matcher learned: out/runs/<matcher>/<hash>/learned/<sha>.json")
 ]
 
 
@@ -67,20 +67,20 @@ def weights_command(
     season: Annotated[str, typer.Option(help="of the view: leaf_on, snow, low_water or harvest; default: none")] = "",
     out: Out = Path("out"),
 ) -> None:
-    """Say what each class is worth to the scorer as the map ages; of a region draw the weight of each cell."""
+    """Print the weight of each class as the map ages; draw the weight of each cell of a region."""
     ages = sorted({check_age(one) for one in age or ()})
     check_season(season)
-    learnt = read_learnt(learned)
+    model = read_model(learned)
     place = None if region is None else find_region(region, out=out)
     classes = load_taxonomy().names if place is None else place.classes
     arms: dict[str, tuple[ScorerModel, Switches]] = {"hand": (ScorerModel.by_hand(classes), HAND)}
-    if learnt is not None:
-        arms["fitted"] = (check_classes(learnt, () if place is None else place.classes), FITTED)
+    if model is not None:
+        arms["fitted"] = (check_classes(model, () if place is None else place.classes), FITTED)
     tables = {
         name: worth_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
         for name, (known, arm) in arms.items()
     }
-    for column, title, factor, digits in (WORTH, *(GAINS if learnt else ()), INFORMATION):
+    for column, title, factor, digits in (WORTH, *(GAINS if model else ()), INFORMATION):
         say(title)
         print_table(_table(side_by_side(tables, column) * factor, digits))
     if place is not None:
@@ -98,11 +98,11 @@ def lookalike_command(
     out: Out = Path("out"),
 ) -> None:
     """Draw a place, the weights of its map, and the place most like it by class shares; with both scores."""
-    learnt = read_learnt(learned)
+    model = read_model(learned)
     mapped = find_region(region, out=out)
     seen = mapped if world is None else find_region(world, out=out)
-    arm = HAND if learnt is None else FITTED
-    known = check_classes(learnt or ScorerModel.by_hand(mapped.classes), mapped.classes)
+    arm = HAND if model is None else FITTED
+    known = check_classes(model or ScorerModel.by_hand(mapped.classes), mapped.classes)
     found = find_lookalike(mapped, seen, known, arm, side_m=side_m)
     for table in (_numbers(found.scores), _numbers(found.terms)):
         print_table(table)
@@ -112,8 +112,8 @@ def lookalike_command(
     say(f"lookalike: {path}")
 
 
-def read_learnt(path: Path | None) -> ScorerModel | None:
-    """What was learnt, of classes that this program knows; None where no file is named."""
+def read_model(path: Path | None) -> ScorerModel | None:
+    """Read a fitted model whose classes this program knows; None if no file is named."""
     if path is None:
         return None
     text = read_learned(path)
@@ -123,7 +123,7 @@ def read_learnt(path: Path | None) -> ScorerModel | None:
     try:
         return check_classes(ScorerModel.from_text(text))
     except ConfigError as error:
-        message = f"{path} is nothing that a sasgeo matcher has learnt: {error}"
+        message = f"{path} holds no model of a sasgeo matcher: {error}"
         raise ConfigError(message) from error
 
 
@@ -164,11 +164,11 @@ def _numbers(frame: pd.DataFrame) -> Table:
 
 
 def _drawn(
-    region: Region, learnt: ScorerModel, arm: Switches, *, ages: Sequence[float], season: str, out: Path
+    region: Region, model: ScorerModel, arm: Switches, *, ages: Sequence[float], season: str, out: Path
 ) -> list[Path]:
     """Draw a map of weights for each age, all by one scale of colours."""
     rarity = rarity_map(region)
-    worth = {age: worth_of(learnt, arm, age_years=age, season=season) for age in ages}
+    worth = {age: worth_of(model, arm, age_years=age, season=season) for age in ages}
     maps = {age: weight_map(region.layers, worth[age], rarity) for age in ages}
     top = top_of(list(maps.values()))
     weights = "weights fitted" if arm.learns else "weights by hand"
@@ -181,7 +181,7 @@ def _drawn(
             weights=maps[age],
             worth=dict(zip(region.classes, worth[age].tolist(), strict=True)),
             top=top,
-            facts=f"taken to be {age:g} years old  |  season: {season or 'none told'}  |  {weights}",
+            facts=f"taken to be {age:g} years old  |  season: {season or 'unknown'}  |  {weights}",
         )
         name = f"{region.manifest.id}-{region.manifest.extract.date}-{age:g}y{f'-{season}' if season else ''}"
         paths.append(out / "sheets" / f"weights-{name}{'-fitted' if arm.learns else ''}.png")

@@ -39,7 +39,7 @@ FIGURES: Final = "figures"
 PICTURES: Final = "pictures"
 PICTURES_FILE: Final = "pictures.json"
 _AS_CSV: Final = (LEADERBOARD, PROTECTION)  # tables that are also written for a spreadsheet
-_VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # said in each table
+_VERSIONS: Final = ("scorer_version", "task_version", "data_version", "made_by")  # stated in each table
 BOARD_FILES: Final = (
     *(f"{LEADERBOARD}.{kind}" for kind in ("parquet", "csv", "md", "tex")),
     *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
@@ -80,14 +80,14 @@ def write_board(
     something that is no part of a board, or cannot be written; an older board is then unchanged.
     """
     versions = {name: str(about[name]) for name in _VERSIONS if name in about}
-    said = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
+    metadata = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
     content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
     try:
         with locked(folder, tell=lambda _: None):
             check_board(folder, scorer_version=int(about["scorer_version"]))
             with fresh_folder(folder) as scratch:
                 for part in (Extra(tables=tables, texts=texts), *extras):
-                    _write_part(scratch, part, said)
+                    _write_part(scratch, part, metadata)
                 for name in (one for one in _AS_CSV if one in tables):
                     tables[name].map(csv_cell).to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
                 content = {name: value for name, value in content.items() if name != "failed" or value}
@@ -102,9 +102,9 @@ def write_board(
         raise StoreError(message) from error
 
 
-def _write_part(folder: Path, part: Extra, said: Mapping[str, str]) -> None:
+def _write_part(folder: Path, part: Extra, metadata: Mapping[str, str]) -> None:
     for name, frame in part.tables.items():
-        write_frame(frame, folder / f"{name}.parquet", attrs=said, **said)
+        write_frame(frame, folder / f"{name}.parquet", attrs=metadata, **metadata)
     for name, text in part.texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     for name, draw in part.figures.items():
@@ -143,8 +143,8 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
 
 def _version(path: Path) -> str:
     try:
-        said = dict(read_schema(path, mend=MEND).metadata or {})
-        return str(said.get(b"scorer_version", b"unknown"), encoding="utf-8")
+        metadata = dict(read_schema(path, mend=MEND).metadata or {})
+        return str(metadata.get(b"scorer_version", b"unknown"), encoding="utf-8")
     except (StoreError, UnicodeDecodeError):
         return "unknown"
 

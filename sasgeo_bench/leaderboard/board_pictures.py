@@ -25,7 +25,7 @@ from sasgeo_bench.leaderboard.cases import (
     words_of,
 )
 from sasgeo_bench.leaderboard.plot_tables import shown_matchers
-from sasgeo_bench.leaderboard.run_cases import Case, read_picture, said_of
+from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
@@ -207,8 +207,8 @@ def _add_cases(
     drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
     for case in _cases(drawn, board, words, root, found):
         row = drawn[case.query.query_id, case.matcher]
-        said = said_of(case)
-        off = f", {said['error_m']:.0f} m off" if "error_m" in said else ""
+        facts = facts_of(case)
+        off = f", {facts['error_m']:.0f} m off" if "error_m" in facts else ""
         alt = f"{case.failure}: view, true place and answer of {case.matcher} on {row['suite']}, {row['region']}{off}"
         task = about[row["suite"], row["region"]]
         region = root / "regions" / row["region"]
@@ -216,7 +216,7 @@ def _add_cases(
             "cases",
             f"{case.matcher}-{case.query.query_id}",
             partial(_drawn, case, region, task),
-            {**{str(name): value for name, value in row.items()}, "alt": alt, "said": said},
+            {**{str(name): value for name, value in row.items()}, "alt": alt, "said": facts},
         )
     order = {key: at for at, key in enumerate(drawn)}
     found.said["cases"].sort(key=lambda one: order[one["query_id"], one["matcher"]])

@@ -106,8 +106,8 @@ def _accepted(scores: pd.DataFrame, judged: pd.DataFrame | None) -> tuple[Bools,
     answered = scores["is_answered"].to_numpy(bool)
     if judged is None:
         return answered, np.zeros(len(scores), dtype=bool)
-    said = dict(zip(judged["query_id"], judged[OPERATING], strict=True))
-    known = np.array([float(said.get(name, np.nan)) for name in scores["query_id"]], dtype=np.float64)
+    operating = dict(zip(judged["query_id"], judged[OPERATING], strict=True))
+    known = np.array([float(operating.get(name, np.nan)) for name in scores["query_id"]], dtype=np.float64)
     is_known = ~np.isnan(known)
     return np.where(is_known, known > 0, answered), is_known
 
@@ -117,9 +117,9 @@ def _controls(scores: pd.DataFrame) -> pd.DataFrame:
     controls = scores[(scores["role"] == "control").to_numpy(bool) & scores["is_present"].to_numpy(bool)]
     how = {"is_right": "all", "changed_share": "max", "unknown_share": "max"}
     found = controls.groupby(list(_SITE), as_index=False).agg(how)
-    beside = scores[list(_SITE)].merge(found, on=list(_SITE), how="left")
-    said = {"is_right": beside["is_right"].eq(other=True), "is_wrong": beside["is_right"].eq(other=False)}
-    return beside.assign(**said).fillna({"changed_share": 0.0, "unknown_share": 0.0})
+    joined = scores[list(_SITE)].merge(found, on=list(_SITE), how="left")
+    shares = {"is_right": joined["is_right"].eq(other=True), "is_wrong": joined["is_right"].eq(other=False)}
+    return joined.assign(**shares).fillna({"changed_share": 0.0, "unknown_share": 0.0})
 
 
 def sample_cases(cases: pd.DataFrame, *, each: int, most: int = MOST_CASES) -> pd.DataFrame:

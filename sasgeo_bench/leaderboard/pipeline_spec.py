@@ -109,12 +109,12 @@ class PipelineFile(NamedDocument):
     def sha256(self) -> str:
         """Hash of all that it says, defaults among it, as `board.json` names it."""
         # Files that leave a newer key out keep the hash that boards were made under before there was one.
-        said = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
-        for task in said["task"]:
+        fields = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
+        for task in fields["task"]:
             for name in CHOICE:
                 if not task[name]:
                     del task[name]
-        return hashlib.sha256(json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @property
     def said(self) -> dict[str, str]:

@@ -45,7 +45,7 @@ SEEDS_NOTE: Final = (
 )
 
 _IS_PRIVATE: Final = (
-    "Seeds: this board is of a private seed. Its figures may be told; publish none of its files, for they hold "
+    "Seeds: this board is of a private seed. Its figures may be published; publish none of its files, for they hold "
     "queries, truths and answers."
 )
 _IS_PUBLIC: Final = (
@@ -182,7 +182,7 @@ def verdict_of(figures: Sequence[SeedFigure]) -> tuple[str, str]:
     return REPRODUCED, whole[0].to_text()
 
 
-def said_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[str, Any]:
+def record_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[str, Any]:
     """Return the entry of `board.json` on both seeds of one matcher."""
     return {"verdict": verdict, "why": why, "figures": [item.model_dump() for item in figures]}
 
@@ -195,10 +195,10 @@ def seed_lines(about: Mapping[str, Any]) -> list[str]:
     if not seed:
         return [_IS_PUBLIC]
     words = f"a private seed of {seed['bits']} bits, commitment {seed['commitment'][:12]}"
-    said = [(entry["name"], entry.get("private")) for entry in about.get("entries", ())]
+    rows = [(entry["name"], entry.get("private")) for entry in about.get("entries", ())]
     return [
         f"Seeds: rows were held against the same pipeline on {words}.",
-        *(f"{name}: {row['verdict']} ({row['why']})." for name, row in said if row),
+        *(f"{name}: {row['verdict']} ({row['why']})." for name, row in rows if row),
     ]
 
 
@@ -283,11 +283,11 @@ def hold_private(
         other = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
         why = _lack(other, about[task_files.PRIVATE])
         if other is None or why:
-            rows[entry.name] = said_of(RUN_HERE, why)
+            rows[entry.name] = record_of(RUN_HERE, why)
             continue
         mine, frame = scores[entry.name], theirs[theirs["matcher"] == other["name"]]
         figures = compare_seeds(mine[_is_of(mine, named)], frame, draws=draws)
-        rows[entry.name] = said_of(*verdict_of(figures), figures)
+        rows[entry.name] = record_of(*verdict_of(figures), figures)
     return OnPrivate(seed=about[task_files.PRIVATE], rows=rows)
 
 
@@ -318,9 +318,9 @@ def _is_of(scores: pd.DataFrame, named: set[tuple[str, ...]]) -> "pd.Series[bool
     return pd.Series([key in named for key in keys], index=scores.index, dtype=bool)
 
 
-def _whose(name: str, said: Mapping[str, Any]) -> tuple[str, ...]:
+def _whose(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     """Return name, version, and hash of code and settings, which identify an entry on both boards."""
-    return (name_alone(name), *(str(said.get(item)) for item in _WHOSE))
+    return (name_alone(name), *(str(entry.get(item)) for item in _WHOSE))
 
 
 def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
@@ -345,7 +345,7 @@ def kept_private(about: Mapping[str, Any], entries: Sequence[Entry], root: Path)
     known = {_whose(entry["name"], entry): entry.get("private") for entry in about["entries"]}
     rows = {}
     for entry in entries:
-        said = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
-        if entry.runs and said and all(source.is_relative_to(root) for source in entry.sources):
-            rows[entry.name] = said
+        row = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
+        if entry.runs and row and all(source.is_relative_to(root) for source in entry.sources):
+            rows[entry.name] = row
     return OnPrivate(seed=about["private"], rows=rows)

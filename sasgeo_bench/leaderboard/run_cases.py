@@ -79,12 +79,12 @@ class Case:
         return math.hypot(fix.easting_m - true.easting_m, fix.northing_m - true.northing_m)
 
 
-def said_of(case: Case) -> dict[str, float | str]:
+def facts_of(case: Case) -> dict[str, float | str]:
     """Return the known facts of a case as plain numbers and words.
 
     `error_m` is the distance from where the view was taken, also of absent places; `score_margin` the score of the
     first pose less that of the second; `p_false_<rejector>` (`order_<rejector>` where it is no probability) and
-    `accepted_<rejector>` what a rejector says, and `told_<name>` what the answer told of itself.
+    `accepted_<rejector>` are of a rejector, `told_<name>` are diagnostics of the answer.
     """
     prediction, truth = case.prediction, case.truth
     status: str = MISSING if prediction is None else prediction.status
@@ -204,25 +204,27 @@ def _title(case: Case) -> str:
 
 def _lines(case: Case) -> list[str]:
     """Return the lines of a picture about an answer: result, rejectors, diagnostics."""
-    said = said_of(case)
-    lines = ["what is known of the answer", f"status: {said['status']}"]
+    facts = facts_of(case)
+    lines = ["the answer", f"status: {facts['status']}"]
     if case.error_m is not None:
         lines.append(f"error: {case.error_m:.1f} m" + ("" if case.truth.is_present else " (of an absent place)"))
     if case.query.track == "retrieval":
         lines.append(f"right candidate: {_right_candidate(case)}")
-    if "confidence" in said:
-        lines.append(f"own confidence: {said['confidence']:.3g}")
-    said_by = [(f"P(false) {name}", name, value) for name, value in case.p_false.items()]
-    said_by += [(f"{name} (an order, no probability)", name, value) for name, value in case.orders.items()]
-    for label, name, value in said_by:
+    if "confidence" in facts:
+        lines.append(f"own confidence: {facts['confidence']:.3g}")
+    rejectors = [(f"P(false) {name}", name, value) for name, value in case.p_false.items()]
+    rejectors += [(f"{name} (an order, no probability)", name, value) for name, value in case.orders.items()]
+    for label, name, value in rejectors:
         taken = "" if name not in case.accepted else f", {'accepted' if case.accepted[name] else 'rejected'}"
         lines.append(f"{label}: {value:.3g}{taken}")
     lines.append(f"unknown {case.truth.unknown_share:.2f}, changed {case.truth.changed_share:.2f}" + _alias(case))
-    told = {} if case.prediction is None else dict(case.prediction.diagnostics)
-    lines += ["", "what the integrity model saw"] if told or said_by else ["", "the answer told nothing of itself"]
-    known = [(item.name, item.unit) for item in EVIDENCE if item.name in told]
-    known += [(name, "") for name in sorted(told) if name not in {name for name, _ in known}]
-    lines += [f"{_short(name)}: {told[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known]
+    diagnostics = {} if case.prediction is None else dict(case.prediction.diagnostics)
+    lines += ["", "its diagnostics"] if diagnostics or rejectors else ["", "no diagnostics"]
+    known = [(item.name, item.unit) for item in EVIDENCE if item.name in diagnostics]
+    known += [(name, "") for name in sorted(diagnostics) if name not in {name for name, _ in known}]
+    lines += [
+        f"{_short(name)}: {diagnostics[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known
+    ]
     rest = len(lines) - _MOST_LINES
     return lines if rest <= 0 else [*lines[: _MOST_LINES - 1], f"and {rest + 1} more"]
 

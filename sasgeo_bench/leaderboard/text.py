@@ -25,11 +25,11 @@ _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
 def warnings_of(board: pd.DataFrame) -> list[str]:
     """Return what a reader must know before reading on."""
-    said = []
+    warnings = []
     if len(board):
         blocks, places = int(board["blocks"].max()), int(board["places"].max())
         if blocks < _FEW_BLOCKS or places < _FEW_PLACES:
-            said.append(
+            warnings.append(
                 f"{counted(blocks, 'block')} in {counted(places, 'place')}: fewer than {_FEW_BLOCKS} in {_FEW_PLACES}, "
                 "so intervals speak of these places and little of others."
             )
@@ -38,8 +38,8 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
         for matcher, count in whole.groupby("matcher")["missing"].sum().items():
             if count:
                 rest = "has no row and counts as a miss" if count == 1 else "have no row and count as misses"
-                said.append(f"{matcher}: {counted(count, 'query', 'queries')} {rest}.")
-    return said
+                warnings.append(f"{matcher}: {counted(count, 'query', 'queries')} {rest}.")
+    return warnings
 
 
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
@@ -66,17 +66,17 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
 def training_lines(about: Mapping[str, Any]) -> list[str]:
     """Return which rows are set apart, and which entries were trained on which places.
 
-    >>> said = {"file": "learned/ab.json", "trained_on": ["monaco", "porto"], "pairs": 24, "asked": ["clean/vaduz"]}
-    >>> training_lines({"entries": [{"name": "mine", "learned": [said]}]})
-    ['mine: for 1 task (clean/vaduz) learnt from 24 queries of 2 places (monaco, porto).']
+    >>> record = {"file": "learned/ab.json", "trained_on": ["monaco", "porto"], "pairs": 24, "asked": ["clean/vaduz"]}
+    >>> training_lines({"entries": [{"name": "mine", "learned": [record]}]})
+    ['mine: for 1 task (clean/vaduz) trained on 24 queries of 2 places (monaco, porto).']
     """
-    apart = [
-        f"{entry['name']} is set apart: {entry['set_apart']}. It is in no rank; its figures stand in tables apart."
+    set_apart = [
+        f"{entry['name']} is set apart: {entry['set_apart']}. It has no rank; its figures stand in other tables."
         for entry in about.get("entries", ())
         if entry.get("set_apart")
     ]
-    return apart + [
-        f"{entry['name']}: for {named(one['asked'], 'task')} {'learnt' if one['file'] else 'could not learn'} from "
+    return set_apart + [
+        f"{entry['name']}: for {named(one['asked'], 'task')} {'trained on' if one['file'] else 'could not train on'} "
         f"{counted(one['pairs'], 'query', 'queries')} of {named(one['trained_on'], 'place')}."
         for entry in about.get("entries", ())
         for one in entry.get("learned", ())

@@ -72,7 +72,7 @@ class {cls}:
     )
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Keep the map; called once for each one. `learned` is what a `learn` of its own would have said."""
+        """Keep the map; called once for each one. `learned` is the text that its own `learn` returned."""
         self.region = region
         self.layers = LayerBits.of(region.layers)
 

@@ -16,23 +16,23 @@ NONE: Final = "none"  # `trained_on` of a method that was not trained on any pla
 MOST_PLACES: Final = 1000
 _SHORT: Final = 60  # characters
 
-_HALVES_SAID: Final = '{ a = ["munich"], b = ["porto"] }'
+_EXAMPLE_BY_HALF: Final = '{ a = ["munich"], b = ["porto"] }'
 
 
-def _trained(said: object) -> object:
+def _trained(given: object) -> object:
     """Refuse anything but "none", a list of places, or a list for each half."""
-    lists = list(said.values()) if isinstance(said, Mapping) and set(said) == set(HALVES) else [said]
+    lists = list(given.values()) if isinstance(given, Mapping) and set(given) == set(HALVES) else [given]
     is_sound = all(
         isinstance(item, list) and len(item) <= MOST_PLACES and all(isinstance(name, str) for name in item)
         for item in lists
     )
-    if said != NONE and (not is_sound or said == []):
+    if given != NONE and (not is_sound or given == []):
         message = (
             f'trained_on must be "{NONE}", places of the split as in ["porto"], or for each half of a cross-fit the '
-            f"places that taught the answers about it, as in {_HALVES_SAID}; got {repr(said)[:_SHORT]}"
+            f"training places of the answers about it, as in {_EXAMPLE_BY_HALF}; got {repr(given)[:_SHORT]}"
         )
         raise ValueError(message)
-    return said
+    return given
 
 
 Name = Annotated[str, Field(pattern=NAME)]
@@ -81,10 +81,10 @@ class Card(Document):
 
     def taught(self, half: Half | None) -> tuple[str, ...]:
         """Return the training places of the answers about a half; of None, where a split has no halves, all of them."""
-        said = self.trained_on
-        if isinstance(said, dict):
-            return self.places if half is None else tuple(said[half])
-        return tuple(said) if isinstance(said, list) else ()
+        given = self.trained_on
+        if isinstance(given, dict):
+            return self.places if half is None else tuple(given[half])
+        return tuple(given) if isinstance(given, list) else ()
 
 
 class SubmittedFile(Document):
@@ -123,7 +123,7 @@ class Submission(Document):
 
 def example_card(name: str = "my-matcher") -> str:
     """Return an example of a card, as TOML."""
-    return _EXAMPLE.format(name=name, halves=_HALVES_SAID)
+    return _EXAMPLE.format(name=name, halves=_EXAMPLE_BY_HALF)
 
 
 _EXAMPLE: Final = """\

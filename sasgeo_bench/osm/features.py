@@ -33,7 +33,7 @@ def make_features(columns: dict[str, object], *, epsg: int) -> "gpd.GeoDataFrame
 
     Raise `ShapeError` if a column is missing.
     """
-    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+    import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
     import pandas as pd  # noqa: PLC0415
 
     missing = [name for name in (*DTYPES, "geometry") if name not in columns]

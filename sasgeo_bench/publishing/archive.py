@@ -136,7 +136,7 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
     """
     stored = [path for path in predictions if is_pack(path)]
     if len(stored) > 1:
-        message = f"{stored[0]} and {stored[1]} are both stored results: name one, beside runs and files of your own"
+        message = f"{stored[0]} and {stored[1]} are both stored results: name one, and runs and files of your own"
         raise ConfigError(message)
     if not stored:
         return Settings()
@@ -227,7 +227,7 @@ def _check_whole(request: ScoreRequest) -> None:
         message = "a board without some regions is not stored: leave --without or --results away"
         raise ConfigError(message)
     if request.submissions:
-        message = "submissions stay apart from the results of their board: leave --submissions or --results away"
+        message = "the results of a board hold no submissions: leave --submissions or --results away"
         raise ConfigError(message)
     submitted = next((path for path in request.predictions if path.is_file()), None)
     if submitted is not None:

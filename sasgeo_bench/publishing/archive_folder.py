@@ -131,7 +131,7 @@ def check_replaced(folder: Path) -> None:
 TASK: Final = "task"  # column: number of the row in tasks.parquet
 TASK_SCHEMA: Final = pa.schema([(name, pa.string()) for name in ("task_json", "truth_json", "region_json")])
 MATCHER: Final = "matcher"  # column: whose answer it is
-LEARNED: Final = "learned"  # column: text that was learnt for a run
+LEARNED: Final = "learned"  # column: text that was learned for a run
 RUNS_SCHEMA: Final = pa.schema(
     [("contestant", pa.string()), ("rows", pa.int64()), ("about", pa.string()), (LEARNED, pa.string())]
 )

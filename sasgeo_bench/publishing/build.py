@@ -82,7 +82,7 @@ def publish(
             about={"board": source.name, "made_by": files.about.get("made_by")},
         )
     if written.site_bytes > MOST_BYTES:
-        tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB, pictures apart: slow to open from afar")
+        tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB without pictures: slow to open from afar")
     return written
 
 
@@ -225,7 +225,7 @@ def _pictures(record: Mapping[str, Any]) -> Pictures:
     cases = tuple(
         Case(
             **plain(item, "query_id", "matcher", "failure", "file", "alt", "suite", "region", "kind"),
-            said={str(name): str(value) for name, value in dict(item.get("said") or {}).items()},
+            facts={str(name): str(value) for name, value in dict(item.get("said") or {}).items()},
         )
         for item in record.get("cases", ())
     )

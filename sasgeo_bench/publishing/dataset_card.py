@@ -118,7 +118,7 @@ def _regions(release: Release) -> str:
         for place in places_of(release)
     )
     crossfit = (
-        "Each place is tested once. What is learnt for a place comes from the other half; the rest of its own half "
+        "Each place is tested once. Training for a place comes from the other half; the rest of its own half "
         "calibrates."
     )
     buffer = (
@@ -303,7 +303,7 @@ drawn at random among those that are mapped and not empty.
 visible from above is left out and counted, as is every object that could not be used: {_left_out_line(release)}.
 
 **Are there recommended splits?** Split `{release.split.id}`: {markdown(release.split.title)}.
-Whole places are kept apart, by {release.split.buffer_m:g} m at least.
+Whole places are separated by {release.split.buffer_m:g} m at least.
 
 **Are there errors, noise or redundancy?** The errors of the detector are put in on purpose, as many for each class as
 published detectors make. The maps have the errors and gaps of OpenStreetMap. All queries of one site show one place:

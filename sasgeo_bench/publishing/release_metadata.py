@@ -129,7 +129,7 @@ _TYPES: Final = (
 
 def write_croissant(folder: Path, release: Release) -> None:
     """Write the metadata of a release whose data is written, sizes and hashes of its files included."""
-    import mlcroissant as mlc  # noqa: PLC0415 - an extra: only whoever writes a release needs it
+    import mlcroissant as mlc  # noqa: PLC0415 - an extra, for releases only
 
     versions = type(mlc.Context().conforms_to)  # the package shows it nowhere else
     tables = [*_query_tables(release), *_map_tables(folder, release)]
@@ -317,7 +317,7 @@ _ASSETS: Final = {
 
 def write_stac(folder: Path, release: Release) -> None:
     """Write the catalog into `stac/` of a release: one collection, an item for each map."""
-    import pystac  # noqa: PLC0415 - an extra: only whoever writes a release needs it
+    import pystac  # noqa: PLC0415 - an extra, for releases only
 
     items = [_item(item, release) for item in release.maps]
     collection = _collection(items, release)

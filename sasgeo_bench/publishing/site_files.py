@@ -92,7 +92,7 @@ _OFFERED: Final = {  # files for download, with descriptions
     "falsifiers.parquet": "the same two methods where they should not differ",
     "controls.parquet": "controls of every matcher",
     f"{PROTECTION}.parquet": "protection levels, counted",
-    "paper.md": "the paper's experiment beside its Table II",
+    "paper.md": "the paper's experiment next to its Table II",
     "paper.parquet": "the same as a table",
     f"{SCORES}.parquet": "a row for each query of each matcher",
     BOARD: "versions, hashes and cards",

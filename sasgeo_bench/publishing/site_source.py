@@ -70,21 +70,21 @@ class Case:
     suite: str = ""
     region: str = ""
     kind: str = ""
-    said: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> dict[str, str]:
         """Return the facts of a case for a page: a line for each rejector, without protection levels.
 
-        >>> said = {"error_m": "9", "p_false_own": "0.9", "accepted_own": "no", "told_hpl_gauss_0.01_m": "4"}
-        >>> Case(query_id="q", matcher="m", failure="aged", file="a.webp", alt="", said=said).lines()
+        >>> facts = {"error_m": "9", "p_false_own": "0.9", "accepted_own": "no", "told_hpl_gauss_0.01_m": "4"}
+        >>> Case(query_id="q", matcher="m", failure="aged", file="a.webp", alt="", facts=facts).lines()
         {'error_m': '9', 'own': 'P(false) 0.9, withheld'}
         """
         found: dict[str, str] = {}
-        for name, value in self.said.items():
+        for name, value in self.facts.items():
             kind = next((kind for kind in _OF_REJECTOR if name.startswith(kind)), "")
             if kind:
                 rejector = name.removeprefix(kind)
-                verdict = {"yes": ", accepted", "no": ", withheld"}.get(self.said.get(f"{_VERDICT}{rejector}", ""), "")
+                verdict = {"yes": ", accepted", "no": ", withheld"}.get(self.facts.get(f"{_VERDICT}{rejector}", ""), "")
                 found[rejector] = f"{_OF_REJECTOR[kind]} {value}{verdict}"
             elif not name.startswith(_LEFT_OUT):
                 found[name] = value

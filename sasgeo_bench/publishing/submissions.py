@@ -162,8 +162,8 @@ def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> 
     lost = sorted(set(places_trained) - set(card.taught(half)))
     if lost:
         message = (
-            f"the runs on {about['suite']}/{about['region']} learnt from {lost[0]}, which trained_on of the card does "
-            f"not say{'' if half is None else f' for half {half}'}: add it"
+            f"the runs on {about['suite']}/{about['region']} were trained on {lost[0]}, which trained_on of the card "
+            f"does not name{'' if half is None else f' for half {half}'}: add it"
         )
         raise ConfigError(message)
 
@@ -239,7 +239,7 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
     Raise `StoreError` if something is no submission or differs from its record, and `ConfigError` if `board` is empty.
     """
     if not board:
-        message = "submissions are scored beside the stored results of a board: name them with --predictions"
+        message = "submissions are scored with the stored results of a board: name them with --predictions"
         raise ConfigError(message)
     found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
     boards = {folder: _board_named(folder, board) for folder in found.values()}

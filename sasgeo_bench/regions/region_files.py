@@ -142,7 +142,7 @@ def _check_file(path: Path, record: FileRecord) -> None:
 
 def _read_geometry(path: Path) -> "gpd.GeoDataFrame":
     """Read a table of geometry, after a check of its size."""
-    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+    import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
     from pyproj.exceptions import CRSError  # noqa: PLC0415
 
     with open_table(path, mend=_MEND, most_rows=MOST_VALUES):

@@ -118,7 +118,7 @@ def walk(roots: Sequence[str], *, most_entries: int = MOST_ENTRIES, most_depth: 
             queue.extend((path, depth + 1) for path in inside)
     missed = [f"beyond {most_entries} files"] if entries >= most_entries else []
     missed += [f"deeper than {most_depth} folders"] if is_deep else []
-    words = f"stored results {' or '.join(missed)} beside the code were not looked for" if missed else ""
+    words = f"stored results {' or '.join(missed)} next to the code were not looked for" if missed else ""
     return Walk(found=tuple(found), unsearched=words)
 
 

@@ -312,7 +312,7 @@ def _part(
         raise StoreError(message)
     task_files.check_queries(task)
     if task_files.PRIVATE in about and request.out.resolve() != root_of(task):
-        message = f"{task} is of a private seed, whose answers stay beside it: say --out {task.parent.parent.parent}"
+        message = f"{task} is of a private seed, whose answers stay with it: say --out {task.parent.parent.parent}"
         raise ConfigError(message)
     region = map_of(task, about)
     asked = {name: asked_under(one, key) for name, one in task_files.read_asked(task).items()}

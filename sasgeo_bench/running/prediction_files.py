@@ -31,7 +31,7 @@ from sasgeo_bench.texts import json_text
 
 RUN: Final = "run.json"
 _MEND: Final = "write it again, or remove it where it is a part of a run"
-_MEND_RUN: Final = "remove it and run again, the parts beside it are kept"
+_MEND_RUN: Final = "remove it and run again, its parts are kept"
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 
 
@@ -79,7 +79,7 @@ class Tie:
     def answers(self, asked: Mapping[str, str], *, is_tied: bool = True) -> bool:
         """Return whether the row answers one of these queries as they are now; without a hash, return `is_tied`.
 
-        >>> [Tie("a", "ok", said).answers({"a": "ff"}) for said in ("ff", "ee", "")]
+        >>> [Tie("a", "ok", asked).answers({"a": "ff"}) for asked in ("ff", "ee", "")]
         [True, False, True]
         """
         now = asked.get(self.query_id)

@@ -198,15 +198,15 @@ def _network_words(walls: _Walls) -> str:
 
 
 def _process_words(walls: _Walls) -> str:
-    apart = "not apart, all end together while the one that keeps them lives"
+    where = "among others, all end together while the one that keeps them lives"
     if walls.spaces & CLONE_NEWPID:
-        apart = "a namespace of their own, all end together"
+        where = "a namespace of their own, all end together"
     elif walls.landlock >= kernel.SCOPE_SINCE:
-        apart = "not apart, others cannot be signalled (Landlock), all end together"
+        where = "among others, which cannot be signalled (Landlock), all end together"
     if walls.has_proc:
-        return f"{apart}; /proc shows no others"
+        return f"{where}; /proc shows no others"
     is_refused = walls.landlock > 0
-    return f"{apart}; /proc of others {'is refused by Landlock' if is_refused else 'can be read, command lines too'}"
+    return f"{where}; /proc of others {'is refused by Landlock' if is_refused else 'can be read, command lines too'}"
 
 
 def _enter_namespaces() -> int:

@@ -183,13 +183,13 @@ class _Judge:
 
     def _stage(self, pose: Pose) -> _Stage:
         nodes, ours = self.mapped.nodes, self.seen.nodes
-        reach_m = float(np.hypot(*self.seen.sight.shape[1:])) * self.seen.cell_size_m / 2 * pose.scale
+        reach_m = float(np.hypot(*self.seen.visible.shape[1:])) * self.seen.cell_size_m / 2 * pose.scale
         reach_m += self.rules.gate_m + self.rules.warp_m + _SPREAD_M.max() + _SLACK_M
         around = self.mapped.around(np.array([pose.easting_m, pose.northing_m]), reach_m)
         around = around[self.seen.asked[nodes.kind[around]]]
         kind = nodes.kind[around]
         local_m = inverse(pose).to_map(nodes.places_m[around])
-        half_m = np.array(self.seen.sight.shape[:0:-1]) * self.seen.cell_size_m / 2
+        half_m = np.array(self.seen.visible.shape[:0:-1]) * self.seen.cell_size_m / 2
         is_whole = (np.abs(local_m) + nodes.radius_m[around, None] / pose.scale < half_m).all(axis=1)
         is_due = is_whole & self.seen.shows(local_m, kind)
         places_m = pose.to_map(ours.places_m)

@@ -108,7 +108,7 @@ _FACING_DEG: Final = 30.0
 _MOSTLY: Final = 0.9  # of the cells around a place
 _FAMILIES: Final = (ROADS, ("railway",), ("waterway",), ("building",))
 _SIGHTS: Final = tuple(dict.fromkeys(kind.classes for kind in KINDS))
-_SIGHT_OF: Final = np.array([_SIGHTS.index(kind.classes) for kind in KINDS])
+_VISIBLE_OF: Final = np.array([_SIGHTS.index(kind.classes) for kind in KINDS])
 _FREE: Final = (INDEX["dead_end"], INDEX["mask dead_end"])
 
 
@@ -118,15 +118,15 @@ class ObservedGraph:
 
     `is_cut`, shape (N,), marks nodes near the border of known cells, of which a part may be missing; `near`, shape (P,
     2), pairs of the Delaunay triangulation within `NEAR_M`; `asked`, shape (K,), judged kinds: a family of which
-    nothing is seen is left to the raster score; `sight`, shape (S, rows, cols), cells where nodes are visible, for each
-    set of classes of a kind of node.
+    nothing is seen is left to the raster score; `visible`, shape (S, rows, cols), cells where nodes are visible, for
+    each set of classes of a kind of node.
     """
 
     nodes: Nodes
     is_cut: Bools
     near: Ints
     asked: Bools
-    sight: Bools
+    visible: Bools
     cell_size_m: float
 
     @classmethod
@@ -156,8 +156,8 @@ class ObservedGraph:
             parts.append(_from_vectors(vectors, evidence))
         parts.append(_from_mask(evidence, without=drawn))
         nodes = Nodes.joined(parts)
-        sight = _sight(evidence)
-        is_cut = ~_looked_up(sight, nodes.places_m, nodes.kind, evidence.cell_size_m)
+        visible = _visible(evidence)
+        is_cut = ~_looked_up(visible, nodes.places_m, nodes.kind, evidence.cell_size_m)
         keep = ~(is_cut & np.isin(nodes.kind, _FREE))
         nodes, is_cut = nodes.taken(keep), is_cut[keep]
         is_cut |= _reaches_out(nodes, evidence)
@@ -166,13 +166,13 @@ class ObservedGraph:
             is_cut=is_cut,
             near=delaunay_pairs(nodes.places_m, NEAR_M),
             asked=_asked(evidence, names, drawn),
-            sight=sight,
+            visible=visible,
             cell_size_m=evidence.cell_size_m,
         )
 
     def shows(self, places_m: Floats, kind: Ints) -> Bools:
         """Return which nodes of some kinds at (right, up) are visible."""
-        return self.asked[kind] & _looked_up(self.sight, places_m, kind, self.cell_size_m)
+        return self.asked[kind] & _looked_up(self.visible, places_m, kind, self.cell_size_m)
 
     @cached_property
     def links(self) -> dict[int, set[int]]:
@@ -238,7 +238,7 @@ def _asked(evidence: Evidence, names: set[str], drawn: set[str]) -> Bools:
     return np.array(found)
 
 
-def _sight(evidence: Evidence) -> Bools:
+def _visible(evidence: Evidence) -> Bools:
     """Return where nearly all cells around are known in each set of classes; absent sets are known nowhere."""
     sights = np.zeros((len(_SIGHTS), *evidence.shape), dtype=bool)
     size = 2 * max(1, round(MARGIN_M / evidence.cell_size_m)) + 1
@@ -250,8 +250,8 @@ def _sight(evidence: Evidence) -> Bools:
     return sights
 
 
-def _looked_up(sight: Bools, places_m: Floats, kind: Ints, cell_size_m: float) -> Bools:
-    rows, cols = sight.shape[1:]
+def _looked_up(visible: Bools, places_m: Floats, kind: Ints, cell_size_m: float) -> Bools:
+    rows, cols = visible.shape[1:]
     view = Grid(
         epsg=0,
         west_m=-cols * cell_size_m / 2,
@@ -262,7 +262,7 @@ def _looked_up(sight: Bools, places_m: Floats, kind: Ints, cell_size_m: float) -
     )
     row, col = view.to_cells(places_m).T
     inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-    return np.asarray(inside & sight[_SIGHT_OF[kind], np.where(inside, row, 0), np.where(inside, col, 0)])
+    return np.asarray(inside & visible[_VISIBLE_OF[kind], np.where(inside, row, 0), np.where(inside, col, 0)])
 
 
 def _reaches_out(nodes: Nodes, evidence: Evidence) -> Bools:

@@ -284,7 +284,7 @@ def _read_run(path: Path) -> dict[str, Any]:
     if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):
         fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
     if fault is not None:
-        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, the parts beside it are kept"
+        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, its parts are kept"
         raise StoreError(message)
     return about
 

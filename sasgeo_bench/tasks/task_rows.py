@@ -188,7 +188,7 @@ def query_of(row: dict[str, Any]) -> Query:
 
 
 def _vectors_of(rows: list[dict[str, Any]]) -> "gpd.GeoDataFrame":
-    import geopandas as gpd  # noqa: PLC0415 - only whoever reads or makes a table of geometry needs it
+    import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
 
     return gpd.GeoDataFrame(
         {

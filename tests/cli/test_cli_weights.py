@@ -32,7 +32,7 @@ def test_fitted_stands_beside_hand_and_no_line_is_wider_than_a_terminal(program,
     assert told.count("railway") == 6
     heads = [line.split() for line in told.splitlines() if "fitted" in line]
     assert heads[0] == ["hand"] * 5 + ["fitted"] * 5
-    assert max(map(len, (line for line in told.splitlines() if not line.startswith("worth")))) <= 80
+    assert max(map(len, (line for line in told.splitlines() if not line.startswith("weight of")))) <= 80
 
 
 def test_a_region_gets_a_picture_for_each_age(program, own_out):

@@ -348,7 +348,7 @@ def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_its
     }
     assert board.table.loc[board.table["matcher"] == "oracle_counts", "is_control"].all()
     text = (tmp_path / "boards" / "taught" / "leaderboard.md").read_text(encoding="utf-8")
-    assert "learnt from 5 queries of 1 place (town-suburb)." in text
+    assert "trained on 5 queries of 1 place (town-suburb)." in text
     told = plan.to_text().splitlines()
     assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in told
     assert "    learners:Oracle: from the half itself, never ranked" in told

@@ -25,7 +25,7 @@ from sasgeo_bench.leaderboard.board_pictures import (
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.case_plot import case_pixels, fitted
 from sasgeo_bench.leaderboard.cases import words_of
-from sasgeo_bench.leaderboard.run_cases import Case, read_picture, said_of
+from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.tasks import task_files
@@ -184,12 +184,12 @@ def test_the_map_of_a_case_holds_both_places(root):
 
 def test_what_is_not_known_of_a_case_is_not_said(root):
     case, _ = case_at(root, "absent", "town-riverside", prediction=None)
-    said = said_of(case)
+    said = facts_of(case)
     assert said["status"] == "missing"
     assert not {"error_m", "confidence", "score_margin"} & set(said)
     with_nan = Prediction(query_id=case.query.query_id, diagnostics={"odd": float("inf")})
-    assert "told_odd" not in said_of(replace(case, prediction=with_nan))
-    assert said_of(replace(case, prediction=with_nan))["status"] == "withheld"
+    assert "told_odd" not in facts_of(replace(case, prediction=with_nan))
+    assert facts_of(replace(case, prediction=with_nan))["status"] == "withheld"
 
 
 def test_a_picture_that_fits_in_no_quality_is_made_smaller():

@@ -215,7 +215,7 @@ def test_what_a_runner_has_taught_must_stand_on_the_card(stored, tmp_path):
         about["learned"] = {"key": "k", "file": None, "trained_on": ["munich"], "pairs": 3}
         path.write_text(json.dumps(about), encoding="utf-8")
     card = write_card(tmp_path / "card.toml", trained_on=["porto"])
-    with pytest.raises(ConfigError, match=r"learnt from munich, which trained_on of the card does not say for half a"):
+    with pytest.raises(ConfigError, match=r"trained on munich, which trained_on of the card does not name for half a"):
         make_submission(SubmitRequest(predictions=mine, card=card, board=stored), tell=silent)
 
 

@@ -100,11 +100,11 @@ def test_a_walk_that_ends_early_has_found_the_upper_ones_and_says_what_it_did_no
     lay(tmp_path, "a/pack.json", "b/c/d/e/pack.json")
     assert hidden(tmp_path, most_depth=2) == (
         ["a"],
-        "stored results deeper than 2 folders beside the code were not looked for",
+        "stored results deeper than 2 folders next to the code were not looked for",
     )
     assert hidden(tmp_path, most_depth=4) == (["a", "b/c/d/e"], "")
     found, words = hidden(tmp_path, most_entries=4)
-    assert (found, words) == (["a"], "stored results beyond 4 files beside the code were not looked for")
+    assert (found, words) == (["a"], "stored results beyond 4 files next to the code were not looked for")
 
 
 def test_the_interpreters_own_folders_are_not_walked(tmp_path):

@@ -170,7 +170,7 @@ def test_a_damaged_run_json_is_told_in_one_line(tmp_path, text):
     (tmp_path / prediction_files.RUN).write_text(text)
     line = refusal(prediction_files.read_run, tmp_path)
     assert "run.json is damaged (" in line
-    assert line.endswith("remove it and run again, the parts beside it are kept")
+    assert line.endswith("remove it and run again, its parts are kept")
 
 
 def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):

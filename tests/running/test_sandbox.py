@@ -109,8 +109,8 @@ OWN_PIDS = "a namespace of their own, all end together"
 NO_METADATA = "modes, owners, times and attributes cannot be changed anywhere (seccomp)"
 IN_MEMORY = "4 MB in memory at most"
 ON_DISC = "files of 1 MB at most, as many as the disc holds"
-ALONE = "not apart, others cannot be signalled (Landlock), all end together"
-LOOSE = "not apart, all end together while the one that keeps them lives"
+ALONE = "among others, which cannot be signalled (Landlock), all end together"
+LOOSE = "among others, all end together while the one that keeps them lives"
 REFUSED, SEEN = "; /proc of others is refused by Landlock", "; /proc of others can be read, command lines too"
 SAID = {
     "all": (

@@ -176,7 +176,7 @@ def test_where_not_all_was_searched_the_run_says_so(place, task, monkeypatch):
     monkeypatch.setattr(leak_scan, "walk_code", lambda code: leak_scan.walk([*map(str, code)], most_entries=3))
     monkeypatch.setattr("sasgeo_bench.running.worker.walk_code", leak_scan.walk_code)
     _, worker = ask(place, task, "Plain")
-    assert "stored results beyond 3 files beside the code were not looked for" in worker.isolation["truth"]
+    assert "stored results beyond 3 files next to the code were not looked for" in worker.isolation["truth"]
 
 
 @shut_in

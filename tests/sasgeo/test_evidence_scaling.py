@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exponents come back from choices that were made with them, and nothing is learnt from nothing."""
+"""Exponents come back from choices that were made with them, and nothing is fitted to nothing."""
 
 import numpy as np
 import pytest

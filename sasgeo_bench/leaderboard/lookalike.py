@@ -32,7 +32,7 @@ NAMES: Final = ("true place", "lookalike")
 NOTE: Final = (
     "The place was chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one with "
     "the nearest lookalike. A lookalike is the place nearest by the shares of all classes, at least three footprint "
-    "radii away; these two differ by {apart:.2f} standard deviations over the map. Scores are those of the best pose "
+    "radii away; these two differ by {distance:.2f} standard deviations over the map. Scores are those of the best pose "
     "within 24 m of each place, at any heading. What is seen and not mapped counts against both. The raster term is "
     "the weighted sum of all classes, listed or not."
 )
@@ -44,13 +44,13 @@ _NOTHING: Final = 1e-9
 class Pair:
     """Two places of a map: the one that is seen, and the one most like it by how much ground each class covers.
 
-    `apart` is how unlike they are: Euclidean distance of the shares of all classes, each in standard deviations over
+    `distance` is how unlike they are: Euclidean distance of the shares of all classes, each in standard deviations over
     the map.
     """
 
     here_m: tuple[float, float]
     there_m: tuple[float, float]
-    apart: float
+    distance: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,9 +95,9 @@ def find_pair(windows: Windows) -> Pair:
         unlike = _distances(table[rows], table)
         unlike[apart_m < min_distance_m(windows.radius_m)] = np.inf
         at, other = np.unravel_index(int(np.argmin(unlike)), unlike.shape)
-        apart = float(unlike[at, other])
-        if math.isfinite(apart) and (best is None or apart < best.apart):
-            best = Pair(here_m=_place(points[rows[at]]), there_m=_place(points[other]), apart=apart)
+        distance = float(unlike[at, other])
+        if math.isfinite(distance) and (best is None or distance < best.distance):
+            best = Pair(here_m=_place(points[rows[at]]), there_m=_place(points[other]), distance=distance)
     if best is None:
         message = "the map has no two places far enough apart that hold roads, buildings or water: choose a larger one"
         raise ConfigError(message)
@@ -225,7 +225,7 @@ def sheet_of(found: Lookalike, mapped: Region, learnt: ScorerModel, arm: Switche
             f"d  the lookalike, {apart_m:.0f} m off" + (f", turned by {turned_deg}\u00b0" if turned_deg else ""),
         ),
         worth_name="worth" if arm.learns else "\u03c3",
-        note=NOTE.format(apart=found.pair.apart),
+        note=NOTE.format(distance=found.pair.distance),
     )
 
 

@@ -33,7 +33,7 @@ def test_the_most_varied_place_gets_its_like_that_is_far_enough():
     assert pair.here_m == (0.0, 0.0)
     # The second place has the same shares, but lies too near.
     assert pair.there_m[0] == pytest.approx(1.5 * min_distance_m(100.0))
-    assert pair.apart == pytest.approx(np.hypot(0.01, 0.1), abs=1e-5)
+    assert pair.distance == pytest.approx(np.hypot(0.01, 0.1), abs=1e-5)
 
 
 def test_where_all_places_are_near_or_empty_there_is_no_pair():

@@ -75,7 +75,8 @@ def inspect_command(
     manifest = read_manifest(folder)
     print_table(_summary(manifest, folder))
     print_table(_class_table(manifest))
-    print_table(_reasons(manifest))
+    if (reasons := _reasons(manifest)).row_count:
+        print_table(reasons)
 
 
 def _check_target(target: str, out: Path) -> None:
@@ -85,8 +86,9 @@ def _check_target(target: str, out: Path) -> None:
         return
     made = sorted(path.parent.name for path in (out / "tasks" / suite).glob(f"*/{TASK}"))
     near = [name for name in made if base_of(name) == base_of(region)] or made
-    there = ", ".join(f"{suite}/{name}" for name in near[:8]) or "none of this suite: make-queries first"
-    message = f"{out / 'tasks'} holds no task {target}; there is {there}"
+    there = ", ".join(f"{suite}/{name}" for name in near[:8])
+    hint = f"there is {there}" if there else f"draw it with make-queries --suite {suite}"
+    message = f"{out / 'tasks'} holds no task {target}: {hint}"
     raise ConfigError(message)
 
 

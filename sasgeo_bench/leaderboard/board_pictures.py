@@ -34,7 +34,7 @@ from sasgeo_bench.running.failures import Failures, stops_all
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.query import CONTROLS, Truth
+from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
 from sasgeo_bench.tasks.sheet import sheet_figure
 from sasgeo_bench.texts import json_text
 
@@ -125,20 +125,11 @@ def _is_there(about: Mapping[str, Any], root: Path) -> bool:
 # --- regions and suites -----------------------------------------------------------------------------------------------
 
 
-def base_region(name: str) -> str:
-    """Return a region without the date or suite that changed it.
-
-    >>> base_region("vaduz@2015-07-27"), base_region("vaduz+growth")
-    ('vaduz', 'vaduz')
-    """
-    return name.split("+", maxsplit=1)[0].split("@", maxsplit=1)[0]
-
-
 def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
     """Add each region once: itself, or the first of its maps if it is missing."""
     maps: dict[str, list[str]] = {}
     for about in asked:
-        maps.setdefault(base_region(str(about["region"])), []).append(str(about["region"]))
+        maps.setdefault(base_of(str(about["region"])), []).append(str(about["region"]))
     for base, variants in sorted(maps.items()):
         there = (name for name in (base, *sorted(variants)) if (root / "regions" / name).is_dir())
         folder = root / "regions" / next(there, base)

@@ -31,6 +31,7 @@ from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.contestants import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
+from sasgeo_bench.scoring.pose import first_pose
 from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
 from sasgeo_bench.scoring.score import MISSING, score_task, settle_not_applicable
 from sasgeo_bench.tasks import task_files
@@ -67,8 +68,7 @@ class Case:
     @property
     def fix(self) -> Pose | None:
         """Return the first pose of the answer."""
-        has_pose = self.prediction is not None and self.prediction.status == "ok" and self.prediction.candidates
-        return self.prediction.candidates[0][0] if has_pose and self.prediction is not None else None
+        return first_pose(self.prediction)
 
     @property
     def error_m(self) -> float | None:

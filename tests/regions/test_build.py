@@ -215,7 +215,7 @@ def test_a_damaged_manifest_is_told_in_one_line(content, tmp_path):
 def test_verify_names_what_differs(tmp_path):
     plan, _ = built(tmp_path, small())
     with (plan.folder / "edges.parquet").open("r+b") as file:
-        file.write(b"XXXX")
+        file.write(b"????")
     (plan.folder / "nodes.parquet").unlink()
     (plan.folder / "stray.txt").write_text("?")
     (plan.folder / "preview.png").write_bytes(b"short")

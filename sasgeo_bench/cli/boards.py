@@ -152,7 +152,7 @@ def score(options: ScoreOptions) -> Board:
 
 
 def score_command(options: ScoreOptions) -> None:
-    """Hold predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
+    """Score predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
     with shown_progress() as progress:
         board = score(**vars(options) | {"tell": tell, "progress": progress})
     show_board(board)

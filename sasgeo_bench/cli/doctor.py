@@ -74,7 +74,7 @@ def _mend(extract: Extract) -> str:
 
 
 def doctor_command(extracts: ExtractFolders = None, out: Out = Path("out")) -> None:
-    """Say which versions, folders and extracts are found, and what is missing."""
+    """Report versions, folders and extracts, and what is missing."""
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, finding in examine(extracts or (), out=out):
         table.add_row(name, finding)

@@ -48,7 +48,7 @@ def inspect_command(
     region_folders: RegionFolders = None,
     out: Out = Path("out"),
 ) -> None:
-    """Say what is in a region, task, split or run; draw a task's sheet, a split's map, a query and its answer."""
+    """Print the content of a region, task, split or run; draw a task's sheet, a split's map, a query and its answer."""
     folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
     if (folder / TASK).is_file():
         _inspect_task(folder, out, query=query, rows=rows)
@@ -185,7 +185,7 @@ def verify_command(
     region_folders: RegionFolders = None,
     out: Out = Path("out"),
 ) -> None:
-    """Hold a region or a task against its hashes; search the parts of a split for ground they share."""
+    """Check a region or a task against its hashes; search the parts of a split for ground they share."""
     task_folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
     if (task_folder / TASK).is_file():
         with_truths = "every query has its truth" if has_truths(task_folder, out=out) else "its truths are not here"

@@ -30,11 +30,11 @@ LEAST_DRAWN: Final = 0.05  # of a place's ground: with less there is nothing to 
 SIDE_M: Final = 192.0  # of the view, as in most suites
 NAMES: Final = ("true place", "lookalike")
 NOTE: Final = (
-    "The place was chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one with "
-    "the nearest lookalike. A lookalike is the place nearest by the shares of all classes, at least three footprint "
-    "radii away; these two differ by {distance:.2f} standard deviations over the map. Scores are those of the best "
-    "pose within 24 m of each place, at any heading. What is seen and not mapped counts against both. The raster term is "
-    "the weighted sum of all classes, listed or not."
+    "The place was chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one "
+    "with the nearest lookalike. A lookalike is the place nearest by the shares of all classes, at least three "
+    "footprint radii away; these two differ by {distance:.2f} standard deviations over the map. Scores are those of "
+    "the best pose within 24 m of each place, at any heading. What is seen and not mapped counts against both. The "
+    "raster term is the weighted sum of all classes, listed or not."
 )
 _CHUNK: Final = 256
 _NOTHING: Final = 1e-9

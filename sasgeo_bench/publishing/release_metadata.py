@@ -33,9 +33,9 @@ QUERY_TEXTS: Final = {
     "classes": "names of the classes, in the order of the evidence",
     "evidence": "two bits a cell, four cells to a byte, the first in the lowest bits: 0 absent, 1 present, 2 unknown; "
     "class by class, row by row, top row first; the top of the view is the heading",
-    "confidence": "one byte a cell, 0 to 255, in the order of the evidence; null where nothing is said",
+    "confidence": "one byte a cell, 0 to 255, in the order of the evidence; null where it is unknown",
     "observed_on": "day of the view",
-    "season": "leaf_on, snow, low_water, harvest, or empty where nothing is said",
+    "season": "leaf_on, snow, low_water, harvest, or empty where it is unknown",
     "prior_group": "how much is known before, by name; results of two groups are never ranked together",
     "prior_easting_m": "middle of the disc that holds the place, metres in the CRS of the map; null where unknown",
     "prior_northing_m": "middle of the disc that holds the place, metres in the CRS of the map; null where unknown",

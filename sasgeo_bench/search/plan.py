@@ -149,7 +149,7 @@ class Disc:
         return np.asarray(np.hypot(*(points_m - self.center_m).T) <= self.radius_m)
 
     def has(self, pose: Pose) -> bool:
-        """Tell if a pose lies within."""
+        """Return whether a pose lies within."""
         return self.center_m is None or math.dist((pose.easting_m, pose.northing_m), self.center_m) <= self.radius_m
 
     def wider(self, by_m: float) -> Self:

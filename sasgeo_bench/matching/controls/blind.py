@@ -19,7 +19,7 @@ from sasgeo_bench.tasks.query import Query
 
 
 def is_blind(query: Query) -> bool:
-    """Tell if a view is wholly unknown."""
+    """Return whether a view is wholly unknown."""
     return bool((query.evidence.cells == UNKNOWN).all())
 
 

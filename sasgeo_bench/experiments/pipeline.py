@@ -47,14 +47,15 @@ MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is co
 class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
-    With a private seed, `out` is the root of private runs.
+    With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
+    cluster to run on instead.
     """
 
     spec: PipelineFile
     requests: tuple[Request, ...]
     controls: tuple[Request, ...]
     out: Path
-    jobs: int
+    jobs: int = 1
     dask: str | None = None
     private: PrivateSeed | None = None
 
@@ -194,24 +195,21 @@ def board_folder(plan: PipelinePlan) -> Path:
     return plan.out / "boards" / plan.spec.id
 
 
-def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may choose
+def plan_pipeline(
     spec: PipelineFile,
     *,
     out: Path,
     tell: Tell,
     extract_folders: tuple[Path, ...] = (),
     region_folders: tuple[Path, ...] = (),
-    jobs: int = 1,
-    dask: str | None = None,
     private: PrivateSeed | None = None,
 ) -> PipelinePlan:
     """Turn a pipeline file into requests; only files of settings are read.
 
     `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
-    serve regions that are not built yet, and files of one's own. `jobs` counts the processes of each matcher, `dask`
-    names a cluster to run on instead. `private` draws all queries instead of the file's seed, below `out/private`.
-    Raise `ConfigError` if a suite, region or split is unknown, or no region can be built here; `MatchError` if no
-    installed package has a matcher or a rejector of a name.
+    serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
+    seed, below `out/private`. Raise `ConfigError` if a suite, region or split is unknown, or no region can be built
+    here; `MatchError` if no installed package has a matcher or a rejector of a name.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
     out, seed = root_of(out, private), private or spec.seed
@@ -255,8 +253,6 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
         requests=tuple(requests),
         controls=plan_requests(controls, tell=_silent),
         out=out,
-        jobs=jobs,
-        dask=dask,
         private=private,
     )
 

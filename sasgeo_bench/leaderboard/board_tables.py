@@ -204,8 +204,9 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     found = {name: row for name in names if (row := book.main(key, name, primary)) is not None}
     order = sorted(found, key=lambda name: (-_value(found[name]), name))
     ties = ties_of(list(found.values()))
+    tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
-    rows = tuple(_row(book, key, found[name], _tie_of(ties, name), ranked) for name in order)
+    rows = tuple(_row(book, key, found[name], tie_of.get(name), ranked) for name in order)
     titles = (primary, "rank", "within_25m", "control", "false fixes", "detectable", "n", "missing", "blocks")
     table = Table(
         name=file_stem("board", suite, track, prior_group),
@@ -223,11 +224,6 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
 def _value(row: Record) -> float:
     value = float(row["value"])
     return -math.inf if math.isnan(value) else value
-
-
-def _tie_of(ties: Sequence[Tie], name: str) -> int | None:
-    """Return the number of the tie that a matcher is in."""
-    return next((number for number, tie in enumerate(ties) if name in tie.names), None)
 
 
 def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Row:

@@ -83,6 +83,7 @@ def _area_km2(region: Path) -> float | None:
     return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
+_HOW_TO_MEND: Final = "run again (existing answers are kept), or make the old queries again"
 MOST_NAMED: Final = 3  # skipped runs in a message; the others are counted
 
 
@@ -121,10 +122,9 @@ def read_entry_answers(
     for entry in entries:
         with failures.of(entry.name):
             if not entry.runs:
-                read = (prediction_files.read_predictions(source) for source in entry.sources)
-                files[entry.name] = {item.query_id: item for rows in read for item in rows}
-    is_chosen = bool(folders)
-    found = folders if is_chosen else _answered_folders(entries, files.values(), root)
+                read = prediction_files.read_predictions(entry.sources[0])  # without runs there is one file
+                files[entry.name] = {item.query_id: item for item in read}
+    found = folders or _answered_folders(entries, files.values(), root)
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
     answers: list[EntryAnswers] = []
     stale: list[Path] = []
@@ -138,11 +138,9 @@ def read_entry_answers(
         raise failures.first
     refused = next((source for source in stale if source in named), None)
     if refused is not None or (stale and not answers):
-        holder = "these tasks do" if is_chosen else "its task does"
-        message = (
-            f"{refused or stale[0]} holds answers to other queries than {holder} now: "
-            "run again (existing answers are kept), or make the old queries again"
-        )
+        holder = "these tasks do" if folders else "its task does"
+        first = refused or stale[0]
+        message = f"{first} holds answers to other queries than {holder} now: {_HOW_TO_MEND}"
         raise StoreError(message)
     if not answers:
         message = (

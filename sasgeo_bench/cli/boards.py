@@ -203,10 +203,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         tell=tell,
         extract_folders=tuple(options.extracts or ()),
         region_folders=tuple(options.region_files or ()),
-        jobs=options.jobs,
-        dask=options.dask,
         private=private_seed(options.seed_file, tell=tell),
     )
+    plan = replace(plan, jobs=options.jobs, dask=options.dask)
     if options.dry_run:
         say(plan.to_text())
         return

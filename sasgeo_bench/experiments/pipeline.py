@@ -28,7 +28,7 @@ from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
-from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.tasks.split import HALVES, Half
 from sasgeo_bench.tasks.suites.base import Choice
@@ -47,14 +47,15 @@ MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is co
 class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
-    With a private seed, `out` is the root of private runs.
+    With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
+    cluster to run on instead.
     """
 
     spec: PipelineFile
     requests: tuple[Request, ...]
     controls: tuple[Request, ...]
     out: Path
-    jobs: int
+    jobs: int = 1
     dask: str | None = None
     private: PrivateSeed | None = None
 
@@ -194,24 +195,21 @@ def board_folder(plan: PipelinePlan) -> Path:
     return plan.out / "boards" / plan.spec.id
 
 
-def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may choose
+def plan_pipeline(
     spec: PipelineFile,
     *,
     out: Path,
     tell: Tell,
     extract_folders: tuple[Path, ...] = (),
     region_folders: tuple[Path, ...] = (),
-    jobs: int = 1,
-    dask: str | None = None,
     private: PrivateSeed | None = None,
 ) -> PipelinePlan:
     """Turn a pipeline file into requests; only files of settings are read.
 
     `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
-    serve regions that are not built yet, and files of one's own. `jobs` counts the processes of each matcher, `dask`
-    names a cluster to run on instead. `private` draws all queries instead of the file's seed, below `out/private`.
-    Raise `ConfigError` if a suite, region or split is unknown, or no region can be built here; `MatchError` if no
-    installed package has a matcher or a rejector of a name.
+    serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
+    seed, below `out/private`. Raise `ConfigError` for an unknown suite, region or split, or if no region can be
+    built here; `MatchError` for an unknown matcher or rejector.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
     out, seed = root_of(out, private), private or spec.seed
@@ -241,6 +239,12 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
     if spec.learning is not None and not requests[0].split.half_of:
         message = f"[learning] needs halves, and split {spec.split!r} is a hold-out: name a cross-fit, or leave it out"
         raise ConfigError(message)
+    controls = _plan_controls(seed, out)
+    return PipelinePlan(spec=spec, requests=tuple(requests), controls=controls, out=out, private=private)
+
+
+def _plan_controls(seed: Seed, out: Path) -> tuple[Request, ...]:
+    """Plan the controls of every board."""
     controls = Wanted(
         suites=(CONTROLS,),
         regions=CONTROL_REGIONS,
@@ -250,15 +254,7 @@ def plan_pipeline(  # noqa: PLR0913 - an option for each thing that a user may c
         out=out,
         may_be_fewer=True,
     )
-    return PipelinePlan(
-        spec=spec,
-        requests=tuple(requests),
-        controls=plan_requests(controls, tell=_silent),
-        out=out,
-        jobs=jobs,
-        dask=dask,
-        private=private,
-    )
+    return plan_requests(controls, tell=_silent)
 
 
 def _silent(line: str) -> None:
@@ -380,9 +376,21 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
     An oracle learns from the half itself.
     """
     own = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
-    whole = plan_run(_run_request(plan, spec, own))
     learning = plan.spec.learning
-    is_oracle = _is_oracle(plan, spec)
+    is_oracle = learning is not None and spec in learning.oracles
+    whole = plan_run(
+        RunRequest(
+            spec=spec,
+            tasks=own,
+            out=plan.out,
+            top_k=plan.spec.top_k,
+            limits=Limits(match_s=plan.spec.match_s),
+            jobs=plan.jobs,
+            dask=plan.dask,
+            is_oracle=is_oracle,
+            hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
+        )
+    )
     if is_oracle and not is_unranked(whole.card.name):
         message = (
             f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
@@ -414,10 +422,6 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
     return runs
 
 
-def _is_oracle(plan: PipelinePlan, spec: str) -> bool:
-    return plan.spec.learning is not None and spec in plan.spec.learning.oracles
-
-
 def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
     """Return whether a matcher is asked on a suite: controls on all, all on the controls, else by the file."""
     return suite in {CONTROLS, PAPER_SUITE} or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
@@ -430,21 +434,6 @@ def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
         for place in request.split.places_in(region):
             return request.split.half_of.get(place)
     return None
-
-
-def _run_request(plan: PipelinePlan, spec: str, tasks: list[Path]) -> RunRequest:
-    """Return the run of one matcher."""
-    return RunRequest(
-        spec=spec,
-        tasks=tasks,
-        out=plan.out,
-        top_k=plan.spec.top_k,
-        limits=Limits(match_s=plan.spec.match_s),
-        jobs=plan.jobs,
-        dask=plan.dask,
-        is_oracle=_is_oracle(plan, spec),
-        hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
-    )
 
 
 def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:

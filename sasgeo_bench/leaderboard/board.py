@@ -1,23 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A board in memory, and the request for one."""
+"""A board in memory, the request for one, and its files."""
 
+import platform
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.private_board import OnPrivate
+from sasgeo_bench.leaderboard.board_files import PROTECTION, Extra, write_board
+from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
+from sasgeo_bench.leaderboard.private_board import OnPrivate, seed_of
+from sasgeo_bench.leaderboard.text import board_latex, board_markdown
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import LOG, Failures
-from sasgeo_bench.scoring.contrasts import Contrast, Finding
-from sasgeo_bench.scoring.controls import Falsifier, Verdict
+from sasgeo_bench.running.sandbox import joined
+from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame
+from sasgeo_bench.scoring.controls import Falsifier, Verdict, failed_controls, falsifier_frame, verdict_frame
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.intervals import DRAWS
-from sasgeo_bench.tasks.query import Truth
+from sasgeo_bench.scoring.score import SCORER_VERSION
+from sasgeo_bench.scoring.strata import queries_of, steps_frame
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import TASK_VERSION, Truth
 from sasgeo_bench.tasks.split import Split
+
+_LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+_CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,3 +104,116 @@ class Board:
     apart: Mapping[str, str] = field(default_factory=dict)
     on_private: OnPrivate = field(default_factory=OnPrivate)
     failures: Failures = field(default_factory=lambda: Failures(Path(LOG), tell=lambda _: None))
+
+
+def make_extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:
+    """Return the additional files; leave out what cannot be made, and figures that cannot be drawn."""
+    if request.extras:
+        tell("drawing figures and pictures")
+    found: list[Extra] = []
+    for make in request.extras:
+        with board.failures.of("more of the board"):
+            extra = make(board)
+            guarded = {name: partial(_draw, draw, name, board.failures) for name, draw in extra.figures.items()}
+            found.append(replace(extra, figures=guarded))
+    return found
+
+
+def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: Path) -> None:
+    """Draw a figure; of one that fails nothing is left."""
+    with failures.of(f"figure {name}"):
+        draw(path)
+        return
+    path.unlink(missing_ok=True)
+
+
+def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
+    """Write a board with its tables, texts and additional files; `cards` are those of its rejectors."""
+    about = record_of(request, board, cards)
+    scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
+    queries = queries_of(board.scores)
+    steps = steps_frame(board.table, queries, sorted(board.scores))
+    write_board(
+        request.board,
+        tables={
+            "leaderboard": board.table,
+            "scores": scores,
+            "contrasts": contrast_frame(board.findings),
+            "falsifiers": falsifier_frame(board.falsifiers),
+            "controls": verdict_frame(board.verdicts),
+            **({PROTECTION: board.protection} if len(board.protection) else {}),
+        },
+        texts={
+            "leaderboard.md": board_markdown(
+                board.table,
+                about,
+                findings=board.findings,
+                verdicts=board.verdicts,
+                falsifiers=board.falsifiers,
+                steps=steps,
+                ages=age_names(ages_frame(steps, queries, board.measured)),
+            ),
+            "leaderboard.tex": board_latex(board.table, about, findings=board.findings, verdicts=board.verdicts),
+        },
+        about=about,
+        extras=extras,
+    )
+
+
+def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
+    """Return the content of `board.json`."""
+    seed = seed_of(board.tasks)
+    return {
+        "scorer_version": SCORER_VERSION,
+        "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
+        "data_version": request.kept.get("data_version") or DATA_VERSION,  # of the maps that were asked about
+        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
+        "libraries": _libraries(),
+        "pipeline": dict(request.pipeline) or None,
+        **{name: said for name, said in ((task_files.PRIVATE, seed), ("private", board.on_private.seed)) if said},
+        "split": None if request.split is None else request.split.spec.id,
+        "draws": request.draws,
+        "contrasts": [asdict(item) for item in request.contrasts],
+        "by_region": sorted(request.by_region),
+        "without": sorted(set(request.without)),
+        "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
+        "remarks": list(board.remarks),
+        "failed": board.failures.found,  # what fails while figures are drawn is added until the file is written
+        "entries": [
+            {
+                "name": entry.name,
+                "version": entry.version,
+                "hash": entry.hash,
+                "how": entry.how,
+                "card": entry.card,
+                "trained_on": entry.declared,
+                "set_apart": board.apart.get(entry.name),
+                "isolation": joined(run.get("isolation") or {} for run in entry.runs) if entry.runs else None,
+                "learned": entry.learned(),
+                **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
+                **({"failed_controls": [item.to_text() for item in failed]} if failed else {}),
+            }
+            for entry in board.entries
+            for failed in [failed_controls(board.verdicts, entry.name)]
+        ],
+        "tasks": [
+            {
+                "suite": item["suite"],
+                "suite_version": item.get("suite_version"),
+                "region": item["region"],
+                "map_date": item.get("map_date"),
+                "queries_sha256": item["files"][task_files.QUERIES]["sha256"],
+                "map_fingerprint": item["map_fingerprint"],
+            }
+            for item in board.tasks
+        ],
+    }
+
+
+def _libraries() -> dict[str, str]:
+    """Return the versions of Python and of installed libraries that affect results."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

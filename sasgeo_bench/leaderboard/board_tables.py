@@ -52,14 +52,15 @@ MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1
 class Book:
     """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
 
-    `counted` are the kinds of stress that the first figure of a table counts, `lost` the entries without a sound
-    answer, and how often; both are empty without scored queries.
+    `controls` are the entries that are never ranked. `counted` are the kinds of stress that the first figure of a table
+    counts, `lost` the entries without a sound answer, and how often; both are empty without scored queries.
     """
 
     figures: Mapping[tuple[str, ...], Record]
     matchers: Mapping[Key, tuple[str, ...]]
     strata: Mapping[Key, tuple[str, ...]]
     entries: Mapping[str, Mapping[str, Any]]
+    controls: frozenset[str]
     matcher_pages: Mapping[str, str]
     suite_pages: Mapping[str, str]
     counted: Mapping[Key, tuple[str, ...]]
@@ -90,6 +91,7 @@ class Book:
             matchers={key: tuple(matchers[key]) for key in sorted(matchers)},
             strata={key: tuple(found) for key, found in strata.items()},
             entries=entries,
+            controls=frozenset(filter(is_unranked, {*entries, *(key[3] for key in figures)})),
             matcher_pages=page_names("matcher", names),
             suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
@@ -107,7 +109,7 @@ class Book:
     def name_cell(self, matcher: str) -> Cell:
         """Return the name of a matcher with its marks and a link to its page."""
         entry = self.entries.get(matcher, {})
-        marks = marks_of(entry, is_control=is_unranked(matcher))
+        marks = marks_of(entry, is_control=matcher in self.controls)
         return Cell(text=matcher, href=self.matcher_pages.get(matcher, ""), marks=marks)
 
     def suite_cell(self, suite: str) -> Cell:
@@ -204,8 +206,9 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     found = {name: row for name in names if (row := book.main(key, name, primary)) is not None}
     order = sorted(found, key=lambda name: (-_value(found[name]), name))
     ties = ties_of(list(found.values()))
+    tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
-    rows = tuple(_row(book, key, found[name], _tie_of(ties, name), ranked) for name in order)
+    rows = tuple(_row(book, key, found[name], tie_of.get(name), ranked) for name in order)
     titles = (primary, "rank", "within_25m", "control", "false fixes", "detectable", "n", "missing", "blocks")
     table = Table(
         name=file_stem("board", suite, track, prior_group),
@@ -215,7 +218,7 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
             *(column(name, order="descending" if name == primary else "none") for name in titles),
         ),
         rows=rows,
-        notes=_notes(ties, found, ranked),
+        notes=_notes(book, ties, found, ranked),
     )
     return table.without_empty(WITHIN.name, "false fixes", "control", "detectable", "missing")
 
@@ -225,16 +228,11 @@ def _value(row: Record) -> float:
     return -math.inf if math.isnan(value) else value
 
 
-def _tie_of(ties: Sequence[Tie], name: str) -> int | None:
-    """Return the number of the tie that a matcher is in."""
-    return next((number for number, tie in enumerate(ties) if name in tie.names), None)
-
-
 def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Row:
     name, stratum = str(main["matcher"]), str(main["stratum"])
     primary = str(main["metric"])
     mark = None if tie is None else Mark(text="tie", meaning="shares ranks with others, named below the table")
-    tone = "control" if is_unranked(name) else "plain" if tie is None else ("tied" if tie % 2 == 0 else "other-tie")
+    tone = "control" if name in book.controls else "plain" if tie is None else ("tied" if tie % 2 == 0 else "other-tie")
     places = counted(int(main["places"]), "place")
     return Row(
         cells=(
@@ -253,14 +251,13 @@ def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Ro
     )
 
 
-def _notes(ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tuple[str, ...]:
+def _notes(book: Book, ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tuple[str, ...]:
     if not found:
         return ("Nobody has a figure here.",)
     if ranked:
         lines = [f"Tied: {tie.to_text()}." for tie in ties]
         return tuple(lines or (["No two share a rank."] if ranked > 1 else ["One alone is ranked."]))
-    rivals = [name for name in found if not is_unranked(name)]
-    if not rivals:
+    if book.controls.issuperset(found):
         return ("Only controls answered.",)
     return ("Nobody is ranked here: the order is that of the figure, and decides nothing.",)
 

@@ -19,7 +19,7 @@ from sasgeo_bench.scoring.rows import AS_SUBMITTED
 from sasgeo_bench.scoring.score import score_task, settle_not_applicable
 from sasgeo_bench.scoring.validate import submission_faults, validate
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import Head, Truth
+from sasgeo_bench.tasks.query import CONTROLS, Head, Truth
 from sasgeo_bench.tasks.split import Split
 
 M2_PER_KM2: Final = 1e6
@@ -40,14 +40,6 @@ class AskedTask:
         Raise StoreError if the folder holds no valid task.
         """
         return cls(folder=folder, about=task_files.read_task(folder), asked=task_files.read_asked(folder))
-
-
-def held_tasks(files: Collection[Mapping[str, Prediction]], root: Path) -> Iterator[Path]:
-    """Yield the task folders for which files hold an answer."""
-    held = {name for rows in files for name in rows}
-    for path in sorted((root / "tasks").glob(f"*/*/{task_files.TASK}")) if held else ():
-        if not held.isdisjoint(task_files.read_ids(path.parent)):
-            yield path.parent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +83,7 @@ def _area_km2(region: Path) -> float | None:
     return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
+_HOW_TO_MEND: Final = "run again (existing answers are kept), or make the old queries again"
 MOST_NAMED: Final = 3  # skipped runs in a message; the others are counted
 
 
@@ -129,26 +122,25 @@ def read_entry_answers(
     for entry in entries:
         with failures.of(entry.name):
             if not entry.runs:
-                files[entry.name] = _rows_of_file(entry)
-    is_chosen = bool(folders)
-    found = folders if is_chosen else [*_named(entries, root), *held_tasks(files.values(), root)]
+                read = prediction_files.read_predictions(entry.sources[0])  # without runs there is one file
+                files[entry.name] = {item.query_id: item for item in read}
+    found = folders or _answered_folders(entries, files.values(), root)
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
     answers: list[EntryAnswers] = []
     stale: list[Path] = []
     for entry in (entry for entry in entries if entry.name not in failures.found):
         with failures.of(entry.name):
-            item, others = _entry_answers(entry, tasks, files.get(entry.name))
+            rows = files.get(entry.name)
+            item, others = _read_runs(entry, tasks) if rows is None else (_answers_of_file(entry, tasks, rows), [])
             stale += others
             answers += [item] if item.asked else []
     if not answers and failures.first is not None:
         raise failures.first
     refused = next((source for source in stale if source in named), None)
     if refused is not None or (stale and not answers):
-        holder = "these tasks do" if is_chosen else "its task does"
-        message = (
-            f"{refused or stale[0]} holds answers to other queries than {holder} now: "
-            "run again (existing answers are kept), or make the old queries again"
-        )
+        holder = "these tasks do" if folders else "its task does"
+        first = refused or stale[0]
+        message = f"{first} holds answers to other queries than {holder} now: {_HOW_TO_MEND}"
         raise StoreError(message)
     if not answers:
         message = (
@@ -162,26 +154,27 @@ def read_entry_answers(
     return answers
 
 
-def _entry_answers(
-    entry: Entry, tasks: Sequence[AskedTask], rows: Mapping[str, Prediction] | None
-) -> tuple[EntryAnswers, list[Path]]:
-    """Return an entry with its answers, and the folders of its runs that answer none of the tasks."""
-    if rows is None:
-        return _read_runs(entry, tasks)
+def _answered_folders(
+    entries: Sequence[Entry], files: Collection[Mapping[str, Prediction]], root: Path
+) -> Iterator[Path]:
+    """Yield the task folders that runs were made on, then those for which files hold an answer."""
+    for suite, region in sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs}):
+        if (root / "tasks" / suite / region / task_files.TASK).is_file():
+            yield root / "tasks" / suite / region
+    held = {name for rows in files for name in rows}
+    for path in sorted((root / "tasks").glob(f"*/*/{task_files.TASK}")) if held else ():
+        if not held.isdisjoint(task_files.read_ids(path.parent)):
+            yield path.parent
+
+
+def _answers_of_file(entry: Entry, tasks: Sequence[AskedTask], rows: dict[str, Prediction]) -> EntryAnswers:
+    """Return a file or a submission with its answers; a submission is asked the tasks it names."""
+    asked = tasks
+    if entry.submission is not None:
+        named = {(item.suite, item.region) for item in entry.submission.tasks}
+        asked = [task for task in tasks if (task.about["suite"], task.about["region"]) in named]
     held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-    return EntryAnswers(entry=entry, predictions=dict(rows), held=held, asked=_asked_of(entry, tasks)), []
-
-
-def _asked_of(entry: Entry, tasks: Sequence[AskedTask]) -> frozenset[Path]:
-    """Return the folders of the tasks that a file or a submission is asked."""
-    if entry.submission is None:
-        return frozenset(task.folder for task in tasks)
-    named = {(item.suite, item.region) for item in entry.submission.tasks}
-    return frozenset(task.folder for task in tasks if (task.about["suite"], task.about["region"]) in named)
-
-
-def _rows_of_file(entry: Entry) -> dict[str, Prediction]:
-    return {item.query_id: item for source in entry.sources for item in prediction_files.read_predictions(source)}
+    return EntryAnswers(entry=entry, predictions=rows, held=held, asked=frozenset(task.folder for task in asked))
 
 
 def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[EntryAnswers, list[Path]]:
@@ -193,13 +186,12 @@ def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[EntryAnswers, 
     stale: list[Path] = []
     for source, about in zip(entry.sources, entry.runs, strict=True):
         task = by_name.get((about["suite"], about["region"]))
-        is_same = task is not None and about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
-        found = (
-            prediction_files.Answers({}, 0)
-            if task is None
-            else prediction_files.read_answers(source, task.asked, is_tied=is_same)
-        )
-        if task is None or not (found.found or is_same):
+        if task is None:
+            stale.append(source)
+            continue
+        is_same = about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
+        found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
+        if not (found.found or is_same):
             stale.append(source)
             continue
         rows |= found.found
@@ -216,11 +208,22 @@ def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Ma
     return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
 
 
-def _named(entries: Sequence[Entry], root: Path) -> list[Path]:
-    """Return the task folders that runs were made on."""
-    names = sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs})
-    folders = [root / "tasks" / suite / region for suite, region in names]
-    return [folder for folder in folders if (folder / task_files.TASK).is_file()]
+def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[ScoredTask]:
+    """Read the tasks of a board with their truths; without `folders`, those that the entries bring.
+
+    Raise StoreError as `read_scored_task` does.
+    """
+    chosen = dict.fromkeys(folders) or sorted({folder for item in answers for folder in item.held})
+    return [read_scored_task(folder, truth) for folder in chosen]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contest:
+    """Entries with their answers, the tasks, and all scored rows by entry, including those of controls."""
+
+    answers: tuple[EntryAnswers, ...]
+    tasks: tuple[ScoredTask, ...]
+    scores: dict[str, pd.DataFrame]
 
 
 def score_entries(
@@ -230,26 +233,50 @@ def score_entries(
     split: Split | None,
     by_region: Collection[str],
     failures: Failures,
-) -> dict[str, pd.DataFrame]:
-    """Return scored rows by entry name; `failures` records entries that cannot be scored.
+) -> Contest:
+    """Score the answers of all entries; `failures` records entries that cannot be scored, and they are left out.
 
-    `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block.
-
-    Raises
-    ------
-    StoreError, ConfigError
-        The first fault, if no entry is left.
+    `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block. Raise the first
+    fault, a StoreError or ConfigError, if no entry is left.
     """
-    folders, found = [task.folder for task in tasks], {}
+    folders = [task.folder for task in tasks]
+    scores: dict[str, pd.DataFrame] = {}
     for item in answers:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
             scored = _scored(item, tasks, split, by_region)
             hold_controls({item.entry.name: scored})  # so that an error names the entry
-            found[item.entry.name] = scored
-    if not found and failures.first is not None:
+            scores[item.entry.name] = scored
+    if not scores and failures.first is not None:
         raise failures.first
+    left = tuple(item for item in answers if item.entry.name in scores)
+    return Contest(answers=left, tasks=tuple(tasks), scores=scores)
+
+
+def rows_to_rank(contest: Contest, *, tell: Callable[[str], None]) -> dict[str, pd.DataFrame]:
+    """Return by entry the scored rows of the suites of which it was asked every task, without those of controls.
+
+    Entries without such a suite are missing; `tell` receives a line about the other suites of an entry. Raise
+    ConfigError if no entry is left.
+    """
+    found = {}
+    for item in contest.answers:
+        asked = {task.about["suite"] for task in contest.tasks if task.folder in item.asked}
+        lacking = {CONTROLS} | {task.about["suite"] for task in contest.tasks if task.folder not in item.asked}
+        lost = sorted(asked & lacking - {CONTROLS})
+        if lost:
+            tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
+        scores = contest.scores[item.entry.name]
+        rows = scores[scores["suite"].isin(asked - lacking)].reset_index(drop=True)
+        if len(rows):
+            found[item.entry.name] = rows
+    if not found:
+        message = (
+            f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
+            "its tasks (--tasks names some)"
+        )
+        raise ConfigError(message)
     return found
 
 

@@ -30,6 +30,8 @@ from sasgeo_bench.tasks.split import Split
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
+_ByRun = dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]]  # folders and run.json by name, version, hash
+
 
 class CardRecord(BaseModel):
     """Texts of a card that boards and pages show; a card of an older version may lack some."""
@@ -126,29 +128,11 @@ def find_entries(
             message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
             raise StoreError(message)
         runs += [run for run in found if _is_new(run, seen)]
-    by_run = _by_run(runs, failures)
-    names = [name for name, _, _ in by_run]
-    versions = [(name, number) for name, number, _ in by_run]
-
-    def shown(name: str, number: str, digest: str) -> str:
-        """Return the shortest unique name."""
-        if names.count(name) == 1:
-            return name
-        return f"{name} {number}" if versions.count((name, number)) == 1 else f"{name} {number} ({digest[:6]})"
-
-    entries = [
-        Entry(
-            name=shown(name, number, digest),
-            version=number,
-            hash=digest,
-            how=RUN_HERE,
-            sources=tuple(folder for folder, _ in found),
-            runs=tuple(about for _, about in found),
-        )
-        for (name, number, digest), found in by_run.items()
-    ]
-    entries += files
-    entries += _all_submitted(submissions, failures)
+    entries = [*_entries_of_runs(_by_run(runs, failures)), *files]
+    for folder in submissions:
+        with _noted(failures, folder.name):
+            entries.append(_submitted(folder))
+    names = {entry.runs[0]["matcher"]["name"] for entry in entries if entry.runs}
     listed = [entry.name for entry in entries]
     # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
     twice = next(
@@ -193,16 +177,36 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
     )
 
 
-def _by_run(
-    paths: Sequence[Path], failures: Failures | None
-) -> dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]]:
+def _entries_of_runs(by_run: _ByRun) -> list[Entry]:
+    """Return an entry for each name, version and hash, under the shortest name that no other has."""
+    names = [name for name, _, _ in by_run]
+    versions = [(name, number) for name, number, _ in by_run]
+    entries = []
+    for (name, number, digest), found in by_run.items():
+        shown = name if names.count(name) == 1 else f"{name} {number}"
+        if versions.count((name, number)) > 1:
+            shown = f"{name} {number} ({digest[:6]})"
+        entries.append(
+            Entry(
+                name=shown,
+                version=number,
+                hash=digest,
+                how=RUN_HERE,
+                sources=tuple(folder for folder, _ in found),
+                runs=tuple(about for _, about in found),
+            )
+        )
+    return entries
+
+
+def _by_run(paths: Sequence[Path], failures: Failures | None) -> _ByRun:
     """Return runs by name, version and hash; skip matchers with an unreadable run, which would be ranked on a part."""
     read: dict[Path, dict[str, Any]] = {}
     for path in paths:
         with _noted(failures, str(path.parent)):
             read[path] = _read_run(path)
     lost = {_root_of(path) for path in paths if path not in read}
-    found: dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]] = {}
+    found: _ByRun = {}
     for path, about in read.items():
         if _root_of(path) not in lost:
             card = about["matcher"]
@@ -217,14 +221,6 @@ def _root_of(run: Path) -> Path:
 
 def _noted(failures: Failures | None, name: str) -> AbstractContextManager[None]:
     return nullcontext() if failures is None else failures.of(name)
-
-
-def _all_submitted(folders: Sequence[Path], failures: Failures | None) -> list[Entry]:
-    found = []
-    for folder in folders:
-        with _noted(failures, folder.name):
-            found.append(_submitted(folder))
-    return found
 
 
 def _is_new(path: Path, seen: set[Path]) -> bool:

@@ -5,7 +5,7 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,12 +17,14 @@ from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false,
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.parallel import spread
+from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.base import Bools, Floats, weighted_mean
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept, presence_weights
 from sasgeo_bench.scoring.integrity_metric import choose_threshold, drawn_areas
 from sasgeo_bench.scoring.intervals import ClusterDraws, Interval, effective_count, seed_of_text, share_interval
 from sasgeo_bench.scoring.metrics import REJECTION, RISKS, THRESHOLDS, RejectionMetric, ThresholdMetric
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, to_frame
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
 
@@ -40,7 +42,7 @@ def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibr
     """
     names = {"matcher": matcher, "rejector": rejector, "stratum": AS_DRAWN}
     parts = [
-        (RowKey.of(part, suite=str(suite), track=str(track), prior_group=str(prior_group), **names), part)
+        (RowKey.of(part, GroupKey(str(suite), str(track), str(prior_group)), **names), part)
         for (track, prior_group), whole in rows.groupby(["track", "prior_group"], sort=True)
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
     ]
@@ -134,6 +136,7 @@ def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Flo
     yield from np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0).T
 
 
+JUDGED: Final = "rejectors"  # what progress is shown of
 OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
 _NUMBER: Final = r"\d+(?:\.\d+)?"
 _PARTS: Final = 5  # folds of the calibration blocks: thresholds need answers that the rejector was not fitted on
@@ -373,46 +376,63 @@ class RejectionTask:
 
 @dataclass(frozen=True, kw_only=True)
 class RejectionResult:
-    """Result for one entry.
+    """Rows of `judge` by matcher and rejector, rows of the board, and the rejectors' remarks on their fits."""
 
-    By rejector: the rows of `judge`, and the errors of those that failed. Then rows of the board, and lines that say
-    why rejectors were not applied.
+    judged: Mapping[tuple[str, str], pd.DataFrame]
+    rows: Sequence[pd.DataFrame]
+    remarks: tuple[str, ...]
+
+
+def evaluate_rejectors(
+    tasks: Sequence[RejectionTask], *, jobs: int, failures: Failures, tell: Tell, progress: Progress
+) -> RejectionResult:
+    """Evaluate all rejectors on the answers of each entry; the number of processes does not affect the result.
+
+    Record rejectors that fail on an entry, and report those that do not apply to it. Raise the error of a rejector that
+    fails on every entry: it is at fault, not the answers.
     """
+    judged: dict[tuple[str, str], pd.DataFrame] = {}
+    rows: list[pd.DataFrame] = []
+    errors: dict[str, list[Exception]] = {}
+    remarks: list[str] = []
+    progress.begin(JUDGED, len(tasks))
+    for task, results in zip(tasks, spread(_evaluated, tasks, jobs=jobs), strict=True):
+        progress.advance(JUDGED, 1)
+        for name, found in results.items():
+            if isinstance(found, Exception):
+                failures.note(f"{task.matcher} x {name}", found)
+                errors.setdefault(name, []).append(found)
+                continue
+            frame, figures = found
+            if name == OWN and not len(frame):
+                continue
+            judged[task.matcher, name] = frame
+            rows.append(figures)
+            if not len(frame):
+                tell(f"{name} on {task.matcher}: not applied, {why_not(task.scores, is_taught=task.is_taught)}")
+            elif name != OWN:
+                remarks += [f"{name} on {task.matcher}: {remark}" for remark in remarks_of(frame)]
+    for name, listed in errors.items():
+        if name != OWN and len(listed) == len(tasks):
+            raise listed[0]
+    for remark in remarks:
+        tell(remark)
+    return RejectionResult(judged=judged, rows=rows, remarks=tuple(remarks))
 
-    matcher: str
-    by_rejector: Mapping[str, pd.DataFrame]
-    rows: tuple[pd.DataFrame, ...] = ()
-    skipped: tuple[str, ...] = ()
-    failed: Mapping[str, Exception] = field(default_factory=dict)
 
-
-def apply_rejectors(tasks: Sequence[RejectionTask], *, jobs: int = 1) -> Iterator[RejectionResult]:
-    """Yield the result of each task in order; the number of processes does not affect it."""
-    yield from spread(_evaluated, tasks, jobs=jobs)
-
-
-def _evaluated(task: RejectionTask) -> RejectionResult:
-    """Apply all rejectors to one entry, and its own confidence; a rejector that is not applied has no rows."""
-    by_rejector, rows, skipped, failed = {}, [], [], {}
+def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame] | Exception]:
+    """Return by rejector the rows of `judge` and those of the board, or the error; own confidence comes first."""
+    results: dict[str, tuple[pd.DataFrame, pd.DataFrame] | Exception] = {}
     for name in (OWN, *task.rules):
-        is_own = name == OWN
         try:
-            if is_own:
-                frame = own_confidence(task.scores, task.split, is_taught=task.is_taught)
+            if name == OWN:  # it counts as a probability
+                frame, is_calibrated = own_confidence(task.scores, task.split, is_taught=task.is_taught), True
             else:
                 rule = task.rules[name]
                 frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
-            if len(frame):  # a matcher's own confidence counts as a probability
-                is_calibrated = is_own or task.rules[name].card.is_calibrated
-                rows.append(to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated))))
+                is_calibrated = rule.card.is_calibrated
+            figures = to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
+            results[name] = frame, figures
         except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
-            failed[name] = error
-            continue
-        if len(frame) or not is_own:
-            by_rejector[name] = frame
-        if not len(frame) and not is_own:
-            why = why_not(task.scores, is_taught=task.is_taught)
-            skipped.append(f"{name} on {task.matcher}: not applied, {why}")
-    return RejectionResult(
-        matcher=task.matcher, by_rejector=by_rejector, rows=tuple(rows), skipped=tuple(skipped), failed=failed
-    )
+            results[name] = error
+    return results

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import pandas as pd
 
@@ -24,6 +24,14 @@ UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # 
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Item = TypeVar("Item")
+
+
+class GroupKey(NamedTuple):
+    """Suite, track and prior group; values of two groups are never ranked against each other."""
+
+    suite: str
+    track: str
+    prior_group: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,23 +65,11 @@ class RowKey:
     places: int
 
     @classmethod
-    def of(
-        cls,
-        scores: pd.DataFrame,
-        *,
-        matcher: str,
-        suite: str,
-        track: str,
-        prior_group: str,
-        stratum: str,
-        rejector: str = "",
-    ) -> Self:
-        """Count some scored rows."""
+    def of(cls, scores: pd.DataFrame, group: GroupKey, *, matcher: str, stratum: str, rejector: str = "") -> Self:
+        """Count some scored rows of a group."""
         return cls(
+            **group._asdict(),
             matcher=matcher,
-            suite=suite,
-            track=track,
-            prior_group=prior_group,
             stratum=stratum,
             rejector=rejector,
             n=len(scores),

@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
+from sasgeo_bench.progress import Progress
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
@@ -25,10 +26,11 @@ from sasgeo_bench.scoring.intervals import (
     share_interval,
 )
 from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, RowKey, bare, in_threads, is_unranked, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, strata
 
+INTERVALS: Final = "intervals of suites"  # what progress is shown of
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -45,31 +47,46 @@ def leaderboard(
     and are no rivals; controls never are. `done` is called after each suite, track and prior group. Raise MetricError
     if two matchers were scored on different queries.
     """
-    groups = _groups(_aligned(scored))
+    frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
+    if not frames:
+        return to_frame([])
+    first = next(iter(frames))
+    queries = frames[first]
+    for name, frame in frames.items():
+        if not frame["query_id"].equals(queries["query_id"]):
+            message = f"{name} was scored on other queries than {first}: score them together"
+            raise MetricError(message)
+    keys = [GroupKey(*key) for key in zip(*(queries[name] for name in GROUP), strict=True)]
+    groups = []
+    for key in sorted(set(keys)):
+        index = [at for at, other in enumerate(keys) if other == key]
+        groups.append((key, {name: frame.iloc[index] for name, frame in frames.items()}))
     unranked = frozenset({*excluded, *filter(is_unranked, scored)})
     return to_frame(in_threads(lambda item: _rows_of_group(*item, draws, unranked), groups, done))
 
 
-def _aligned(scored: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Return the frames with their rows in one order."""
-    frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
-    first = next(iter(frames.values()), None)
-    for name, frame in frames.items():
-        if first is not None and not frame["query_id"].equals(first["query_id"]):
-            message = f"{name} was scored on other queries than {next(iter(frames))}: score them together"
-            raise MetricError(message)
-    return frames
+def leaderboards(
+    scored: Mapping[str, pd.DataFrame], *, draws: int, excluded: Collection[str], progress: Progress
+) -> list[pd.DataFrame]:
+    """Return the `leaderboard` of each set of suites that the same matchers were asked: in most cases one.
 
-
-def _groups(frames: Mapping[str, pd.DataFrame]) -> Iterator[tuple[tuple[str, str, str], dict[str, pd.DataFrame]]]:
-    """Yield suite, track and prior group, with the rows of each matcher."""
-    if not frames:
-        return
-    first = next(iter(frames.values()))
-    keys = list(zip(*(first[name] for name in GROUP), strict=True))
-    for suite, track, prior_group in sorted(set(keys)):
-        index = [at for at, key in enumerate(keys) if key == (suite, track, prior_group)]
-        yield (suite, track, prior_group), {name: frame.iloc[index] for name, frame in frames.items()}
+    Arguments as of `leaderboard`, but matchers may lack suites. `progress` counts suites, tracks and prior groups.
+    """
+    keys = {key for frame in scored.values() for key in frame[[*GROUP]].itertuples(index=False)}
+    progress.begin(INTERVALS, len(keys))
+    suites_of = {name: set(frame["suite"]) for name, frame in scored.items()}
+    asked_by: dict[tuple[str, ...], list[str]] = {}
+    for suite in sorted({suite for suites in suites_of.values() for suite in suites}):
+        asked_by.setdefault(tuple(name for name in scored if suite in suites_of[name]), []).append(suite)
+    return [
+        leaderboard(
+            {name: scored[name][scored[name]["suite"].isin(suites)] for name in names},
+            draws=draws,
+            excluded=excluded,
+            done=lambda: progress.advance(INTERVALS, 1),
+        )
+        for names, suites in asked_by.items()
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +97,7 @@ class _Group:
     in the order of their names.
     """
 
-    key: tuple[str, str, str]
+    key: GroupKey
     names: tuple[str, ...]
     rivals: tuple[str, ...]  # the ranked ones
     first: pd.DataFrame  # rows of any matcher: query columns are the same for all
@@ -93,7 +110,7 @@ class _Group:
     errors: dict[str, Floats]
 
     @classmethod
-    def of(cls, key: tuple[str, str, str], frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
+    def of(cls, key: GroupKey, frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
         """Return the columns of some matchers' rows; `unranked` matchers are no rivals."""
         first = next(iter(frames.values()))
         columns = dict.fromkeys(quantile.column for quantile in QUANTILES)
@@ -113,7 +130,7 @@ class _Group:
             sites=codes[2],
             is_answered=stacked(lambda frame: frame["is_answered"].to_numpy(bool)),
             is_missing=stacked(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
-            measured={metric.name: stacked(metric.values) for metric in means_of(key[1])},
+            measured={metric.name: stacked(metric.values) for metric in means_of(key.track)},
             errors={name: stacked(partial(_floats, name=name)) for name in columns},
         )
 
@@ -138,14 +155,11 @@ class _Cell:
 
     def keys(self) -> list[RowKey]:
         """Return the row key of each matcher."""
-        suite, track, prior_group = self.group.key
         blocks, places = (len(np.unique(codes[self.chosen])) for codes in (self.group.blocks, self.group.places))
         return [
             RowKey(
+                **self.group.key._asdict(),
                 matcher=name,
-                suite=suite,
-                track=track,
-                prior_group=prior_group,
                 stratum=self.stratum,
                 n=len(self.chosen),
                 answered=int(self.group.is_answered[self.chosen, at].sum()),
@@ -158,33 +172,26 @@ class _Cell:
 
 
 def _rows_of_group(
-    key: tuple[str, str, str], frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str]
+    key: GroupKey, frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str]
 ) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
     for name, frame in frames.items():
         if name not in able:
-            yield _not_applicable(name, key, frame)
+            row_key = RowKey.of(frame, key, matcher=name, stratum=ALL)
+            yield row_key.row(primary_of(key.track), bare(math.nan), is_applicable=False)
     if not able:
         return
     group = _Group.of(key, able, unranked)
-    counted = {metric.name: metric.counts(group.first) for metric in means_of(key[1])}
+    counted = {metric.name: metric.counts(group.first) for metric in means_of(key.track)}
     for stratum, inside in strata(group.first):
         by_count: dict[bytes, list[MeanMetric]] = {}
-        for metric in means_of(key[1]):
+        for metric in means_of(key.track):
             mask = inside & counted[metric.name]
             if mask.any():
                 by_count.setdefault(mask.tobytes(), []).append(metric)
         for key_of_mask, metrics in by_count.items():
             chosen = np.flatnonzero(np.frombuffer(key_of_mask, dtype=bool))
             yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), metrics)
-
-
-def _not_applicable(name: str, key: tuple[str, str, str], frame: pd.DataFrame) -> Row:
-    """Return the only row of a matcher that cannot do the task."""
-    suite, track, prior_group = key
-    primary = primary_of(track)
-    row_key = RowKey.of(frame, matcher=name, suite=suite, track=track, prior_group=prior_group, stratum=ALL)
-    return row_key.row(primary, bare(math.nan), is_applicable=False)
 
 
 def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
@@ -223,7 +230,7 @@ class _Below:
 
 def _thresholds(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[_Below]:
     """Yield quantiles of errors; their intervals invert those of the share below them (Woodruff 1952)."""
-    is_pose = cell.group.key[1] == "localization" and any(metric.is_primary for metric in metrics)
+    is_pose = cell.group.key.track == "localization" and any(metric.is_primary for metric in metrics)
     if not is_pose or cell.stratum not in _WHOLE:
         return
     for at in range(len(cell.group.names)):
@@ -282,12 +289,12 @@ def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
     return sensitivity(table[:, group.names.index(name)], table[:, best], blocks)
 
 
-def cost_rows(matcher: str, costs: Costs) -> Iterator[Row]:
-    """Yield every cost metric of one matcher: of each track, or of all tracks together."""
+def cost_figures(matcher: str, costs: Costs) -> pd.DataFrame:
+    """Return every cost metric of one matcher, of each track or of all tracks together, with the columns of `Row`."""
+    rows = []
     by_track = {str(track): part for track, part in costs.scores.groupby("track", sort=True)}
     for track, part in [*by_track.items(), ("all", costs.scores)]:
         mine = replace(costs, scores=part)
-        key = RowKey.of(part, matcher=matcher, suite=ALL_SUITES, track=track, prior_group="all", stratum="all")
-        for metric in COSTS:
-            if metric.is_by_track == (track != "all"):
-                yield key.row(metric, bare(metric.compute(mine)))
+        key = RowKey.of(part, GroupKey(ALL_SUITES, track, "all"), matcher=matcher, stratum="all")
+        rows += [key.row(one, bare(one.compute(mine))) for one in COSTS if one.is_by_track == (track != "all")]
+    return to_frame(rows)

@@ -30,11 +30,11 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.scoring import contestants
+from sasgeo_bench.scoring import contestants, tables
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.entries import find_entries
-from sasgeo_bench.scoring.rejection import why_not
+from sasgeo_bench.scoring.rejection import JUDGED, why_not
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.build import make_tasks
@@ -142,7 +142,7 @@ def test_progress_counts_every_group_of_queries_and_every_entry(out):
     request = ScoreRequest(predictions=[out / "runs"], root=out, board=out / "boards" / "mine", draws=200)
     board = make_board(request, tell=lambda _: None, progress=Counts())
     groups = board.scores["oracle_pose"][["suite", "track", "prior_group"]].drop_duplicates()
-    assert begun == done == {boards.INTERVALS: len(groups), boards.JUDGED: 1}
+    assert begun == done == {tables.INTERVALS: len(groups), JUDGED: 1}
 
 
 def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_path):
@@ -793,7 +793,7 @@ def test_answers_that_are_none_cost_their_author_alone(out, both, column, value,
 
 def fails_with(monkeypatch, name, is_bad):
     """A mistake of ours that only what one contestant says brings about."""
-    room = boards if hasattr(boards, name) and name != "hold_controls" else contestants
+    room = {"_scored": contestants, "hold_controls": contestants, "leaderboard": tables}.get(name, boards)
     work = getattr(room, name)
 
     def broken(*words, **more):
@@ -830,7 +830,7 @@ def test_a_mistake_of_ours_costs_the_contestant_it_is_about_and_the_log_says_whe
 @pytest.mark.parametrize(
     ("step", "is_bad", "what"),
     [
-        ("cost_rows", lambda name, *_, **__: name == "bad", "costs of bad"),
+        ("cost_figures", lambda name, *_, **__: name == "bad", "costs of bad"),
         ("protection_frame", lambda name, *_: name == "bad", "protection levels of bad"),
     ],
 )

@@ -18,7 +18,7 @@ from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard import build as boards
+from sasgeo_bench.leaderboard import board as board_module
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
@@ -96,7 +96,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
 
 def test_stored_results_keep_the_version_of_the_maps_they_were_asked_on(kept, tmp_path, monkeypatch):
     _, _, folder, _ = kept
-    monkeypatch.setattr(boards, "DATA_VERSION", 99)
+    monkeypatch.setattr(board_module, "DATA_VERSION", 99)
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path)
     score_all(replace(usual, draws=100, rejectors=()), tell=lambda _: None, has_cases=False)
     first = json.loads((folder / "board.json").read_text())

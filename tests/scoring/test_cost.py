@@ -8,8 +8,7 @@ import pytest
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.cost import Costs, latency_quantile, map_kb_per_km2, per_fix, run_cost
-from sasgeo_bench.scoring.rows import to_frame
-from sasgeo_bench.scoring.tables import cost_rows
+from sasgeo_bench.scoring.tables import cost_figures
 from tests.scoring.test_tables import scores
 
 RUNS = (
@@ -27,7 +26,7 @@ def costs_of(runs=RUNS, table=None, **more):
 
 
 def costs(runs=RUNS, table=None):
-    return to_frame(list(cost_rows("mine", costs_of(runs, table)))).set_index("metric")["value"]
+    return cost_figures("mine", costs_of(runs, table)).set_index("metric")["value"]
 
 
 def timed(latency_s, status):
@@ -86,5 +85,5 @@ def test_a_file_of_predictions_has_only_the_cost_of_what_was_sent():
 
 def test_latencies_are_of_a_track_and_all_else_of_the_matcher():
     table = scores([1.0]).assign(latency_s=np.array([0.5]))
-    rows = {row.metric: row.track for row in cost_rows("mine", costs_of(table=table))}
+    rows = cost_figures("mine", costs_of(table=table)).set_index("metric")["track"].to_dict()
     assert {name for name, track in rows.items() if track != "all"} == {"latency_p50", "latency_p95"}

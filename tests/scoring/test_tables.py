@@ -21,7 +21,7 @@ from sasgeo_bench.scoring.rejection import integrity_rows, own_confidence
 from sasgeo_bench.scoring.rows import COLUMNS, EntryLabel, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
-from sasgeo_bench.scoring.tables import cost_rows, leaderboard
+from sasgeo_bench.scoring.tables import cost_figures, leaderboard
 from sasgeo_bench.texts import markdown
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
@@ -354,9 +354,9 @@ def test_the_board_says_what_each_of_its_columns_is():
     tables = {"mine": scores([1.0, 99.0] * 20, confidence=[0.9, 0.1] * 20, is_present=[True] * 30 + [False] * 10)}
     tables["mine"]["is_right"] &= tables["mine"]["is_present"]
     views = dict.fromkeys(tables["mine"]["query_id"], 1)
-    rows = [*cost_rows("mine", Costs(scores=tables["mine"], runs=[], view_bytes=views, area_km2={}))]
-    rows += integrity_rows("mine", "own", own_confidence(tables["mine"]))
-    board = pd.concat([leaderboard(tables, draws=200), to_frame(rows)], ignore_index=True)
+    costs = cost_figures("mine", Costs(scores=tables["mine"], runs=[], view_bytes=views, area_km2={}))
+    rows = to_frame(list(integrity_rows("mine", "own", own_confidence(tables["mine"]))))
+    board = pd.concat([leaderboard(tables, draws=200), costs, rows], ignore_index=True)
     text = board_markdown(board, ABOUT).split("## How to read")[1]
     terms = {line.split("**")[1] for line in text.splitlines() if line}
     shown = {column.term for table in tables_of(board, {}) for column in table.columns}

@@ -152,13 +152,13 @@ class PlainFigure(Figure):
 
     def write(self, path: Path, about: Page) -> None:
         """Write the figure as .svg or .png; the same figure gives the same bytes."""
-        if path.suffix == ".svg":
+        if ".svg" in path.suffixes:  # of a file that is not yet in its place, too
             drawn = io.StringIO()
             metadata = {"Date": None, "Creator": None, "Rights": about.data, "Title": about.title}
             self.savefig(drawn, format="svg", metadata=metadata)
             path.write_text(_rounded(drawn.getvalue()), encoding="utf-8")
         else:
-            self.savefig(path, metadata={"Title": about.title, "Copyright": about.data, "Software": None})
+            self.savefig(path, format="png", metadata={"Title": about.title, "Copyright": about.data, "Software": None})
 
     def savefig(self, fname: Any, **options: Any) -> None:  # noqa: ANN401 - as the figure's own
         """Write the figure; each entry of its metadata is one line."""

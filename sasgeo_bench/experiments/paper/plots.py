@@ -3,7 +3,7 @@
 
 import math
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
@@ -193,13 +193,17 @@ def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
     )
     most = {name: float(table.loc[table["matcher"] == name, "risk"].max()) for name in names}
     low = sorted(most.values())[max(0, len(names) - 2)]  # the second largest: of all but the worst
-    lines = []
+    curves: list[tuple[list[float], list[float], dict[str, Any]]] = []
     for number, name in enumerate(names):
         rows = table[table["matcher"] == name]
         first = rows.iloc[0]
-        look = {"color": _COLOURS[number % len(_COLOURS)], "ls": _DASHES[number % len(_DASHES)], "lw": 1.6}
-        label = f"{first['title']} (AURC {first['aurc']:.4f}, n {first['n']})"
-        lines.append(Line2D([0, *rows["coverage"]], [first["risk"], *rows["risk"]], label=label, **look))
+        look = {
+            "color": _COLOURS[number % len(_COLOURS)],
+            "ls": _DASHES[number % len(_DASHES)],
+            "lw": 1.6,
+            "label": f"{first['title']} (AURC {first['aurc']:.4f}, n {first['n']})",
+        }
+        curves.append(([0.0, *rows["coverage"]], [first["risk"], *rows["risk"]], look))
     about = Page(
         title="Risk against coverage, accepting by margin",
         note=note,
@@ -207,15 +211,13 @@ def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
         below="coverage (share of trials accepted)",
         columns=2,
         panel_inches=(3.9, 2.3),
-        keys=lines,
+        keys=[Line2D([], [], **look) for _, _, look in curves],
         dpi=_DPI,
     )
     with page(path, about) as ((whole, lower),):
         for chart, top in ((whole, max(most.values())), (lower, low)):
-            for line in lines:
-                chart.plot(
-                    *line.get_data(), color=line.get_color(), ls=line.get_linestyle(), lw=1.6, drawstyle="steps-pre"
-                )
+            for coverage, risk, look in curves:
+                chart.plot(coverage, risk, drawstyle="steps-pre", **look)
             chart.set_xlim(0, 1)
             chart.set_ylim(0, max(_LEAST_RISK, 1.08 * top))
             chart.grid(visible=True, color="#e2e2e2", lw=0.6)

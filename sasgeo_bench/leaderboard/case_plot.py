@@ -101,7 +101,6 @@ ANSWERED: Final = "#d55e00"
 _OTHER: Final = "#0072b2"
 _SIDE: Final = 1.72  # of a small panel, inches
 _MAP: Final = 3.9
-_MOSAIC: Final = (("view", "true", "answer", "map"), ("modes", "said", "said", "map"))
 _DPI: Final = 100
 _HALO: Final = (patheffects.withStroke(linewidth=2.6, foreground="white"),)
 
@@ -162,18 +161,18 @@ def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
     """Draw a query and its answer; pixels as of `picture.pixels_of`, the same for the same case."""
     about = Page(title=case.title, data=case.attribution)
     with styled():
-        figure = new_figure((3 * _SIDE + _MAP + 0.7, _MAP + 0.9), dpi=_DPI)
-        body = figure.framed(about)
-        charts = body.subplot_mosaic(
-            _MOSAIC, width_ratios=(_SIDE, _SIDE, _SIDE, _MAP), height_ratios=(_SIDE, _MAP - _SIDE)
-        )
-        _panel(charts["view"], "view", case.view)
-        _panel(charts["true"], "map at the true place" if case.is_present else "map where it was taken", case.at_true)
-        _panel(charts["answer"], "map at the answer", case.at_answer)
-        _draw_map(charts["map"], case)
-        _draw_modes(charts["modes"], case)
-        charts["said"].axis("off")
-        charts["said"].text(0, 1, "\n".join(case.said), va="top", fontsize=6.8, linespacing=1.32)
+        figure = new_figure((3 * _SIDE + _MAP + 0.5, _MAP + 1.2), dpi=_DPI)
+        left, right = figure.framed(about).subfigures(1, 2, width_ratios=(3 * _SIDE, _MAP))
+        above, below = left.subfigures(2, 1, height_ratios=(_SIDE, _MAP - _SIDE))
+        where = "map at the true place" if case.is_present else "map where it was taken"
+        panels = (("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer))
+        for chart, (name, evidence) in zip(above.subplots(1, 3), panels, strict=True):
+            _panel(chart, name, evidence)
+        _draw_map(right.subplots(), case)
+        modes, said = below.subplots(1, 2)
+        _draw_modes(modes, case)
+        said.axis("off")
+        said.text(0, 1, "\n".join(case.said), va="top", fontsize=6.8, linespacing=1.32)
         return pixels_of(figure)
 
 
@@ -197,7 +196,7 @@ def _draw_map(chart: Axes, case: CasePicture) -> None:
     chart.set_facecolor(HIDDEN)
     chart.add_patch(Rectangle((0, 0), width_m, height_m, color="white", lw=0, zorder=-1))
     without_ticks(chart)
-    chart.set_title(f"map, north up, {side_m:.0f} m across: {_key(case)}", fontsize=7.5)
+    chart.set_title(f"map, north up, {side_m:.0f} m across:\n{_key(case)}", fontsize=7.5)
     if case.disc is not None:
         easting_m, northing_m, radius_m = case.disc
         middle = (easting_m - part.west_m, northing_m - part.south_m)

@@ -114,6 +114,7 @@ def picture_of(
     """Draw a raster in metres without ticks; values from 0 to `top` by the colours of weights."""
     box = (0.0, side_m[0], 0.0, side_m[1])
     without_ticks(chart)
+    chart.set_anchor("N")  # beside a panel with a colour bar
     chart.set_title(title)
     if top is None:
         return chart.imshow(picture, extent=box, interpolation="nearest")
@@ -122,7 +123,7 @@ def picture_of(
 
 def colour_bar(chart: Axes, mapped: ScalarMappable) -> None:
     """Draw the colour bar of weights below a panel."""
-    drawn = chart.figure.colorbar(mapped, ax=chart, location="bottom", extend="max", extendfrac=0.03, aspect=45)
+    drawn = chart.figure.colorbar(mapped, ax=chart, location="bottom", extend="max", aspect=45, panchor=False)
     drawn.set_label(f"w = \u03c3\u03bd, {UNIT} that are mapped and seen")
 
 

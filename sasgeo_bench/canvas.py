@@ -104,7 +104,7 @@ class PlainFigure(Figure):
             if text.get_horizontalalignment() == "center":
                 x = text.get_position()[0]
                 room = 2 * min(x, 1 - x) * width
-            points = float(text.get_fontsize()) * (1.2 if text.get_weight() == "bold" else 1.0)
+            points = float(text.get_fontsize()) * (1.2 if text.get_fontweight() == "bold" else 1.0)
             text.set(x=x, text=_broken(said, room, points))
         for item in self.findobj(Text):
             if isinstance(item, Text):

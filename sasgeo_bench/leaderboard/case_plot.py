@@ -91,7 +91,8 @@ def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uin
         chart.set_axis_off()
         chart.set_anchor("W")
         figure.supxlabel(manifest.attribution, x=0.01, ha="left", fontsize=5.5, color=GREY)
-        figure.get_layout_engine().set(w_pad=0, h_pad=0.02)
+        engine: Any = figure.get_layout_engine()  # without types
+        engine.set(w_pad=0, h_pad=0.02)
         return pixels_of(figure)
 
 

@@ -80,7 +80,12 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
     with styled():
         figure = new_figure((4 * (_SIDE + 0.15), _SIDE + tables + 2.3), dpi=_DPI)
         charts = figure.framed(about).subplot_mosaic(mosaic, height_ratios=(_SIDE, tables))
-        pictures = (paint(sheet.view), paint(sheet.mapped), sheet.weights, paint(sheet.lookalike))
+        pictures: tuple[NDArray[np.generic], ...] = (
+            paint(sheet.view),
+            paint(sheet.mapped),
+            sheet.weights,
+            paint(sheet.lookalike),
+        )
         for name, picture, title in zip(mosaic[0], pictures, sheet.panels, strict=True):
             top = sheet.top if name == "weights" else None
             drawn = picture_of(charts[name], picture, sheet.view.size_m, title, top=top)
@@ -121,13 +126,12 @@ def _draw_classes(chart: Axes, sheet: LookalikeSheet, told: Sequence[str]) -> No
     for number, row in enumerate((groups, heads)):
         _draw_row(chart, number, row, _CLASS_COLUMNS, color=GREY)
     classes = {item.name: item for item in load_taxonomy().classes}
-    scores = sheet.scores.to_dict("index")
     for number, name in enumerate(told, start=2):
-        row = scores[name]
+        shares, nats = (sheet.scores.loc[name, list(columns)].to_numpy(float) for columns in (_SHARES, _SCORES))
         numbers = (
-            *(f"{100 * row[column]:.1f}" for column in _SHARES),
+            *(f"{100 * share:.1f}" for share in shares),
             f"{sheet.worth[name]:.2f}",
-            *(_signed(row[column]) for column in _SCORES),
+            *(_signed(value) for value in nats),
         )
         _draw_row(chart, number, ("", classes[name].title, *numbers), _CLASS_COLUMNS)
         chart.plot(0.01, number, marker="s", ms=6.5, color=classes[name].colour, mec="#666666", mew=0.4)

@@ -197,7 +197,7 @@ def draw_risk(path: Path, table: pd.DataFrame, *, data: str) -> None:
     for number, name in enumerate(names):
         rows = table[table["matcher"] == name]
         first = rows.iloc[0]
-        look = {
+        look: dict[str, Any] = {
             "color": _COLOURS[number % len(_COLOURS)],
             "ls": _DASHES[number % len(_DASHES)],
             "lw": 1.6,

@@ -126,12 +126,13 @@ def _draw_classes(chart: Axes, sheet: LookalikeSheet, told: Sequence[str]) -> No
     for number, row in enumerate((groups, heads)):
         _draw_row(chart, number, row, _CLASS_COLUMNS, color=GREY)
     classes = {item.name: item for item in load_taxonomy().classes}
+    all_scores = sheet.scores.to_dict("index")
     for number, name in enumerate(told, start=2):
-        shares, nats = (sheet.scores.loc[name, list(columns)].to_numpy(float) for columns in (_SHARES, _SCORES))
+        scores = all_scores[name]
         numbers = (
-            *(f"{100 * share:.1f}" for share in shares),
+            *(f"{100 * scores[column]:.1f}" for column in _SHARES),
             f"{sheet.worth[name]:.2f}",
-            *(_signed(value) for value in nats),
+            *(_signed(scores[column]) for column in _SCORES),
         )
         _draw_row(chart, number, ("", classes[name].title, *numbers), _CLASS_COLUMNS)
         chart.plot(0.01, number, marker="s", ms=6.5, color=classes[name].colour, mec="#666666", mew=0.4)

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from sasgeo_bench.canvas import page
 from sasgeo_bench.leaderboard.board_files import Extra, write_board
-from sasgeo_bench.leaderboard.board_plots import Page, page
+from sasgeo_bench.leaderboard.board_plots import BoardPage
 from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict, verdict_frame
 from sasgeo_bench.scoring.rows import RUN_HERE, EntryLabel, Row, to_frame, with_entry_labels
@@ -113,7 +114,7 @@ def verdict(*, holds=True):
 
 def draw(path):
     """A figure of the board's."""
-    about = Page(title="Success against the age of the map: real-age", note="n 80 each", below="years")
+    about = BoardPage(title="Success against the age of the map: real-age", note="n 80 each", below="years")
     with page(path, about) as charts:
         charts[0][0].plot([0, 1], [1, 0])
 

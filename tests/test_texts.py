@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.table import Table
 
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import PlainFigure, page
 from sasgeo_bench.cli.console import Bars, errors, print_table, say, tell
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import write_board
-from sasgeo_bench.leaderboard.board_plots import Page, page
+from sasgeo_bench.leaderboard.board_plots import BoardPage, line_keys
 from sasgeo_bench.leaderboard.case_plot import pixels_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
@@ -217,7 +217,7 @@ def test_toml_yaml_and_json_read_the_text_again(text):
 
 def drawn(path, text):
     """A figure with a text in every place that a figure has."""
-    about = Page(title=text or "x", note=text, below=text, keys=[text or "x", "other"])
+    about = BoardPage(title=text or "x", note=text, below=text, keys=line_keys([text or "x", "other"]))
     with page(path, about) as charts:
         (chart,) = charts[0]
         chart.plot([0, 1], [1, 0], label=text)

@@ -8,13 +8,11 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from sasgeo_bench.ageing.measure import Ageing
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import Page, page
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION
 
@@ -24,37 +22,34 @@ _POOLED: Final = "#000000"
 _WHOLE: Final = "#d55e00"
 _BY_ID: Final = "#0072b2"
 _LATE: Final = 0.8  # of viridis: beyond, its yellow is too pale on white
-_ROW_INCHES: Final = 0.42
-_WIDTH_INCHES: Final = 12.0
-_FRAME_INCHES: Final = 2.75
-_TOP_INCHES: Final = 1.0
-# Text stays searchable; ids are the same in every run.
-_STYLE: Final[dict[Any, Any]] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "sasgeo-bench",
-    "font.family": "sans-serif",
-    "font.size": 9.0,
-}
+_NOTE: Final = (
+    "What appears may be mapping that catches up. Rates beyond the scale lie on its edges. "
+    "Amount: ground or length; number and id: things."
+)
 
 
 def draw_ageing(path: Path, ageing: Ageing) -> None:
     """Draw the measurements of one place as an SVG; the same table gives the same bytes."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     names = list(dict.fromkeys(ageing.table["class"]))
-    height = _ROW_INCHES * len(names) + _FRAME_INCHES
-    with mpl.rc_context(_STYLE):
-        figure = PlainFigure(figsize=(_WIDTH_INCHES, height), facecolor="white")
-        FigureCanvasAgg(figure)
-        panels = figure.subplots(1, 3, sharey=True, width_ratios=[1, 1, 0.8])
-        low, high = 1.3 / height, 1 - _TOP_INCHES / height
-        figure.subplots_adjust(left=0.16, right=0.985, bottom=low, top=high, wspace=0.13)
-        _draw_rates(panels[0], ageing.table, names, "vanish_per_year", "vanishes, % of the older map a year")
-        _draw_rates(panels[1], ageing.table, names, "appear_per_year", "appears, % of the newer map a year")
-        _draw_shares(panels[2], ageing.table, names)
-        panels[0].set_yticks(range(len(names)), [titles[name] for name in names])
-        panels[0].set_ylim(len(names) - 0.5, -0.5)
-        _words(figure, ageing, height)
-        figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None, "Rights": ATTRIBUTION})
+    first, last = ageing.table["date_from"].min(), ageing.table["date_to"].max()
+    about = Page(
+        title=f"{ageing.place}: how the map aged",
+        facts=f"{len(ageing.sources)} maps from {first:%Y-%m-%d} to {last:%Y-%m-%d}, {ageing.area_km2:,.1f} km2",
+        note=_NOTE,
+        data=ATTRIBUTION,
+        columns=3,
+        panel_inches=(3.1, 0.42 * len(names)),
+        keys=_keys(),
+    )
+    with page(path, about) as ((vanished, appeared, gone),):
+        _draw_rates(vanished, ageing.table, names, "vanish_per_year", "vanishes, % of the older map a year")
+        _draw_rates(appeared, ageing.table, names, "appear_per_year", "appears, % of the newer map a year")
+        _draw_shares(gone, ageing.table, names)
+        for chart in (vanished, appeared, gone):
+            chart.set_yticks(range(len(names)), [titles[name] for name in names])
+            chart.tick_params(labelleft=chart is vanished)
+            chart.set_ylim(len(names) - 0.5, -0.5)
 
 
 def _draw_rates(chart: Axes, table: pd.DataFrame, names: list[str], column: str, title: str) -> None:
@@ -112,25 +107,18 @@ def _draw_shares(chart: Axes, table: pd.DataFrame, names: list[str]) -> None:
 
 
 def _dress(chart: Axes, title: str, rows: int) -> None:
-    chart.set_title(title, fontsize=10, loc="left")
+    chart.set_title(title)
     chart.grid(visible=True, axis="x", color="#dddddd", lw=0.7)
     for at in range(0, rows, 2):
         chart.axhspan(at - 0.5, at + 0.5, color="#f6f6f6", lw=0, zorder=0)
-    chart.set_axisbelow(True)
     chart.tick_params(axis="y", length=0)
-    for side in ("top", "right", "left"):
-        chart.spines[side].set_visible(False)
+    chart.spines["left"].set_visible(False)
 
 
-def _words(figure: Figure, ageing: Ageing, height: float) -> None:
-    """Write the title above; explain the marks and name the source of the data below."""
-    table = ageing.table
-    first, last = table["date_from"].min(), table["date_to"].max()
-    states = f"{len(ageing.sources)} maps from {first:%Y-%m-%d} to {last:%Y-%m-%d}, {ageing.area_km2:,.1f} km2"
-    figure.text(0.015, 1 - 0.15 / height, f"{ageing.place}: how the map aged", fontsize=14, weight="bold", va="top")
-    figure.text(0.015, 1 - 0.47 / height, states, fontsize=9.5, color="#444444", va="top")
+def _keys() -> list[Line2D]:
+    """Explain the marks."""
     common: dict[str, Any] = {"ls": "", "marker": "o"}
-    marks = [
+    return [
         Line2D([], [], color=_POOLED, marker="o", ms=5, lw=1.6, label="rate over all intervals, 95 %"),
         Line2D([], [], color=mpl.colormaps["viridis"](0.0), ms=4, label="one interval, early", **common),
         Line2D([], [], color=mpl.colormaps["viridis"](_LATE), ms=4, label="one interval, late", **common),
@@ -148,10 +136,3 @@ def _words(figure: Figure, ageing: Ageing, height: float) -> None:
         Line2D([], [], color="none", mec=_WHOLE, ms=5, mew=1.4, label="the same, by number", **common),
         Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="by id"),
     ]
-    figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.01, 0.36 / height), ncols=6, frameon=False)
-    note = (
-        "What appears may be mapping that catches up. Rates beyond the scale lie on its edges. "
-        "Amount: ground or length; number and id: things."
-    )
-    figure.text(0.015, 0.33 / height, note, fontsize=8.5, color="#444444", va="top")
-    figure.text(0.985, 0.33 / height, ATTRIBUTION, fontsize=8.5, va="top", ha="right")

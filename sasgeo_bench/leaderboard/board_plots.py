@@ -1,25 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages for the figures of a board, as SVG or PNG, and the axes, lines and bars that several share."""
 
-import io
-import math
-import re
-import textwrap
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.lines import Line2D
 
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import Page, page, panels
 from sasgeo_bench.errors import counted
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.base import Floats
@@ -29,31 +22,8 @@ from sasgeo_bench.scoring.metrics import primary_of
 _COLOURS: Final = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _DASHES: Final = ("-", "--", "-.", ":")
 _MARKS: Final = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "h")
-GREY: Final = "#555555"
 FAINT: Final = "#dddddd"
-_DPI: Final = 110
-_TAGS: Final = re.compile(r"<[^>]+>")  # texts between them hold no bracket, and are not touched
-_NUMBERS: Final = re.compile(r' (?:d|x|y|x1|x2|y1|y2|points)="[^"]*"')
-_GROUP_NAMES: Final = re.compile(r' id="[A-Za-z2.]+_\d+"')  # nothing refers to them; what is referred to has a hash
-_STYLE_OF: Final = re.compile(r' style="([^"]*)"')
-_INDENTS: Final = re.compile(r"\n +")
-_DIGITS: Final = re.compile(r"(\.\d\d)\d+")
-_TITLE_LETTERS: Final = 30  # of a panel's title, in a line
-_LABEL_POINTS: Final = 8.5
-_LINE_INCHES: Final = 0.155  # of a note
-_KEY_INCHES: Final = 0.2
-_LABEL_LETTERS: Final = 13.0  # of a label of axes, on an inch
-_LETTERS: Final = 15.5  # of a note, on an inch
-_STYLE: Final[dict[Any, Any]] = {
-    "svg.fonttype": "none",  # text stays text, so that it can be searched for
-    "svg.hashsalt": "sasgeo-bench",
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 8.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-}
+BoardPage: Final = partial(Page, data=ATTRIBUTION)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,113 +44,15 @@ def look_of(number: int) -> Look:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Page:
-    """Title, notes and size of a figure around its panels.
-
-    `title` and `note` stand above and below, broken into lines; `below` names the axes across, once, under the middle
-    of the panels. `rows` and `columns` count panels down and across. `panel_inches` are width and height of a panel,
-    `left_inches` and `gap_inches` the room for text left of all panels, and of each but the first column,
-    `row_gap_inches` that between rows. `keys` is the legend, above the panels, by the numbers of `look_of`, with marks
-    if `has_marks`.
-    """
-
-    title: str
-    note: str
-    below: str
-    rows: int = 1
-    columns: int = 1
-    panel_inches: tuple[float, float] = (2.4, 2.1)
-    left_inches: float = 0.75
-    gap_inches: float = 0.2
-    row_gap_inches: float = 0.55
-    keys: Sequence[str] = field(default=())
-    has_marks: bool = True
-
-
-@contextmanager
-def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
-    """Yield the panels of a figure, row by row; write it as .svg or .png when the block ends."""
-    wide, high = about.panel_inches
-    width = max(6.4, about.left_inches + about.columns * (wide + about.gap_inches) + 0.2)
-    title = textwrap.wrap(about.title, int(width * 10.5))
-    note = textwrap.wrap(about.note, int(width * _LETTERS))
-    across = _keys_across(about.keys, width)
-    legend = _KEY_INCHES * math.ceil(len(about.keys) / across) + 0.1 if about.keys else 0.0
-    top = 0.14 + 0.2 * len(title) + legend + 0.36
-    bottom = 0.62 + _LINE_INCHES * len(note) + 0.3
-    height = top + about.rows * high + (about.rows - 1) * about.row_gap_inches + bottom
-    with mpl.rc_context(_STYLE):
-        figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
-        FigureCanvasAgg(figure)
-        figure.text(0.12 / width, 1 - 0.1 / height, "\n".join(title), fontsize=10.5, weight="bold", va="top")
-        figure.text(
-            0.12 / width, 0.26 / height, "\n".join(note), fontsize=7.5, color=GREY, va="bottom", linespacing=1.3
+def line_keys(names: Sequence[str], *, has_marks: bool = True) -> list[Line2D]:
+    """Return the legend of lines of the looks 0, 1, ..."""
+    looks = [(name, look_of(number)) for number, name in enumerate(names)]
+    return [
+        Line2D(
+            [], [], color=look.colour, ls=look.dash, marker=look.mark if has_marks else "", ms=4.5, lw=1.5, label=name
         )
-        figure.text(0.12 / width, 0.09 / height, f"Data: {ATTRIBUTION}", fontsize=7.5, color=GREY, va="bottom")
-        if about.keys:
-            figure.legend(
-                handles=[_key(number, name, has_mark=about.has_marks) for number, name in enumerate(about.keys)],
-                loc="upper left",
-                bbox_to_anchor=(0.06 / width, 1 - (0.14 + 0.2 * len(title)) / height),
-                ncols=across,
-                frameon=False,
-                fontsize=8,
-                borderaxespad=0.2,
-                handlelength=2.6,
-            )
-        lefts = [about.left_inches + column * (wide + about.gap_inches) for column in range(about.columns)]
-        lows = [height - top - (row + 1) * high - row * about.row_gap_inches for row in range(about.rows)]
-        charts = [
-            [figure.add_axes((left / width, low / height, wide / width, high / height)) for left in lefts]
-            for low in lows
-        ]
-        middle = about.left_inches + (about.columns * (wide + about.gap_inches) - about.gap_inches) / 2
-        label = "\n".join(textwrap.wrap(about.below, int(2 * min(middle, width - middle) * _LABEL_LETTERS)))
-        figure.text(middle / width, (bottom - 0.42) / height, label, ha="center", va="center", fontsize=_LABEL_POINTS)
-        yield charts
-        if path.suffix == ".svg":
-            drawn = io.StringIO()
-            metadata = {"Date": None, "Creator": None, "Rights": ATTRIBUTION, "Title": about.title}
-            figure.savefig(drawn, format="svg", metadata=metadata)
-            path.write_text(_rounded(drawn.getvalue()), encoding="utf-8")
-        else:
-            figure.savefig(path, metadata={"Software": None, "Title": about.title})
-
-
-def _rounded(svg: str) -> str:
-    """Shorten an SVG: hundredths of a point at most, no indents or names of groups, each style written once.
-
-    This halves the file.
-    """
-    return _classed(_TAGS.sub(lambda tag: _short(tag[0]), _INDENTS.sub("\n", svg)))
-
-
-def _short(tag: str) -> str:
-    return _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), _GROUP_NAMES.sub("", tag))
-
-
-def _classed(svg: str) -> str:
-    """Replace styles that stand more than once by classes, numbered by first appearance."""
-    counts = Counter(style for tag in _TAGS.findall(svg) for style in _STYLE_OF.findall(tag))
-    names = {style: f"s{at}" for at, style in enumerate(style for style, count in counts.items() if count > 1)}
-    rules = "".join(f".{name}{{{style}}}" for style, name in names.items())
-    classes = {f' style="{style}"': f' class="{name}"' for style, name in names.items()}
-    short = _TAGS.sub(lambda tag: _STYLE_OF.sub(lambda one: classes.get(one[0], one[0]), tag[0]), svg)
-    return short.replace("</style>", f"{rules}</style>", 1)
-
-
-def _keys_across(keys: Sequence[str], width: float) -> int:
-    """Return the number of legend entries in a row."""
-    longest = max((len(name) for name in keys), default=1)
-    return max(1, min(len(keys), int(width / (0.6 + 0.075 * longest))))
-
-
-def _key(number: int, name: str, *, has_mark: bool) -> Line2D:
-    look = look_of(number)
-    return Line2D(
-        [], [], color=look.colour, ls=look.dash, marker=look.mark if has_mark else "", ms=4.5, lw=1.5, label=name
-    )
+        for name, look in looks
+    ]
 
 
 PRIMARY: Final = {
@@ -232,15 +104,6 @@ def draw_line(chart: Axes, mine: pd.DataFrame, at: Floats, number: int) -> None:
     chart.vlines(at, lo, hi, color=look.colour, lw=0.9, alpha=0.75)
 
 
-def panels(charts: list[list[Axes]], count: int) -> Iterator[tuple[int, Axes]]:
-    """Yield the number and axes of each of `count` panels; hide those beyond."""
-    for number, chart in enumerate(chart for line in charts for chart in line):
-        if number < count:
-            yield number, chart
-        else:
-            chart.set_visible(False)
-
-
 def label_outer(chart: Axes, number: int, columns: int, count: int, label: str) -> None:
     """Label the axes of a panel where no other panel stands between them and the edge."""
     is_left = number % columns == 0
@@ -259,12 +122,7 @@ def ticks_across(chart: Axes, ticks: Sequence[float], low: float, high: float) -
 
 def panel_title(chart: Axes, name: str, row: Mapping[str, Any] | pd.Series) -> None:
     """Write a name and the numbers of queries and blocks of a row above a panel."""
-    chart.set_title(f"{name}\nn {row['n']:g}, {counted(int(row['blocks']), 'block')}", fontsize=8, loc="left")
-
-
-def cut(name: str) -> str:
-    """Return a name cut to the width of a panel."""
-    return name if len(name) <= _TITLE_LETTERS else f"{name[: _TITLE_LETTERS - 3]}..."
+    chart.set_title(f"{name}\nn {row['n']:g}, {counted(int(row['blocks']), 'block')}")
 
 
 def draw_bar_panels(
@@ -272,21 +130,18 @@ def draw_bar_panels(
 ) -> None:
     """Draw success as bars with intervals: a panel for each value of a column, a bar for each matcher."""
     names, (down, across) = those_there(rows, shown), panels_across(len(values))
-    about = Page(
+    about = BoardPage(
         title=title,
         note=note,
         below=PRIMARY[primary_of(str(rows["track"].iloc[0])).name].replace("\n", " "),
         rows=down,
         columns=across,
         panel_inches=(1.9, 0.3 + 0.19 * len(names)),
-        left_inches=0.35 + 0.075 * max(map(len, names)),
-        gap_inches=0.42,
-        row_gap_inches=0.62,
     )
     with page(path, about) as charts:
         for number, chart in panels(charts, len(values)):
             mine = rows[rows[column] == values[number]]
-            panel_title(chart, cut(values[number]), mine.iloc[0])
+            panel_title(chart, values[number], mine.iloc[0])
             _draw_bars(chart, mine, names)
             if number % across:
                 chart.set_yticklabels([])

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence, footprint
@@ -84,24 +84,24 @@ def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uin
     """
     rows, cols = overview.shape[1:]
     scale = _THUMB_INCHES / max(rows, cols)
-    width, height = max(cols * scale, 1.6), rows * scale + _FOOT_INCHES
-    figure = PlainFigure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    chart = figure.add_axes((0, _FOOT_INCHES / height, cols * scale / width, rows * scale / height))
-    chart.imshow(paint_overview(manifest, overview), interpolation="antialiased", aspect="auto")
-    chart.set_axis_off()
-    figure.text(0.03 / width, 0.03 / height, manifest.attribution, fontsize=5.5, color="#444444", va="bottom")
-    return pixels_of(figure)
+    with styled():
+        figure = new_figure((max(cols * scale, 1.6), rows * scale + _FOOT_INCHES), dpi=_DPI)
+        chart = figure.subplots()
+        chart.imshow(paint_overview(manifest, overview), interpolation="antialiased")
+        chart.set_axis_off()
+        chart.set_anchor("W")
+        figure.supxlabel(manifest.attribution, x=0.01, ha="left", fontsize=5.5, color=GREY)
+        engine: Any = figure.get_layout_engine()  # without types
+        engine.set(w_pad=0, h_pad=0.02)
+        return pixels_of(figure)
 
 
 MOST_MODES: Final = 8  # bars of an answer; a list may be longer
 TRUE: Final = "#000000"
 ANSWERED: Final = "#d55e00"
 _OTHER: Final = "#0072b2"
-_GREY: Final = "#444444"
 _SIDE: Final = 1.72  # of a small panel, inches
 _MAP: Final = 3.9
-_WIDTH: Final = 0.12 + 3 * (_SIDE + 0.08) + 0.1 + _MAP + 0.1
-_HEIGHT: Final = 0.62 + _MAP + 0.26
 _DPI: Final = 100
 _HALO: Final = (patheffects.withStroke(linewidth=2.6, foreground="white"),)
 
@@ -160,40 +160,28 @@ class CasePicture:
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
     """Draw a query and its answer; pixels as of `picture.pixels_of`, the same for the same case."""
-    figure = PlainFigure(figsize=(_WIDTH, _HEIGHT), dpi=_DPI, facecolor="white")
-    _text(figure, 0.12, _HEIGHT - 0.1, case.title, size=10.5, weight="bold")
-    _text(figure, 0.12, 0.17, f"Map: {case.attribution}", size=7)
-    top = _HEIGHT - 0.62
-    where = "map at the true place" if case.is_present else "map where it was taken"
-    panels = (("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer))
-    for number, (name, evidence) in enumerate(panels):
-        box = (0.12 + number * (_SIDE + 0.08), top - _SIDE, _SIDE, _SIDE)
-        _panel(_axes(figure, box), name, evidence)
-    _draw_map(_axes(figure, (_WIDTH - 0.1 - _MAP, top - _MAP, _MAP, _MAP)), case)
-    low = top - _MAP
-    _draw_modes(_axes(figure, (0.62, low + 0.33, 1.62, _MAP - _SIDE - 0.75)), case)
-    lines = "\n".join(case.said)
-    _text(figure, 2.5, top - _SIDE - 0.2, lines, size=6.8, linespacing=1.32)
-    return pixels_of(figure)
-
-
-def _axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
-    left, low, wide, high = box
-    return figure.add_axes((left / _WIDTH, low / _HEIGHT, wide / _WIDTH, high / _HEIGHT))
-
-
-def _text(
-    figure: Figure, left: float, top: float, text: str, *, size: float, weight: str = "normal", linespacing: float = 1.2
-) -> None:
-    figure.text(left / _WIDTH, top / _HEIGHT, text, va="top", fontsize=size, fontweight=weight, linespacing=linespacing)
+    about = Page(title=case.title, data=case.attribution)
+    with styled():
+        figure = new_figure((3 * _SIDE + _MAP + 0.5, _MAP + 1.2), dpi=_DPI)
+        left, right = figure.framed(about).subfigures(1, 2, width_ratios=(3 * _SIDE, _MAP))
+        above, below = left.subfigures(2, 1, height_ratios=(_SIDE, _MAP - _SIDE))
+        where = "map at the true place" if case.is_present else "map where it was taken"
+        panels = (("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer))
+        for chart, (name, evidence) in zip(above.subplots(1, 3), panels, strict=True):
+            _panel(chart, name, evidence)
+        _draw_map(right.subplots(), case)
+        modes, said = below.subplots(1, 2)
+        _draw_modes(modes, case)
+        said.axis("off")
+        said.text(0, 1, "\n".join(case.said), va="top", fontsize=6.8, linespacing=1.32)
+        return pixels_of(figure)
 
 
 def _panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
-    chart.set_xticks([])
-    chart.set_yticks([])
-    chart.set_title(name, fontsize=7.5, pad=2, loc="left")
+    without_ticks(chart)
+    chart.set_title(name, fontsize=7.5)
     if evidence is None:
-        chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=8, color=_GREY, transform=chart.transAxes)
+        chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=8, color=GREY, transform=chart.transAxes)
     else:
         chart.imshow(paint(evidence), interpolation="antialiased")
 
@@ -208,9 +196,8 @@ def _draw_map(chart: Axes, case: CasePicture) -> None:
     chart.set_ylim(0, side_m)
     chart.set_facecolor(HIDDEN)
     chart.add_patch(Rectangle((0, 0), width_m, height_m, color="white", lw=0, zorder=-1))
-    chart.set_xticks([])
-    chart.set_yticks([])
-    chart.set_title(f"map, north up, {side_m:.0f} m across: {_key(case)}", fontsize=7.5, pad=2, loc="left")
+    without_ticks(chart)
+    chart.set_title(f"map, north up, {side_m:.0f} m across:\n{_key(case)}", fontsize=7.5)
     if case.disc is not None:
         easting_m, northing_m, radius_m = case.disc
         middle = (easting_m - part.west_m, northing_m - part.south_m)
@@ -272,14 +259,12 @@ def _offset(chart: Axes, case: CasePicture, part: MapPart) -> None:
 
 def _draw_modes(chart: Axes, case: CasePicture) -> None:
     """Draw the scores of the modes as bars from the least, each named by its distance from the true place."""
-    chart.set_title("scores of the modes", fontsize=7.5, pad=2, loc="left")
+    chart.set_title("scores of the modes", fontsize=7.5)
     modes = list(case.modes[:MOST_MODES])
     chart.set_yticks([])
-    for side in ("top", "right"):
-        chart.spines[side].set_visible(False)
     if not modes:
         chart.set_xticks([])
-        chart.text(0.5, 0.5, "no answer", ha="center", va="center", fontsize=8, color=_GREY, transform=chart.transAxes)
+        chart.text(0.5, 0.5, "no answer", ha="center", va="center", fontsize=8, color=GREY, transform=chart.transAxes)
         return
     scores = np.array([score for _, score in modes])
     least = min(0.0, float(scores.min())) if float(scores.min()) < 0 <= float(scores.max()) else float(scores.min())

@@ -1,42 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fig. 1 of the SASGeo paper from a real extract: a view, the map there, its weights, and the place it resembles."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import wrap
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import GREY, Page, new_figure, styled
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.preview import scale_bar
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.sasgeo.weight_plot import colour_bar, picture_of, words
+from sasgeo_bench.sasgeo.weight_plot import colour_bar, picture_of
 from sasgeo_bench.tasks.sheet import paint
 
 _DPI: Final = 130
 _SIDE: Final = 2.95  # of a panel, inches
-_GAP: Final = 0.12
-_LEFT: Final = 0.25
-_ROW: Final = 0.175
-_WIDTH: Final = 2 * _LEFT + 4 * _SIDE + 3 * _GAP
-_GREY: Final = "#444444"
+_ROW: Final = 0.175  # of a table, inches
 _SHARES: Final = ("share view", "share true place", "share lookalike")
 _SCORES: Final = ("score true place", "score lookalike")
-_WEIGHTS: Final = 2  # of the panels
 _LEAST_SHARE: Final = 5e-4  # that is not 0.0 %
-# Right edges of the columns of numbers, inches from the left: shares, weight, scores.
-_COLUMNS: Final = (2.3, 3.0, 3.7, 4.3, 5.25, 6.05)
-_TERMS_AT: Final = (6.65, 8.75, 9.65, 10.55)  # left edge of the names, right edges of the numbers
-_NOTE_CHARS: Final = 100
+# Left edges of a table's columns of words, right edges of those of numbers; shares of its width.
+_CLASS_COLUMNS: Final = ((0.0, 0.03), (0.4, 0.52, 0.64, 0.75, 0.87, 0.98))
+_TERM_COLUMNS: Final = ((0.05,), (0.48, 0.66, 0.84))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,30 +73,31 @@ class LookalikeSheet:
 
 def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
     """Draw a view, the map there, its weights and the lookalike as PNG, with the scores of both places below."""
-    rows = _told(sheet.scores)
-    below = 0.5 + _ROW * max(len(rows) + 3, 13)  # colour bar, table, attribution
-    height = 0.98 + _SIDE + below
-    figure = PlainFigure(figsize=(_WIDTH, height), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    words(figure, sheet.title, sheet.facts)
-    pictures: tuple[NDArray[np.generic], ...] = (
-        *(paint(sheet.view), paint(sheet.mapped)),
-        *(sheet.weights, paint(sheet.lookalike)),
-    )
-    for at, (picture, title) in enumerate(zip(pictures, sheet.panels, strict=True)):
-        box = ((_LEFT + at * (_SIDE + _GAP)) / _WIDTH, below / height, _SIDE / _WIDTH, _SIDE / height)
-        chart = figure.add_axes(box)
-        is_weight = at == _WEIGHTS
-        drawn = picture_of(chart, picture, sheet.view.size_m, title, top=sheet.top if is_weight else None)
-        if at == 0:
-            scale_bar(chart, *sheet.view.size_m)
-        if is_weight:
-            bar = figure.add_axes((box[0], (below - 0.2) / height, box[2], 0.12 / height))
-            colour_bar(figure, drawn, bar)
-    _class_rows(figure, sheet, rows, top=below - 0.32)
-    _term_rows(figure, sheet, top=below - 0.78)
-    _text(figure, _LEFT, 0.1, ATTRIBUTION, fontsize=8.5)
-    figure.savefig(path, format="png", metadata={"Title": sheet.title, "Copyright": ATTRIBUTION, "Software": None})
+    told = _told(sheet.scores)
+    about = Page(title=sheet.title, data=ATTRIBUTION, facts=sheet.facts, note=sheet.note, dpi=_DPI)
+    tables = _ROW * (len(told) + 2)
+    mosaic = (("view", "mapped", "weights", "lookalike"), ("classes", "classes", "terms", "terms"))
+    with styled():
+        figure = new_figure((4 * (_SIDE + 0.15), _SIDE + tables + 2.3), dpi=_DPI)
+        charts = figure.framed(about).subplot_mosaic(mosaic, height_ratios=(_SIDE, tables))
+        pictures: tuple[NDArray[np.generic], ...] = (
+            paint(sheet.view),
+            paint(sheet.mapped),
+            sheet.weights,
+            paint(sheet.lookalike),
+        )
+        for name, picture, title in zip(mosaic[0], pictures, sheet.panels, strict=True):
+            top = sheet.top if name == "weights" else None
+            drawn = picture_of(charts[name], picture, sheet.view.size_m, title, top=top)
+            if top is not None:
+                colour_bar(charts[name], drawn)
+        scale_bar(charts["view"], *sheet.view.size_m)
+        for name in ("classes", "terms"):
+            charts[name].axis("off")
+            charts[name].set(xlim=(0, 1), ylim=(len(told) + 1.5, -0.5))
+        _draw_classes(charts["classes"], sheet, told)
+        _draw_terms(charts["terms"], sheet.terms)
+        figure.write(path, about)
 
 
 def _told(scores: pd.DataFrame) -> list[str]:
@@ -113,52 +105,46 @@ def _told(scores: pd.DataFrame) -> list[str]:
     return scores.index[(scores[list(_SHARES)] >= _LEAST_SHARE).any(axis=1)].tolist()
 
 
-def _text(figure: Figure, left: float, up: float, text: str, **look: Any) -> None:  # noqa: ANN401 - of matplotlib
-    """Write words at a place in inches from the lower left corner."""
-    at = (left / _WIDTH, up / figure.get_figheight())
-    figure.text(*at, text, **{"fontsize": 8.0, "va": "baseline", **look})
+def _draw_row(
+    chart: Axes,
+    number: int,
+    texts: Sequence[str],
+    columns: tuple[Sequence[float], Sequence[float]],
+    **look: Any,  # noqa: ANN401 - of matplotlib
+) -> None:
+    """Write a row of a table: words to the right of their edges, numbers to the left."""
+    lefts, rights = columns
+    sides = [*(("left", at) for at in lefts), *(("right", at) for at in rights)]
+    for (side, at), text in zip(sides, texts, strict=True):
+        chart.text(at, number, text, ha=side, va="center", **look)
 
 
-def _class_rows(figure: Figure, sheet: LookalikeSheet, rows: list[str], *, top: float) -> None:
+def _draw_classes(chart: Axes, sheet: LookalikeSheet, told: Sequence[str]) -> None:
     """Draw legend and table in one: a row for each class."""
-    heads = ("view", "map there", "lookalike", sheet.worth_name, "true place", "lookalike")
-    for left, title in ((_COLUMNS[2], "covers, % of the ground"), (_COLUMNS[5], "raster score (Eq. 8), nats")):
-        _text(figure, left, top, title, color=_GREY, ha="right")
-    for right, head in zip(_COLUMNS, heads, strict=True):
-        _text(figure, right, top - _ROW, head, ha="right", color=_GREY)
-    titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
-    told = sheet.scores.to_dict("index")
-    for number, name in enumerate(rows):
-        up = top - _ROW * (number + 2)
-        said, colour = titles[name]
-        box = (_LEFT / _WIDTH, up / figure.get_figheight())
-        size = (0.14 / _WIDTH, 0.1 / figure.get_figheight())
-        figure.add_artist(Rectangle(box, *size, facecolor=colour, edgecolor="#666666", lw=0.4))
-        _text(figure, _LEFT + 0.2, up, said)
-        row = told[name]
-        values = (
-            *(f"{100 * row[column]:.1f}" for column in _SHARES),
+    groups = ("", "", "", "", "covers, % of the ground", "", "", "raster score (Eq. 8), nats")
+    heads = ("", "", "view", "map there", "lookalike", sheet.worth_name, "true place", "lookalike")
+    for number, row in enumerate((groups, heads)):
+        _draw_row(chart, number, row, _CLASS_COLUMNS, color=GREY)
+    classes = {item.name: item for item in load_taxonomy().classes}
+    all_scores = sheet.scores.to_dict("index")
+    for number, name in enumerate(told, start=2):
+        scores = all_scores[name]
+        numbers = (
+            *(f"{100 * scores[column]:.1f}" for column in _SHARES),
             f"{sheet.worth[name]:.2f}",
-            *(_signed(row[column]) for column in _SCORES),
+            *(_signed(scores[column]) for column in _SCORES),
         )
-        for right, value in zip(_COLUMNS, values, strict=True):
-            _text(figure, right, up, value, ha="right")
+        _draw_row(chart, number, ("", classes[name].title, *numbers), _CLASS_COLUMNS)
+        chart.plot(0.01, number, marker="s", ms=6.5, color=classes[name].colour, mec="#666666", mew=0.4)
 
 
-def _term_rows(figure: Figure, sheet: LookalikeSheet, *, top: float) -> None:
-    """Draw the terms of the joint score at both places, and how the places were chosen."""
-    left, *rights = _TERMS_AT
-    for right, head in zip(rights, (*sheet.terms.columns, "difference"), strict=True):
-        _text(figure, right, top, head, ha="right", color=_GREY)
-    _text(figure, left, top, "terms of Eq. 11, nats", color=_GREY)
-    for number, (name, values) in enumerate(zip(sheet.terms.index, sheet.terms.to_numpy(), strict=True)):
-        up = top - _ROW * (number + 1)
-        weight = "bold" if number == len(sheet.terms) - 1 else "normal"
-        _text(figure, left, up, name, fontweight=weight)
-        for right, value in zip(rights, (*values, values[0] - values[1]), strict=True):
-            _text(figure, right, up, _signed(value), ha="right", fontweight=weight)
-    for number, line in enumerate(wrap(sheet.note, _NOTE_CHARS)):
-        _text(figure, left, top - _ROW * (len(sheet.terms) + 1.6 + 0.85 * number), line, fontsize=7.5, color=_GREY)
+def _draw_terms(chart: Axes, terms: pd.DataFrame) -> None:
+    """Draw the terms of the joint score at both places."""
+    _draw_row(chart, 1, ("terms of Eq. 11, nats", *terms.columns, "difference"), _TERM_COLUMNS, color=GREY)
+    for number, (name, values) in enumerate(zip(terms.index, terms.to_numpy(), strict=True), start=2):
+        weight = "bold" if number == len(terms) + 1 else "normal"
+        numbers = [_signed(value) for value in (*values, values[0] - values[1])]
+        _draw_row(chart, number, (name, *numbers), _TERM_COLUMNS, fontweight=weight)
 
 
 def _signed(value: float) -> str:

@@ -14,23 +14,22 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
+from sasgeo_bench.canvas import GREY, page, panels
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_plots import (
     ACROSS,
     FAINT,
-    GREY,
     HALVES,
     INTERVALS,
     PRIMARY,
-    Page,
+    BoardPage,
     draw_bar_panels,
     draw_line,
     dress_share,
     label_outer,
+    line_keys,
     look_of,
     of_which,
-    page,
-    panels,
     panels_across,
     those_there,
 )
@@ -77,7 +76,7 @@ def _draw_lines(
         flat = [line[0] for line in grid]
         flat += [None] * (-len(flat) % across)
         grid = [flat[at : at + across] for at in range(0, len(flat), across)]
-    about = Page(title=title, note=note, below=label, rows=len(grid), columns=len(grid[0]), keys=names, gap_inches=0.25)
+    about = BoardPage(title=title, note=note, below=label, rows=len(grid), columns=len(grid[0]), keys=line_keys(names))
     measure = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
     high = max(1.0, float(rows[column].max()))
     with page(path, about) as charts:
@@ -85,7 +84,7 @@ def _draw_lines(
             for chart, key in zip(line, keys, strict=True):
                 mine = rows.iloc[:0] if key is None else rows[(rows["kind"] == key[0]) & (rows["view_cells"] == key[1])]
                 if key is not None:
-                    chart.set_title(f"{key[0]}, view of {key[1]:g} cells", fontsize=8.5, loc="left", pad=4)
+                    chart.set_title(f"{key[0]}, view of {key[1]:g} cells")
                 chart.set_xlim(-0.1 * high, 1.1 * high)
                 dress_share(chart)
                 if chart is not line[0]:
@@ -130,7 +129,7 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
     kinds = f", kinds {', '.join(contrast.kinds)}" if contrast.kinds else ""
     labels = [f"{one.place} (n {one.n}, {counted(one.blocks, 'block')})" for one in places]
     labels.append(f"all places (n {finding.n}, {counted(finding.blocks, 'block')})")
-    about = Page(
+    about = BoardPage(
         title=f"Contrast {contrast.name}: {contrast.first} less {contrast.second}",
         note=(
             f"Suites {', '.join(contrast.suites)}{kinds}; {contrast.track}. Lines: paired 95 % intervals; those of few "
@@ -140,7 +139,6 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
         ),
         below=f"difference of {what}\n{better}",
         panel_inches=(4.6, 0.3 + 0.2 * len(labels)),
-        left_inches=0.3 + 0.07 * max(map(len, labels)),
     )
     with page(path, about) as charts:
         chart = charts[0][0]
@@ -173,7 +171,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     cells = [(name, mixture) for name in names for mixture in mixtures]
     columns = min(ACROSS, len(cells)) if len(mixtures) == 1 else len(mixtures)
     pooled = " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
-    about = Page(
+    about = BoardPage(
         title=f"Risk against coverage: {of_which(rows.iloc[0])}",
         note=(
             "Answers are accepted from the surest down, by each rejector; what it says of a place was fitted on other "
@@ -183,9 +181,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         below="coverage (share of queries accepted)",
         rows=-(-len(cells) // columns),
         columns=columns,
-        keys=rejectors,
-        has_marks=False,
-        gap_inches=0.25,
+        keys=line_keys(rejectors, has_marks=False),
         panel_inches=(2.1, 1.7),
     )
     high = min(1.02, 1.08 * float(rows["risk"].max()))
@@ -194,7 +190,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             matcher, mixture = cells[number]
             mine = rows[(rows["matcher"] == matcher) & (rows["mixture"] == mixture)]
             head = matcher if mixture == AS_DRAWN else f"{matcher}, {mixture}"
-            chart.set_title(f"{head}\n{_counts(mine)}", fontsize=7.5, loc="left", pad=3)
+            chart.set_title(f"{head}\n{_counts(mine)}")
             _risk_lines(chart, mine, rejectors)
             chart.set_xlim(0.0, 1.0)
             chart.set_xticks(HALVES)
@@ -225,7 +221,7 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
     """Draw how often answers are false by stated chance, from `reliability_frame`: a panel a matcher and rejector."""
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
-    about = Page(
+    about = BoardPage(
         title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
         note=(
             "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; beside a point, "
@@ -236,13 +232,12 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
         rows=len(names),
         columns=len(rejectors),
         panel_inches=(2.0, 1.9),
-        gap_inches=0.25,
     )
     with page(path, about) as charts:
         for line, name in zip(charts, names, strict=True):
             for chart, rejector in zip(line, rejectors, strict=True):
                 mine = rows[(rows["matcher"] == name) & (rows["rejector"] == rejector)]
-                chart.set_title(f"{name} x {rejector}\n{_bin_counts(mine)}", fontsize=7, loc="left", pad=3)
+                chart.set_title(f"{name} x {rejector}\n{_bin_counts(mine)}")
                 chart.plot([0, 1], [0, 1], color="#999999", lw=0.8)
                 _reliable(chart, mine)
                 chart.set_xlim(-0.03, 1.03)
@@ -291,7 +286,7 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ProtectionLevels], 
     first = next(iter(told.values()))
     cells = {key: stanford_cells(item) for key, item in told.items()}
     most = max(int(frame["n"].max()) for frame in cells.values())
-    about = Page(
+    about = BoardPage(
         title=f"Protection levels at risk {first.risk:g}: all suites, localization, prior {first.prior_group}",
         note=(
             f"Alert limit {limit_m:g} m. Available: error <= level <= limit. Misleading: level < error <= limit. "
@@ -303,13 +298,12 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ProtectionLevels], 
         rows=len(names),
         columns=len(methods),
         panel_inches=(2.25, 2.1),
-        gap_inches=0.25,
     )
     with page(path, about) as charts:
         for line, name in zip(charts, names, strict=True):
             for chart, method in zip(line, methods, strict=True):
                 item = told.get((name, method))
-                chart.set_title(f"{name}, {method}\n{_available(item, limit_m)}", fontsize=8, loc="left", pad=3)
+                chart.set_title(f"{name}, {method}\n{_available(item, limit_m)}")
                 _stanford_axes(chart, limit_m)
                 if item is not None:
                     _stanford(chart, item, cells[name, method], limit_m, most)

@@ -14,22 +14,21 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from sasgeo_bench.canvas import page, panels
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_plots import (
     FAINT,
     INTERVALS,
     PRIMARY,
-    Page,
-    cut,
+    BoardPage,
     dodged,
     draw_bar_panels,
     draw_line,
     dress_share,
     label_outer,
+    line_keys,
     look_of,
-    page,
     panel_title,
-    panels,
     panels_across,
     those_there,
     ticks_across,
@@ -65,22 +64,20 @@ def _suite_panels(
     """Yield the axes and rows of each suite on a page of shares, with a line for each matcher."""
     first, suites = rows.iloc[0], sorted(set(rows["suite"]))
     down, across = panels_across(len(suites))
-    about = Page(
+    about = BoardPage(
         title=f"{title}: {first['track']}, prior {first['prior_group']}",
         note=f"{note} {_STRESS} {_MOST_ASKED}",
         below=below,
         rows=down,
         columns=across,
-        keys=names,
-        gap_inches=0.25,
-        row_gap_inches=0.65,
+        keys=line_keys(names),
     )
 
     def dressed(charts: list[list[Axes]]) -> Iterator[tuple[Axes, pd.DataFrame]]:
         for number, chart in panels(charts, len(suites)):
             mine = rows[rows["suite"] == suites[number]]
             part = mine["stratum"].iloc[0]
-            panel_title(chart, cut(suites[number] + ("" if part == "all" else f" {part}")), mine.iloc[0])
+            panel_title(chart, suites[number] + ("" if part == "all" else f" {part}"), mine.iloc[0])
             yield chart, mine
             chart.set_ylim(-0.02, 1.04)
             chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
@@ -138,7 +135,7 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
     down, across = panels_across(len(names))
-    about = Page(
+    about = BoardPage(
         title=f"Cost of a query: {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
         note=(
             "A fix is accepted where the rejector says that its chance to be false is below 1 / (1 + C) (Eq. 14). A "
@@ -150,17 +147,14 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         below="C: cost of a false fix (places without a fix)",
         rows=down,
         columns=across,
-        keys=rejectors,
-        has_marks=False,
-        gap_inches=0.25,
-        row_gap_inches=0.65,
+        keys=line_keys(rejectors, has_marks=False),
     )
     high = 1.25 * max(float(rows["withhold_all"].max()), float(rows["cost"].quantile(0.9)))
     with page(path, about) as charts:
         for number, chart in panels(charts, len(names)):
             mine = rows[rows["matcher"] == names[number]]
             counts = ", ".join(f"{count:g}" for count in sorted(set(mine["n"])))
-            chart.set_title(f"{cut(names[number])}\nn {counts}", fontsize=8, loc="left")
+            chart.set_title(f"{names[number]}\nn {counts}")
             _cost_lines(chart, mine, rejectors)
             ticks_across(chart, [1.0, *COST_RATIOS], float(mine["ratio"].min()), float(mine["ratio"].max()))
             chart.set_ylim(0.0, high)
@@ -183,7 +177,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     names = those_there(rows, shown)
     first = rows.iloc[0]
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
-    about = Page(
+    about = BoardPage(
         title=f"What answers are worth, and what they take: {first['track']}, prior {first['prior_group']}",
         note=(
             f"Suites {first['suites']}: those that all of these matchers were asked; n {first['n']:g} present places, "
@@ -194,13 +188,12 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         ),
         below="",
         columns=len(axes),
-        keys=names,
+        keys=line_keys(names),
         panel_inches=(3.0, 2.5),
-        gap_inches=0.3,
     )
     with page(path, about) as charts:
         for chart, (column, label) in zip(charts[0], axes, strict=True):
-            chart.set_title(f"n {first['n']:g}", fontsize=8, loc="left")
+            chart.set_title(f"n {first['n']:g}")
             _prices(chart, rows, names, column)
             chart.set_xlabel(label, fontsize=8.5)
             dress_share(chart)

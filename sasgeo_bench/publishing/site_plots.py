@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from sasgeo_bench.ageing.ratebook import Estimate, RateBook
-from sasgeo_bench.leaderboard.board_plots import FAINT, GREY, Page, look_of, page
+from sasgeo_bench.canvas import GREY, page
+from sasgeo_bench.leaderboard.board_plots import FAINT, BoardPage, line_keys, look_of
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.site_pages import PlaceOnMap
 
@@ -37,19 +38,18 @@ def draw_places(path: Path, places: Sequence[PlaceOnMap]) -> None:
     panels = [("all places", list(places))]
     if 1 < len(near) < len(places):
         panels.append(("those in Europe", near))
-    about = Page(
+    about = BoardPage(
         title="Places of this board",
         note="Numbers: as in the table. Hollow: made-up towns, which lie where they lie only so that they have "
         "coordinates. Plain longitude and latitude; coasts: Natural Earth.",
         below="longitude (deg)",
         columns=len(panels),
         panel_inches=(3.6, 2.9) if len(panels) > 1 else (5.4, 3.2),
-        gap_inches=0.55,
-        keys=[_part_name(part) for part in parts],
+        keys=line_keys([_part_name(part) for part in parts]),
     )
     with page(path, about) as charts:
         for chart, (title, some) in zip(charts[0], panels, strict=True):
-            chart.set_title(f"{title} (n = {len(some)})", fontsize=8.5, loc="left")
+            chart.set_title(f"{title} (n = {len(some)})")
             _draw_spots(chart, some, parts)
         charts[0][0].set_ylabel("latitude (deg)")
 
@@ -86,16 +86,14 @@ def draw_rates(path: Path, book: RateBook) -> None:
     """Draw into a .svg or .png what vanishes and what appears in a year, by class, a mark for each measured place."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     names = [name for name in titles if any(name in place.classes for place in book.places)]
-    about = Page(
+    about = BoardPage(
         title=f"How fast maps grow old: {len(book.places)} places",
         note="Bars: 95 % intervals, from blocks of 1 km. Rates beyond the scale lie at its edge. What appears is "
         "mostly mapping that catches up. How many things each rate is of stands in the table.",
         below="per cent a year",
         columns=2,
         panel_inches=(3.1, 0.3 + 0.29 * len(names)),
-        left_inches=1.7,
-        gap_inches=0.25,
-        keys=book.names,
+        keys=line_keys(book.names),
     )
     with page(path, about) as charts:
         for chart, (column, title) in zip(
@@ -109,7 +107,7 @@ def draw_rates(path: Path, book: RateBook) -> None:
                     rate = None if found is None else getattr(found, column)
                     if rate is not None:
                         _draw_rate(chart, rate, at + _STEP * (number - (len(book.places) - 1) / 2), number)
-            chart.set_title(title, fontsize=8.5, loc="left")
+            chart.set_title(title)
             chart.set_xscale("log")
             chart.set_xlim(_RATES[0] * 0.8, _RATES[1] * 1.2)
             chart.set_xticks([0.1, 1.0, 10.0, 100.0], ["0.1", "1", "10", "100"])

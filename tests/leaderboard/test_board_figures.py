@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sasgeo_bench.canvas import page
 from sasgeo_bench.leaderboard import board_figures
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.board_plots import Page, page
+from sasgeo_bench.leaderboard.board_plots import BoardPage
 from sasgeo_bench.leaderboard.plot_tables import (
     BEYOND_M,
     MOST_MATCHERS,
@@ -237,7 +238,7 @@ def test_areas_of_a_stanford_figure_are_those_of_the_board(board):
 
 def test_a_figure_writes_each_style_once_and_a_long_label_whole(tmp_path):
     label = "share of the view that is hidden; in U3 of where trees and shadows hide thin classes, and more words"
-    with page(tmp_path / "one.svg", Page(title="One", note="", below=label)) as charts:
+    with page(tmp_path / "one.svg", BoardPage(title="One", note="", below=label)) as charts:
         charts[0][0].plot([0, 1], [0, 1])
     text = (tmp_path / "one.svg").read_text(encoding="utf-8")
     styles = re.findall(r' style="([^"]*)"', text)

@@ -29,7 +29,6 @@ from sasgeo_bench.texts import plain, plain_lines
 GREY: Final = "#555555"
 DPI: Final = 110
 _LEAST_WIDTH: Final = 6.4  # inches: notes are read in few lines
-_PASSES: Final = 2  # until a page has its size: lines break anew at another width
 _EDGE_INCHES: Final = 0.12  # left of title and notes
 _LETTERS: Final = 130.0  # on an inch, of a font of one point
 _TAGS: Final = re.compile(r"<[^>]+>")  # texts between them hold no bracket, and are not touched
@@ -99,13 +98,13 @@ class PlainFigure(Figure):
 
     def _set_texts(self) -> None:
         width = self.get_figwidth()
-        for text, said in self._words.items():
+        for text, given in self._words.items():
             x, room = _EDGE_INCHES / width, width - 2 * _EDGE_INCHES
             if text.get_horizontalalignment() == "center":
                 x = text.get_position()[0]
                 room = 2 * min(x, 1 - x) * width
             points = float(text.get_fontsize()) * (1.2 if text.get_fontweight() == "bold" else 1.0)
-            text.set(x=x, text=_broken(said, room, points))
+            text.set(x=x, text=_broken(given, room, points))
         for item in self.findobj(Text):
             if isinstance(item, Text):
                 item.set_parse_math(False)
@@ -132,16 +131,15 @@ class PlainFigure(Figure):
 
     def fit(self, first: Axes, last: Axes, about: Page) -> None:
         """Set the size of the figure so that each panel of a grid, from `first` to `last`, is as large as asked."""
-        for _ in range(_PASSES):
-            self.arrange()
-            box, end = (one.get_position(original=True).transformed(one.figure.transSubfigure) for one in (first, last))
-            for text in self._words:
-                if text.get_horizontalalignment() == "center":
-                    text.set_x((box.x0 + end.x1) / 2 / self.bbox.width)
-            width, height = self.get_size_inches()
-            width += about.columns * (about.panel_inches[0] - box.width / self.dpi)
-            height += about.rows * (about.panel_inches[1] - box.height / self.dpi)
-            self.set_size_inches(max(width, _LEAST_WIDTH), height)
+        self.arrange()
+        box, end = (one.get_position(original=True).transformed(one.figure.transSubfigure) for one in (first, last))
+        for text in self._words:
+            if text.get_horizontalalignment() == "center":
+                text.set_x((box.x0 + end.x1) / 2 / self.bbox.width)
+        width, height = self.get_size_inches()
+        width += about.columns * (about.panel_inches[0] - box.width / self.dpi)
+        height += about.rows * (about.panel_inches[1] - box.height / self.dpi)
+        self.set_size_inches(max(width, _LEAST_WIDTH), height)
         self.arrange()
         self.set_layout_engine("none")
 

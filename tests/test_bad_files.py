@@ -413,6 +413,8 @@ def odd_table(draw: st.DrawFn, data: bytes) -> bytes:
         table = draw(st.sampled_from((table.slice(0, 0), table.slice(1), pa.concat_tables([table, table]))))
     else:
         value = draw(st.sampled_from([value for value in HOSTILE if value != {}]))  # no parquet holds an empty struct
+        if value == [None] and pa.types.is_map(column.type):
+            value = None  # pyarrow ends the process that makes such a map; a file that holds one it refuses to read
         try:
             odd = pa.array([value] * len(table), column.type if kind == "set" else None)
         except (pa.ArrowException, TypeError, ValueError, OverflowError):

@@ -26,6 +26,7 @@ from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
@@ -39,7 +40,6 @@ CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
 CONTROL_SPLIT: Final = "crossfit"
 CONTROL_SITES: Final = 8
 CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
-REFERENCE: Final = "fft_vote"  # on the controls of every board
 MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is counted
 
 

@@ -213,7 +213,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     if plan.private is not None and (results is not None or private is not None):
         check_public(seed_record(plan.private), str(board_folder(plan)))
     if private is not None:
-        read_private(private, plan.spec.said)
+        read_private(private, plan.spec.identity)
     with shown_progress() as progress:
         board = run_pipeline(
             plan, tell=tell, progress=progress, results=results, has_cases=options.cases, private=private

@@ -27,18 +27,18 @@ from sasgeo_bench.sasgeo.class_weights import (
     check_age,
     check_classes,
     check_season,
+    class_weight_table,
+    class_weights_of,
     rarity_map,
     side_by_side,
     weight_map,
-    worth_of,
-    worth_table,
 )
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
 WORTH: Final = (
-    "worth",
+    "weight",
     "weight of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
     1,
     2,
@@ -77,7 +77,7 @@ def weights_command(
     if model is not None:
         arms["fitted"] = (check_classes(model, () if place is None else place.classes), FITTED)
     tables = {
-        name: worth_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
+        name: class_weight_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
         for name, (known, arm) in arms.items()
     }
     for column, title, factor, digits in (WORTH, *(GAINS if model else ()), INFORMATION):
@@ -168,10 +168,10 @@ def _drawn(
 ) -> list[Path]:
     """Draw a map of weights for each age, all by one scale of colours."""
     rarity = rarity_map(region)
-    worth = {age: worth_of(model, arm, age_years=age, season=season) for age in ages}
-    maps = {age: weight_map(region.layers, worth[age], rarity) for age in ages}
+    by_class = {age: class_weights_of(model, arm, age_years=age, season=season) for age in ages}
+    maps = {age: weight_map(region.layers, by_class[age], rarity) for age in ages}
     top = top_of(list(maps.values()))
-    weights = "weights fitted" if arm.learns else "weights by hand"
+    source = "weights fitted" if arm.learns else "weights by hand"
     (out / "sheets").mkdir(parents=True, exist_ok=True)
     paths = []
     for age in ages:
@@ -179,9 +179,9 @@ def _drawn(
             manifest=region.manifest,
             layers=region.layers,
             weights=maps[age],
-            worth=dict(zip(region.classes, worth[age].tolist(), strict=True)),
+            class_weights=dict(zip(region.classes, by_class[age].tolist(), strict=True)),
             top=top,
-            facts=f"taken to be {age:g} years old  |  season: {season or 'unknown'}  |  {weights}",
+            facts=f"taken to be {age:g} years old  |  season: {season or 'unknown'}  |  {source}",
         )
         name = f"{region.manifest.id}-{region.manifest.extract.date}-{age:g}y{f'-{season}' if season else ''}"
         paths.append(out / "sheets" / f"weights-{name}{'-fitted' if arm.learns else ''}.png")

@@ -300,7 +300,7 @@ def run_pipeline(
         rejectors=plan.spec.rejectors,
         contrasts=contrasts,
         draws=plan.spec.draws,
-        pipeline=plan.spec.said,
+        pipeline=plan.spec.identity,
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
         jobs=plan.jobs,

@@ -170,7 +170,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "libraries": _libraries(),
         "pipeline": dict(request.pipeline) or None,
-        **{name: said for name, said in ((task_files.PRIVATE, seed), ("private", board.on_private.seed)) if said},
+        **{name: seed for name, seed in ((task_files.PRIVATE, seed), ("private", board.on_private.seed)) if seed},
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
         "contrasts": [asdict(item) for item in request.contrasts],

@@ -70,7 +70,7 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         "success against the age of the map": lambda: _each("age", ages, GROUP, draw_ages, shown),
         "success against strength": lambda: _each("strength", others, GROUP, draw_steps, shown),
         "success under stress": lambda: _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
-        "arms beside each other": lambda: _each(
+        "arms side by side": lambda: _each(
             "ablation", ablation_frame(board.scores, contrasts, shown), GROUP[1:], draw_ablation, shown
         ),
         "differences by place": lambda: _forests(board, contrasts),
@@ -84,7 +84,7 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         "the distribution of errors": lambda: _each(
             "errors", errors_frame(board.scores, board.table, shown), GROUP[1:], draw_errors, shown
         ),
-        "worth against cost": lambda: _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
+        "success against cost": lambda: _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
         "risk against coverage": lambda: _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
         "reliability": lambda: _each(
             "reliability",
@@ -152,8 +152,8 @@ def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named
             rows = {name for name, _ in found.get(key, ())} | {matcher}
             if len(item.level_m) and len(rows) <= MOST_STANFORD:
                 found.setdefault(key, {})[matcher, item.method] = item
-    for (prior_group, risk), told in sorted(found.items()):
+    for (prior_group, risk), levels in sorted(found.items()):
         yield (
             _file_name("stanford", f"{risk:g}", prior_group),
-            partial(draw_stanford, told=told, limit_m=FIX_M),
+            partial(draw_stanford, levels=levels, limit_m=FIX_M),
         )

@@ -54,7 +54,7 @@ class _Found:
     """Pictures so far, what `pictures.json` says of them, and why others are not among them."""
 
     files: dict[str, bytes] = field(default_factory=dict)
-    said: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"regions": [], "suites": [], "cases": []})
+    listed: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"regions": [], "suites": [], "cases": []})
     lacking: Counter[str] = field(default_factory=Counter)
     failures: Failures
 
@@ -75,7 +75,7 @@ class _Found:
             return
         file = f"{kind}/{_PLAIN.sub('-', name).strip('-')}{WEBP}"
         self.files[file] = data
-        self.said[kind].append({**about, "file": file})
+        self.listed[kind].append({**about, "file": file})
 
 
 def pictures_extra(
@@ -103,13 +103,13 @@ def pictures_extra(
         _add_cases(found, board, contrasts, asked, root)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
-    listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.said.items())
+    listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.listed.items())
     tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
-    return Extra(pictures=_with_list(found.files, found.said) if found.files else {})
+    return Extra(pictures=_with_list(found.files, found.listed) if found.files else {})
 
 
-def _with_list(files: Mapping[str, bytes], said: Mapping[str, Any]) -> dict[str, bytes]:
-    content = {**said, "licence": LICENCE, "attribution": ATTRIBUTION}
+def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Any]) -> dict[str, bytes]:
+    content = {**listed, "licence": LICENCE, "attribution": ATTRIBUTION}
     return {**files, PICTURES_FILE: json_text(content).encode()}
 
 
@@ -175,9 +175,9 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
     """
     order = sorted(truths, key=lambda item: (item.pair_id, item.kind, -item.strength, item.query_id))
     for one in (item for item in order if item.role == "control"):
-        beside = [item for item in order if item.pair_id == one.pair_id and item.role == "stress"]
-        if beside:
-            return [one, max(beside, key=lambda item: item.strength)]
+        stressed = [item for item in order if item.pair_id == one.pair_id and item.role == "stress"]
+        if stressed:
+            return [one, max(stressed, key=lambda item: item.strength)]
     rank = {"stress": 0, "control": 1, "falsifier": 2}
     return sorted(order, key=lambda item: (rank[item.role], -item.strength))[:2]
 
@@ -210,7 +210,7 @@ def _add_cases(
             {**{str(name): value for name, value in row.items()}, "alt": alt, "said": facts},
         )
     order = {key: at for at, key in enumerate(drawn)}
-    found.said["cases"].sort(key=lambda one: order[one["query_id"], one["matcher"]])
+    found.listed["cases"].sort(key=lambda one: order[one["query_id"], one["matcher"]])
 
 
 def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:

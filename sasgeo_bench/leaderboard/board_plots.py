@@ -63,7 +63,7 @@ INTERVALS: Final = (
     "Bars: 95 % intervals as on the board (blocks, then sites are drawn; never narrower than Wilson's over sites). "
     "n: queries of each point."
 )
-ACROSS: Final = 4  # panels beside each other
+ACROSS: Final = 4  # panels side by side
 HALVES: Final = (0.0, 0.5, 1.0)
 
 

@@ -155,7 +155,7 @@ class Section:
 
     @property
     def context(self) -> str:
-        """Say which queries the table counts, and what they are worth without a method."""
+        """Return which queries the table counts, and the success on them without a method."""
         texts = [f"Prior group {self.prior_group}."]
         texts += [f"Stress that is counted: {self.counted}."] if self.counted else []
         texts += [f"Without looking at the view: {self.for_nothing}."] if self.for_nothing else []

@@ -46,7 +46,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     progress = progress or Lines(tell)
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
-    failures = Failures(log_beside(request.board), tell=lambda _: None)  # told when the board is there, or raised
+    failures = Failures(log_beside(request.board), tell=lambda _: None)  # reported with the board, or raised
     ranks = None
     while ranks is None:  # once more for each time that the comparison of entries fails because of some of them
         contest = _contest(request, failures, tell)

@@ -139,7 +139,7 @@ class CasePicture:
         What the map shows at the true and at the first place.
     disc : (float, float, float), optional
         Easting, northing and radius of the disc that is searched.
-    said : sequence of str
+    lines : sequence of str
         Lines on what the answer and the integrity model say.
     attribution : str
         Of the map.
@@ -154,7 +154,7 @@ class CasePicture:
     at_true: Evidence | None
     at_answer: Evidence | None
     disc: tuple[float, float, float] | None
-    said: Sequence[str]
+    lines: Sequence[str]
     attribution: str
 
 
@@ -170,10 +170,10 @@ def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
         for chart, (name, evidence) in zip(above.subplots(1, 3), panels, strict=True):
             _panel(chart, name, evidence)
         _draw_map(right.subplots(), case)
-        modes, said = below.subplots(1, 2)
+        modes, text = below.subplots(1, 2)
         _draw_modes(modes, case)
-        said.axis("off")
-        said.text(0, 1, "\n".join(case.said), va="top", fontsize=6.8, linespacing=1.32)
+        text.axis("off")
+        text.text(0, 1, "\n".join(case.lines), va="top", fontsize=6.8, linespacing=1.32)
         return pixels_of(figure)
 
 

@@ -16,7 +16,7 @@ from sasgeo_bench.leaderboard.lookalike_plot import LookalikeSheet
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.class_weights import rarity_map, weight_map, worth_of
+from sasgeo_bench.sasgeo.class_weights import class_weights_of, rarity_map, weight_map
 from sasgeo_bench.sasgeo.reading import Reader, Reading
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import top_of
@@ -114,7 +114,7 @@ def _place(point_m: NDArray[np.float64]) -> tuple[float, float]:
     return (float(point_m[0]), float(point_m[1]))
 
 
-def find_lookalike(mapped: Region, world: Region, learnt: ScorerModel, arm: Switches, *, side_m: float) -> Lookalike:
+def find_lookalike(mapped: Region, world: Region, model: ScorerModel, arm: Switches, *, side_m: float) -> Lookalike:
     """Score a place, as it is on the day of `world`, and its lookalike on an older map.
 
     `mapped` and `world` are one region at two dates, or the same twice; `arm` selects the scorer. Raise ConfigError if
@@ -140,7 +140,7 @@ def find_lookalike(mapped: Region, world: Region, learnt: ScorerModel, arm: Swit
         prior_group="rnone-unknown-s0",
         candidates=tuple(places),
     )
-    glance = Reader.of(mapped, learnt, arm).read(query)
+    glance = Reader.of(mapped, model, arm).read(query)
     poses = best_poses(glance)
     views = tuple(on_map.view(pose, size_cells=size, cell_size_m=cell_m) for pose in poses)
     return Lookalike(
@@ -196,11 +196,11 @@ def _terms(glance: Reading, poses: tuple[Pose, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, index=list(NAMES)).T
 
 
-def sheet_of(found: Lookalike, mapped: Region, learnt: ScorerModel, arm: Switches) -> LookalikeSheet:
+def sheet_of(found: Lookalike, mapped: Region, model: ScorerModel, arm: Switches) -> LookalikeSheet:
     """Put what was found into words and pictures."""
     about, side_m = mapped.manifest, found.query.evidence.size_m[0]
-    worth = worth_of(learnt, arm, age_years=found.age_years)
-    weights = weight_map(mapped.layers, worth, rarity_map(mapped))
+    class_weights = class_weights_of(model, arm, age_years=found.age_years)
+    weights = weight_map(mapped.layers, class_weights, rarity_map(mapped))
     apart_m = math.dist(found.pair.here_m, found.pair.there_m)
     turned_deg = round(float(found.poses[1].yaw_deg)) % 360
     east_m, north_m = (round(value) for value in found.pair.here_m)
@@ -215,7 +215,7 @@ def sheet_of(found: Lookalike, mapped: Region, learnt: ScorerModel, arm: Switche
         lookalike=found.views[1],
         weights=_cut(weights, mapped.grid, found.pair.here_m, found.query.evidence.shape[0]),
         top=top_of([weights]),
-        worth=dict(zip(mapped.classes, worth.tolist(), strict=True)),
+        class_weights=dict(zip(mapped.classes, class_weights.tolist(), strict=True)),
         scores=found.scores,
         terms=found.terms,
         panels=(
@@ -224,7 +224,7 @@ def sheet_of(found: Lookalike, mapped: Region, learnt: ScorerModel, arm: Switche
             "c  weights of the map there",
             f"d  the lookalike, {apart_m:.0f} m off" + (f", turned by {turned_deg}\u00b0" if turned_deg else ""),
         ),
-        worth_name="worth" if arm.learns else "\u03c3",
+        weight_name="weight" if arm.learns else "\u03c3",
         note=NOTE.format(distance=found.pair.distance),
     )
 

@@ -44,13 +44,13 @@ class LookalikeSheet:
         Of the map at the true place, nats for 100 m2.
     top : float
         End of the colours.
-    worth : mapping of str to float
+    class_weights : mapping of str to float
         Of each class, where its surroundings are as rare as the map's mean.
     scores, terms : pandas.DataFrame
         As those of `lookalike.Lookalike`.
     panels : tuple of str
         A title for each of the four panels.
-    worth_name : str
+    weight_name : str
         What the weight of a class is called.
     note : str
         How the places were chosen.
@@ -63,19 +63,19 @@ class LookalikeSheet:
     lookalike: Evidence
     weights: NDArray[np.float32]
     top: float
-    worth: Mapping[str, float]
+    class_weights: Mapping[str, float]
     scores: pd.DataFrame
     terms: pd.DataFrame
     panels: tuple[str, str, str, str]
-    worth_name: str
+    weight_name: str
     note: str
 
 
 def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
     """Draw a view, the map there, its weights and the lookalike as PNG, with the scores of both places below."""
-    told = _told(sheet.scores)
+    shown = _shown(sheet.scores)
     about = Page(title=sheet.title, data=ATTRIBUTION, facts=sheet.facts, note=sheet.note, dpi=_DPI)
-    tables = _ROW * (len(told) + 2)
+    tables = _ROW * (len(shown) + 2)
     mosaic = (("view", "mapped", "weights", "lookalike"), ("classes", "classes", "terms", "terms"))
     with styled():
         figure = new_figure((4 * (_SIDE + 0.15), _SIDE + tables + 2.3), dpi=_DPI)
@@ -94,13 +94,13 @@ def draw_lookalike(path: Path, sheet: LookalikeSheet) -> None:
         scale_bar(charts["view"], *sheet.view.size_m)
         for name in ("classes", "terms"):
             charts[name].axis("off")
-            charts[name].set(xlim=(0, 1), ylim=(len(told) + 1.5, -0.5))
-        _draw_classes(charts["classes"], sheet, told)
+            charts[name].set(xlim=(0, 1), ylim=(len(shown) + 1.5, -0.5))
+        _draw_classes(charts["classes"], sheet, shown)
         _draw_terms(charts["terms"], sheet.terms)
         figure.write(path, about)
 
 
-def _told(scores: pd.DataFrame) -> list[str]:
+def _shown(scores: pd.DataFrame) -> list[str]:
     """Return the classes that cover some ground in view or on the map."""
     return scores.index[(scores[list(_SHARES)] >= _LEAST_SHARE).any(axis=1)].tolist()
 
@@ -119,19 +119,19 @@ def _draw_row(
         chart.text(at, number, text, ha=side, va="center", **look)
 
 
-def _draw_classes(chart: Axes, sheet: LookalikeSheet, told: Sequence[str]) -> None:
+def _draw_classes(chart: Axes, sheet: LookalikeSheet, shown: Sequence[str]) -> None:
     """Draw legend and table in one: a row for each class."""
     groups = ("", "", "", "", "covers, % of the ground", "", "", "raster score (Eq. 8), nats")
-    heads = ("", "", "view", "map there", "lookalike", sheet.worth_name, "true place", "lookalike")
+    heads = ("", "", "view", "map there", "lookalike", sheet.weight_name, "true place", "lookalike")
     for number, row in enumerate((groups, heads)):
         _draw_row(chart, number, row, _CLASS_COLUMNS, color=GREY)
     classes = {item.name: item for item in load_taxonomy().classes}
     all_scores = sheet.scores.to_dict("index")
-    for number, name in enumerate(told, start=2):
+    for number, name in enumerate(shown, start=2):
         scores = all_scores[name]
         numbers = (
             *(f"{100 * scores[column]:.1f}" for column in _SHARES),
-            f"{sheet.worth[name]:.2f}",
+            f"{sheet.class_weights[name]:.2f}",
             *(_signed(scores[column]) for column in _SCORES),
         )
         _draw_row(chart, number, ("", classes[name].title, *numbers), _CLASS_COLUMNS)

@@ -117,7 +117,7 @@ class PipelineFile(NamedDocument):
         return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @property
-    def said(self) -> dict[str, str]:
+    def identity(self) -> dict[str, str]:
         """Return the pipeline as `board.json` holds it."""
         return {"id": self.id, "sha256": self.sha256}
 

@@ -47,8 +47,8 @@ def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[
         rows = table[(table["stratum"] == ALL) & table["metric"].isin(["success_25m", "recall_1"])]
         means = rows.groupby("matcher")["value"].mean()
         named = sorted(there, key=lambda name: (-means.get(name, 0.0), name))[:MOST_MATCHERS]
-    beside = sorted(name for name in there if any(part in name for part in ARMS))
-    return tuple(dict.fromkeys((*named, *beside)))
+    related = sorted(name for name in there if any(part in name for part in ARMS))
+    return tuple(dict.fromkeys((*named, *related)))
 
 
 # --- success by what was done -----------------------------------------------------------------------------------------

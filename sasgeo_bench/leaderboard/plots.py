@@ -71,7 +71,7 @@ def _draw_lines(
     names = those_there(rows, shown)
     kinds, sizes = (sorted(set(rows[name])) for name in ("kind", "view_cells"))
     grid: list[list[tuple[str, float] | None]] = [[(kind, size) for size in sizes] for kind in kinds]
-    if len(sizes) == 1:  # kinds beside each other, not in a tower
+    if len(sizes) == 1:  # kinds side by side, not in a tower
         _, across = panels_across(len(kinds))
         flat = [line[0] for line in grid]
         flat += [None] * (-len(flat) % across)
@@ -224,11 +224,11 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
     about = BoardPage(
         title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
         note=(
-            "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; beside a point, "
+            "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; next to a point, "
             "where there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has "
-            "sites. On the diagonal answers are false as often as was said; above it more often."
+            "sites. On the diagonal answers are false as often as stated; above it more often."
         ),
-        below="said to be false (P, mean of the bin)",
+        below="stated to be false (P, mean of the bin)",
         rows=len(names),
         columns=len(rejectors),
         panel_inches=(2.0, 1.9),
@@ -280,11 +280,11 @@ def _reliable(chart: Axes, mine: pd.DataFrame) -> None:
 # --- protection levels ------------------------------------------------------------------------------------------------
 
 
-def draw_stanford(path: Path, told: Mapping[tuple[str, str], ProtectionLevels], limit_m: float) -> None:
+def draw_stanford(path: Path, levels: Mapping[tuple[str, str], ProtectionLevels], limit_m: float) -> None:
     """Draw protection levels of one prior group and risk against errors: a panel for each matcher and method."""
-    names, methods = (list(dict.fromkeys(key[at] for key in told)) for at in (0, 1))
-    first = next(iter(told.values()))
-    cells = {key: stanford_cells(item) for key, item in told.items()}
+    names, methods = (list(dict.fromkeys(key[at] for key in levels)) for at in (0, 1))
+    first = next(iter(levels.values()))
+    cells = {key: stanford_cells(item) for key, item in levels.items()}
     most = max(int(frame["n"].max()) for frame in cells.values())
     about = BoardPage(
         title=f"Protection levels at risk {first.risk:g}: all suites, localization, prior {first.prior_group}",
@@ -302,7 +302,7 @@ def draw_stanford(path: Path, told: Mapping[tuple[str, str], ProtectionLevels], 
     with page(path, about) as charts:
         for line, name in zip(charts, names, strict=True):
             for chart, method in zip(line, methods, strict=True):
-                item = told.get((name, method))
+                item = levels.get((name, method))
                 chart.set_title(f"{name}, {method}\n{_available(item, limit_m)}")
                 _stanford_axes(chart, limit_m)
                 if item is not None:

@@ -49,7 +49,7 @@ def draw_ablation(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """Draw success pooled over the suites of each contrast, from `ablation_frame`, as bars with intervals."""
     first, pools = rows.iloc[0], list(dict.fromkeys(rows["pool"]))
     suites = "; ".join(f"{pool}: {rows.loc[rows['pool'] == pool, 'suites'].iloc[0]}" for pool in pools)
-    title = f"Arms beside each other: {first['track']}, prior {first['prior_group']}"
+    title = f"Arms side by side: {first['track']}, prior {first['prior_group']}"
     note = (
         f"Pools of the registered contrasts, all queries of a pool weighing the same. {suites}. "
         f"{INTERVALS.replace('each point', 'each bar')} {_MOST_ASKED}"
@@ -178,7 +178,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     first = rows.iloc[0]
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
     about = BoardPage(
-        title=f"What answers are worth, and what they take: {first['track']}, prior {first['prior_group']}",
+        title=f"Success against cost: {first['track']}, prior {first['prior_group']}",
         note=(
             f"Suites {first['suites']}: those that all of these matchers were asked; n {first['n']:g} present places, "
             f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "

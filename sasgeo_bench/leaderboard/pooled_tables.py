@@ -102,11 +102,11 @@ def ablation_frame(scores: Scores, contrasts: Sequence[Contrast], shown: Sequenc
         for group in sorted({group for frame in some.values() for group in frame["prior_group"]}):
             alike = _alike({name: frame[frame["prior_group"] == group] for name, frame in some.items()})
             suites = sorted({suite for frame in alike.values() for suite in frame["suite"]})
-            said = {"pool": pool.name, "suites": ", ".join(suites), "track": pool.track, "prior_group": group}
+            keys = {"pool": pool.name, "suites": ", ".join(suites), "track": pool.track, "prior_group": group}
             for name, frame in alike.items():
                 values = primary_of(pool.track).values(frame)[:, None]
                 text = f"{pool.name}/{pool.track}/{group}"
-                rows += [{**said, "matcher": name, **one} for one in _figures(frame, values, text)]
+                rows += [{**keys, "matcher": name, **one} for one in _figures(frame, values, text)]
     return pd.DataFrame(rows, columns=["pool", "suites", "track", "prior_group", "matcher", *_FIGURE])
 
 
@@ -143,7 +143,7 @@ def recall_frame(
     heading.
     """
     rows: list[dict[str, Any]] = []
-    for said, frames in _suites(scores, shown):
+    for group, frames in _suites(scores, shown):
         longest = max(
             len(answer.candidates)
             for name, frame in frames.items()
@@ -152,12 +152,12 @@ def recall_frame(
         steps = [k for k in RANKS if k <= longest]
         if len(steps) < 2:  # noqa: PLR2004 - a point is no curve
             continue
-        text = "/".join((*said.values(), "recall"))
+        text = "/".join((*group.values(), "recall"))
         for name, frame in frames.items():
-            ranks = ranks_of(frame) if said["track"] == "retrieval" else _near(frame, predictions[name], truths)
+            ranks = ranks_of(frame) if group["track"] == "retrieval" else _near(frame, predictions[name], truths)
             table = np.column_stack([hits(ranks, k) for k in steps])
             found = _figures(frame, table, text)
-            rows += [{**said, "matcher": name, "k": k, **one} for k, one in zip(steps, found, strict=True)]
+            rows += [{**group, "matcher": name, "k": k, **one} for k, one in zip(steps, found, strict=True)]
     return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "k", *_FIGURE])
 
 
@@ -180,22 +180,22 @@ def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> p
     denominator.
     """
     rows: list[dict[str, Any]] = []
-    told = table[(table["metric"] == WITHIN_M) & (table["rejector"] == "")]
-    keys = zip(*(told[name] for name in (*GROUP, "stratum", "matcher")), strict=True)
-    both = zip(told["lo"].to_numpy(float), told["hi"].to_numpy(float), strict=True)
+    within = table[(table["metric"] == WITHIN_M) & (table["rejector"] == "")]
+    keys = zip(*(within[name] for name in (*GROUP, "stratum", "matcher")), strict=True)
+    both = zip(within["lo"].to_numpy(float), within["hi"].to_numpy(float), strict=True)
     ends = dict(zip(keys, both, strict=True))
-    for said, frames in _suites(scores, shown):
-        if said["track"] == "retrieval":
+    for group, frames in _suites(scores, shown):
+        if group["track"] == "retrieval":
             continue
         for name, frame in frames.items():
             errors_m = np.sort(frame["position_error_m"].fillna(np.inf).to_numpy(float))
             shares = np.searchsorted(errors_m, _RADII_M, side="right") / len(errors_m)
             counts = {"n": len(frame), "blocks": int(frame["block"].nunique())}
-            end = ends.get((*said.values(), name), _NO_INTERVAL)
+            end = ends.get((*group.values(), name), _NO_INTERVAL)
             for radius_m, value in zip(_RADII_M.tolist(), shares.tolist(), strict=True):
                 lo, hi = end if radius_m == FIX_M else _NO_INTERVAL
                 point = {"radius_m": radius_m, "value": value, "lo": lo, "hi": hi}
-                rows.append({**said, "matcher": name, **counts, **point})
+                rows.append({**group, "matcher": name, **counts, **point})
     return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "radius_m", *_FIGURE])
 
 
@@ -212,14 +212,14 @@ def cost_frame(
     without an accepted fix costs 1, a false fix `ratio`.
     """
     rows: list[dict[str, Any]] = []
-    for said, part in calibrated_parts(judged, calibrated, shown):
+    for group, part in calibrated_parts(judged, calibrated, shown):
         some = answers_of(part)
         withhold = float(some.is_present.mean())
         for ratio in _RATIOS.tolist():
             cost = decision_cost(some, ratio, charged="place")
             all_accepted = float(cost_values(some, some.is_answered, ratio, charged="place").mean())
             costs = {"cost": cost, "accept_all": all_accepted, "withhold_all": withhold}
-            rows.append({**said, "n": len(some), "ratio": ratio, **costs})
+            rows.append({**group, "n": len(some), "ratio": ratio, **costs})
     columns = ["track", "prior_group", "matcher", "rejector", "n", "ratio", "cost", "accept_all", "withhold_all"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -245,19 +245,19 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
         some = {name: frame for name, frame in some.items() if _is_able(frame)}
         suites = [set(frame["suite"]) for frame in some.values()]
         shared = set.intersection(*suites) if suites else set()
-        said = {"suites": ", ".join(sorted(shared)), "track": track, "prior_group": prior_group}
+        group = {"suites": ", ".join(sorted(shared)), "track": track, "prior_group": prior_group}
         for name, frame in _alike({name: one[one["suite"].isin(shared)] for name, one in some.items()}).items():
             values = primary_of(track).values(frame)[:, None]
-            (found,) = _figures(frame, values, f"{said['suites']}/{track}/{prior_group}")
-            rows.append({**said, "matcher": name, **found, **_costs_of(table, name, track)})
+            (found,) = _figures(frame, values, f"{group['suites']}/{track}/{prior_group}")
+            rows.append({**group, "matcher": name, **found, **_costs_of(table, name, track)})
     columns = ["suites", "track", "prior_group", "matcher", *_FIGURE, *COSTS.values()]
     return pd.DataFrame(rows, columns=columns)
 
 
 def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]:
     """Return the costs of one matcher from the leaderboard."""
-    told = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
-    known = dict(zip(told["metric"], told["value"], strict=True))
+    within = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
+    known = dict(zip(within["metric"], within["value"], strict=True))
     return {column: float(known.get(metric, np.nan)) for metric, column in COSTS.items()}
 
 

@@ -144,7 +144,7 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
         at_true=_seen_at(truth.pose, case, bits, grid, manifest),
         at_answer=_seen_at(case.fix, case, bits, grid, manifest),
         disc=_disc(query),
-        said=_lines(case),
+        lines=_lines(case),
         attribution=manifest.attribution,
     )
 

@@ -63,7 +63,7 @@ def rank_text(row: Record) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bar:
-    """An interval as a picture beside its numbers: ends, and the figure between them, in per cent of the cell."""
+    """An interval as a picture next to its numbers: ends, and the figure between them, in per cent of the cell."""
 
     lo: float
     hi: float
@@ -262,8 +262,8 @@ def ties_of(rows: Sequence[Record]) -> tuple[Tie, ...]:
     >>> ties_of([dict(zip(("matcher", "rank_best", "rank_worst"), row)) for row in ranked])
     (Tie(names=('a', 'b'), best=1, worst=2),)
     """
-    told = [row for row in rows if not pd.isna(row["rank_best"]) and not is_unranked(str(row["matcher"]))]
-    ranked = sorted((int(row["rank_best"]), int(row["rank_worst"]), str(row["matcher"])) for row in told)
+    known = [row for row in rows if not pd.isna(row["rank_best"]) and not is_unranked(str(row["matcher"]))]
+    ranked = sorted((int(row["rank_best"]), int(row["rank_worst"]), str(row["matcher"])) for row in known)
     chains: list[list[tuple[int, int, str]]] = []
     for item in ranked:
         if chains and item[0] <= max(worst for _, worst, _ in chains[-1]):

@@ -50,7 +50,7 @@ _NO_IMAGERY: Final = f"""\
 None is in this release: every file of it is derived from OpenStreetMap ({ATTRIBUTION}), and the column `image` of the
 queries is empty. Imagery has a licence of its own; a release that holds some keeps it in this folder, apart from what
 is
-under the ODbL, each source with its licence beside it.
+under the ODbL, each source with its licence.
 """
 
 

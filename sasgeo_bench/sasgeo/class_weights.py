@@ -199,27 +199,27 @@ def check_classes(model: ScorerModel, classes: Sequence[str] = ()) -> ScorerMode
     return model.of_classes(classes) if classes else model
 
 
-def worth_of(model: ScorerModel, arm: Switches, *, age_years: float, season: str = "") -> NDArray[np.float64]:
+def class_weights_of(model: ScorerModel, arm: Switches, *, age_years: float, season: str = "") -> NDArray[np.float64]:
     """Return the weight of each class in nats for 100 m2 that are mapped and seen, shape (C,).
 
     Examples
     --------
     By hand it is sigma of Eq. 5, here a prior of 0.97 at the half-life of 231 years:
 
-    >>> worth_of(ScorerModel.by_hand(["railway"]), HAND, age_years=231.0).round(3).tolist()
+    >>> class_weights_of(ScorerModel.by_hand(["railway"]), HAND, age_years=231.0).round(3).tolist()
     [0.485]
     """
     agree = arm.gains(model, age_years=age_years, season=season).agree
     return np.asarray(AREA_M2 * model.scaling * agree)
 
 
-def worth_table(
+def class_weight_table(
     model: ScorerModel, arm: Switches, *, ages_years: Sequence[float] = AGES_YEARS, season: str = ""
 ) -> pd.DataFrame:
     """Return weights, gains and information of each class as the map ages, a row for each class and age.
 
-    Columns: class, age_years; worth (see `worth_of`); agree, extra, missed, quiet (see `weights.Gains`) and information
-    (see `weights.information`), nats a cell.
+    Columns: class, age_years; weight (see `class_weights_of`); agree, extra, missed, quiet (see `Gains`) and
+    information (see `weights.information`), nats a cell.
     """
     persists = model.persists(season)
     parts = []
@@ -230,9 +230,9 @@ def worth_table(
             for rates, factor in zip(model.rates, persists, strict=True)
         ]
         about = {"class": model.classes, "age_years": float(age), "order": range(len(model.classes))}
-        worth = worth_of(model, arm, age_years=age, season=season)
+        weights = class_weights_of(model, arm, age_years=age, season=season)
         columns = {name: getattr(gains, name) for name in GAINS}
-        parts.append(pd.DataFrame(about | {"worth": worth} | columns | {"information": nats}))
+        parts.append(pd.DataFrame(about | {"weight": weights} | columns | {"information": nats}))
     rows = pd.concat(parts).sort_values(["order", "age_years"], kind="stable", ignore_index=True)
     return rows.drop(columns="order")
 
@@ -245,12 +245,12 @@ def rarity_map(region: Region) -> NDArray[np.float32]:
 
 
 def weight_map(
-    layers: NDArray[np.uint8], worth: NDArray[np.float64], rarity: NDArray[np.float32]
+    layers: NDArray[np.uint8], weights: NDArray[np.float64], rarity: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Return the weight of every cell of a map: w = sigma nu, summed over its classes as in Eq. 8.
 
-    `layers` have shape (C, rows, cols), `worth` (`worth_of`) shape (C,), `rarity` (`rarity_map`) and the result (rows,
-    cols). Nats for 100 m2; 0 where nothing is mapped, NaN where nothing is known.
+    `layers` have shape (C, rows, cols), `weights` (`class_weights_of`) shape (C,), `rarity` (`rarity_map`) and the
+    result (rows, cols). Nats for 100 m2; 0 where nothing is mapped, NaN where nothing is known.
 
     Examples
     --------
@@ -259,7 +259,7 @@ def weight_map(
     [[1.5, 0.0, nan]]
     """
     total = np.zeros(layers.shape[1:], dtype=np.float32)
-    for layer, value in zip(layers, worth, strict=True):
+    for layer, value in zip(layers, weights, strict=True):
         total[layer == PRESENT] += np.float32(value)
     total *= rarity
     total[(layers > PRESENT).any(axis=0)] = np.nan

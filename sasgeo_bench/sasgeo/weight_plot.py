@@ -34,14 +34,14 @@ class WeightSheet:
     """A region and the weights of its cells.
 
     `layers` are those of the region; `weights`, shape (rows, cols), are nats for 100 m2, NaN where nothing is known;
-    `worth` holds the weight of each class at mean rarity; `top` is the end of the colours (see `top_of`); `facts` is a
-    line on age, season and weights.
+    `class_weights` holds the weight of each class at mean rarity; `top` is the end of the colours (see `top_of`);
+    `facts` is a line on age, season and weights.
     """
 
     manifest: Manifest
     layers: NDArray[np.uint8]
     weights: NDArray[np.float32]
-    worth: Mapping[str, float]
+    class_weights: Mapping[str, float]
     top: float
     facts: str
 
@@ -87,7 +87,9 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
     weights = _blocks(filled, factor).max(axis=(1, 3))
     side_m = (region.cols * region.cell_size_m, region.rows * region.cell_size_m)
     scale = _MAP_INCHES / max(side_m)
-    keys = _class_keys({name: f"  {sheet.worth[name]:.2f}" for name in region.classes if region.counts.get(name)})
+    keys = _class_keys(
+        {name: f"  {sheet.class_weights[name]:.2f}" for name in region.classes if region.counts.get(name)}
+    )
     if np.isnan(sheet.weights).any():
         keys.append(Patch(facecolor=HIDDEN, edgecolor="#666666", lw=0.4, label="not mapped (unknown)"))
     place = Evidence(classes=region.classes, cells=shrunk(sheet.layers), cell_size_m=region.cell_size_m * factor)
@@ -114,7 +116,7 @@ def picture_of(
     """Draw a raster in metres without ticks; values from 0 to `top` by the colours of weights."""
     box = (0.0, side_m[0], 0.0, side_m[1])
     without_ticks(chart)
-    chart.set_anchor("N")  # beside a panel with a colour bar
+    chart.set_anchor("N")  # next to a panel with a colour bar
     chart.set_title(title)
     if top is None:
         return chart.imshow(picture, extent=box, interpolation="nearest")

@@ -122,7 +122,7 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
     (line,) = told
     assert line == (
         "figures left out, for nothing on this board is seen in them: success against strength, recall against K, "
-        "worth against cost"
+        "success against cost"
     )
     for name, draw in figures.items():
         draw(tmp_path / name)
@@ -149,7 +149,7 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
         "success against the age of the map",
         "differences by place",
         "recall against K",
-        "worth against cost",
+        "success against cost",
         "risk against coverage",
         "reliability",
         "the cost of decisions",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What classes are worth: Eq. 5 by hand, the gains of the arm where fitted, and the weight of each cell of a map."""
+"""Weights of classes: Eq. 5 by hand, the gains of the arm where fitted, and the weight of each cell of a map."""
 
 from dataclasses import replace
 
@@ -14,10 +14,10 @@ from sasgeo_bench.sasgeo.class_weights import (
     check_age,
     check_classes,
     check_season,
+    class_weight_table,
+    class_weights_of,
     side_by_side,
     weight_map,
-    worth_of,
-    worth_table,
 )
 from sasgeo_bench.sasgeo.rates import ClassRates
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
@@ -30,26 +30,26 @@ HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01
 def test_by_hand_the_worth_is_sigma_of_eq_5():
     hand = [load_taxonomy()[name].persistence for name in NAMES]
     sigma = [one.prior * np.exp(-7 * one.vanish_per_year) for one in hand] * by_hand("snow", NAMES)
-    assert worth_of(ScorerModel.by_hand(NAMES), HAND, age_years=7.0, season="snow") == pytest.approx(sigma)
+    assert class_weights_of(ScorerModel.by_hand(NAMES), HAND, age_years=7.0, season="snow") == pytest.approx(sigma)
 
 
 def test_gains_and_information_shrink_as_the_map_ages():
-    learnt = replace(ScorerModel.by_hand(["building"]), rates=(HOUSE,))
-    table = worth_table(learnt, FITTED)
-    for column in ("worth", "agree", "information"):
+    model = replace(ScorerModel.by_hand(["building"]), rates=(HOUSE,))
+    table = class_weight_table(model, FITTED)
+    for column in ("weight", "agree", "information"):
         assert table[column].is_monotonic_decreasing
     assert table["missed"].is_monotonic_increasing
 
 
 def test_a_fitted_table_holds_the_gains_of_the_arm_and_its_exponents():
-    learnt = replace(
+    model = replace(
         ScorerModel.by_hand(NAMES), scaling=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(13, 0.4)
     )
-    table = worth_table(learnt, FITTED, ages_years=[3.0], season="leaf_on")
-    gains = FITTED.gains(learnt, age_years=3.0, season="leaf_on")
+    table = class_weight_table(model, FITTED, ages_years=[3.0], season="leaf_on")
+    gains = FITTED.gains(model, age_years=3.0, season="leaf_on")
     assert table["class"].tolist() == list(NAMES)
     assert table["missed"].to_numpy() == pytest.approx(gains.missed)
-    assert table["worth"].to_numpy() == pytest.approx(100 * learnt.scaling * gains.agree)
+    assert table["weight"].to_numpy() == pytest.approx(100 * model.scaling * gains.agree)
 
 
 def test_information_out_of_season_is_less():
@@ -58,10 +58,10 @@ def test_information_out_of_season_is_less():
 
 def test_tables_stand_side_by_side_in_the_order_of_the_classes():
     tables = {
-        name: worth_table(ScorerModel.by_hand(NAMES), arm, ages_years=[0.0, 5.0])
+        name: class_weight_table(ScorerModel.by_hand(NAMES), arm, ages_years=[0.0, 5.0])
         for name, arm in (("a", HAND), ("b", HAND))
     }
-    wide = side_by_side(tables, "worth")
+    wide = side_by_side(tables, "weight")
     assert wide.index.tolist() == list(NAMES)
     assert wide.columns.tolist() == [("a", 0.0), ("a", 5.0), ("b", 0.0), ("b", 5.0)]
 

@@ -164,7 +164,7 @@ def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
 KINDS: Final = ("png", "svg")
 CAPTIONS: Final = {
     "example": "example query with its mask and hardest decoy",
-    "ablation": "Recall@1 of each variant beside the paper's",
+    "ablation": "Recall@1 of each variant and in the paper",
     "robustness": "Recall@1 against map-change probability",
     "risk-coverage": "risk against coverage of every variant",
 }

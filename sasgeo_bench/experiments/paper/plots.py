@@ -99,7 +99,7 @@ def draw_ablation(path: Path, summary: pd.DataFrame, *, chance: float, data: str
     if summary["paper"].notna().any():
         keys.append(Patch(color=_PAPER, label="the paper's, n = 220"))
     about = Page(
-        title="Recall@1 of each variant, beside the paper's Table II",
+        title="Recall@1 of each variant, and in Table II of the paper",
         note=note,
         data=data,
         below="Recall@1 (share of trials with the true candidate first)",

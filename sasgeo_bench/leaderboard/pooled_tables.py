@@ -256,8 +256,8 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
 
 def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]:
     """Return the costs of one matcher from the leaderboard."""
-    within = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
-    known = dict(zip(within["metric"], within["value"], strict=True))
+    costs = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
+    known = dict(zip(costs["metric"], costs["value"], strict=True))
     return {column: float(known.get(metric, np.nan)) for metric, column in COSTS.items()}
 
 

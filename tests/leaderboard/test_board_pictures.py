@@ -155,7 +155,7 @@ def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, as
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert fitted(first, CASE_BYTES) == fitted(again, CASE_BYTES)
-    text = "\n".join(read_picture(case, root / "regions" / asked[1], about).said)
+    text = "\n".join(read_picture(case, root / "regions" / asked[1], about).lines)
     assert "P(false) sure: 0.25, accepted" in text
     assert "margin (an order, no probability): 0.5\n" in text
     assert ("margin_nats: 1.25 nat" in text) == (prediction == "answer")

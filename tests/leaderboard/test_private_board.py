@@ -275,7 +275,7 @@ def test_a_private_pipeline_is_the_same_with_another_seed_in_another_root(tmp_pa
         assert [replace(item, seed=7, out=tmp_path) for item in theirs] == list(ours)
         assert {item.seed for item in theirs} == {SEED}
         assert {item.out for item in theirs} == {tmp_path / "private"}
-    assert private.spec.said == public.spec.said
+    assert private.spec.identity == public.spec.identity
     assert SEED.text not in private.to_text() + repr(private)
 
 

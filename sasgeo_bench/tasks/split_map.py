@@ -7,11 +7,10 @@ from typing import Final
 import numpy as np
 import pyproj
 import shapely
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import Page, page, panels, without_ticks
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks.split import HALVES, Block, Split
 
@@ -22,37 +21,33 @@ _COLUMNS: Final = 6
 
 def write_split_map(path: Path, split: Split) -> None:
     """Write a PNG with a panel for each place: its blocks in true shape, and a scale bar of one kilometre."""
-    places = list(split.blocks)
-    rows = -(-len(places) // _COLUMNS)
-    width, height = 2.3 * _COLUMNS, 2.4 * rows + 1.1
-    figure = PlainFigure(figsize=(width, height), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
-    for at, place in enumerate(places):
-        row, col = divmod(at, _COLUMNS)
-        box = (col / _COLUMNS + 0.01, (height - 0.95 - 2.4 * (row + 1) + 0.25) / height, 0.88 / _COLUMNS, 2.0 / height)
-        chart = figure.add_axes(box)
-        blocks = split.blocks[place]
-        part = colour_of(split, place)
-        outlines = [_outline_m(block, blocks[0]) for block in blocks]
-        for outline in outlines:
-            chart.add_patch(Polygon(outline, closed=True, facecolor=COLOURS[part], edgecolor="white", lw=0.5))
-        west, south, east, north = shapely.total_bounds([shapely.Polygon(outline) for outline in outlines])
-        half_m = max(east - west, north - south) / 2 * 1.12
-        x_m, y_m = (west + east) / 2, (south + north) / 2
-        chart.set(xlim=(x_m - half_m, x_m + half_m), ylim=(y_m - half_m, y_m + half_m), xticks=[], yticks=[])
-        left_m, bottom_m = x_m - half_m * 0.95, y_m - half_m * 0.95
-        chart.plot([left_m, left_m + 1000], [bottom_m, bottom_m], color="black", lw=2)
-        chart.set_title(f"{place} ({len(blocks)})", fontsize=8.5, pad=3)
-    title = f"{split.spec.id}: {split.spec.title}"
-    figure.text(0.01, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
-    note = "blocks of about 1 km; the bar is 1 km; panels are not to one scale"
-    figure.text(0.01, 1 - 0.45 / height, note, va="top", fontsize=9, color="#444444")
     parts = sorted({colour_of(split, place) for place in split.blocks}, key=list(COLOURS).index)
     names: dict[str, str] = {half: f"half {half}: test, calibration; train for the other" for half in HALVES}
-    handles = [Patch(facecolor=COLOURS[part], label=names.get(part, part)) for part in parts]
-    figure.legend(handles=handles, loc="upper right", frameon=False, fontsize=9, ncols=len(handles))
-    figure.text(0.01, 0.06 / height, ATTRIBUTION, fontsize=8)
-    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+    about = Page(
+        title=f"{split.spec.id}: {split.spec.title}",
+        facts="blocks of about 1 km; the bar is 1 km; panels are not to one scale",
+        data=ATTRIBUTION,
+        rows=-(-len(split.blocks) // _COLUMNS),
+        columns=_COLUMNS,
+        panel_inches=(2.0, 2.0),
+        keys=[Patch(facecolor=COLOURS[part], label=names.get(part, part)) for part in parts],
+    )
+    places = list(split.blocks)
+    with page(path, about) as charts:
+        for at, chart in panels(charts, len(places)):
+            blocks = split.blocks[places[at]]
+            colour = COLOURS[colour_of(split, places[at])]
+            outlines = [_outline_m(block, blocks[0]) for block in blocks]
+            for outline in outlines:
+                chart.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor="white", lw=0.5))
+            west, south, east, north = shapely.total_bounds([shapely.Polygon(outline) for outline in outlines])
+            half_m = max(east - west, north - south) / 2 * 1.12
+            x_m, y_m = (west + east) / 2, (south + north) / 2
+            chart.set(xlim=(x_m - half_m, x_m + half_m), ylim=(y_m - half_m, y_m + half_m))
+            without_ticks(chart)
+            left_m, bottom_m = x_m - half_m * 0.95, y_m - half_m * 0.95
+            chart.plot([left_m, left_m + 1000], [bottom_m, bottom_m], color="black", lw=2)
+            chart.set_title(f"{places[at]} ({len(blocks)})")
 
 
 def colour_of(split: Split, place: str) -> str:

@@ -168,8 +168,10 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """Draw risk against coverage from `risk_frame`: a panel for each matcher and mixture, a line for each rejector."""
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     mixtures = list(dict.fromkeys(rows["mixture"]))
-    cells = [(name, mixture) for name in names for mixture in mixtures]
-    columns = min(ACROSS, len(cells)) if len(mixtures) == 1 else len(mixtures)
+    there = set(zip(rows["matcher"], rows["mixture"], strict=True))
+    cells = [(name, mixture) for name in names for mixture in mixtures if (name, mixture) in there]
+    is_grid = len(mixtures) > 1 and len(cells) == len(names) * len(mixtures)
+    columns = len(mixtures) if is_grid else min(ACROSS, len(cells))
     pooled = " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
     about = BoardPage(
         title=f"Risk against coverage: {of_which(rows.iloc[0])}",

@@ -366,7 +366,7 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
         about.write_text(text)
         told = mistake(*ORACLE)
         assert "run.json is damaged" in told
-        assert told.endswith("remove it and run again, the parts beside it are kept")
+        assert told.endswith("remove it and run again, its parts are kept")
     about.write_text("{}")
     assert "holds answers of None, not of" in mistake(*ORACLE)
     about.write_text(json.dumps(sound | {"cpu_s": "long"}))

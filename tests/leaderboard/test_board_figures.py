@@ -271,7 +271,7 @@ def test_a_stanford_figure_is_of_few_matchers_those_of_contrasts_first(board, mo
 
     def rows(contrasts=CONTRASTS):
         drawn = figures_extra(both, tell=lambda _: None, contrasts=contrasts).figures[name]
-        return {matcher for matcher, _ in drawn.keywords["told"]}
+        return {matcher for matcher, _ in drawn.keywords["levels"]}
 
     assert rows() == {"raster", "graph"}
     monkeypatch.setattr(board_figures, "MOST_STANFORD", 1)

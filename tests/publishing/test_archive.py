@@ -189,7 +189,7 @@ def test_stored_again_nothing_but_the_board_changes(kept, program, tmp_path):
     [
         ("--without", "a board without some regions is not stored: leave --without or --results away"),
         ("--predictions", r"mine.parquet is a file of predictions: only boards of runs are stored"),
-        ("--submissions", "submissions stay apart from the results of their board: leave --sub"),
+        ("--submissions", "results of a board hold no submissions: leave --sub"),
     ],
 )
 def test_what_is_no_whole_board_of_runs_is_not_stored(kept, tmp_path, flag, words):

@@ -488,7 +488,7 @@ def test_a_folder_of_submissions_holds_nothing_else_but_its_readme(copied):
     (copied.parent / "notes").mkdir()
     with pytest.raises(StoreError, match=r"notes is no submission, for it holds no submission\.json"):
         submissions_for("kept", [copied.parent], tell=silent)
-    with pytest.raises(ConfigError, match="beside the stored results of a board: name them with --predictions"):
+    with pytest.raises(ConfigError, match="with the stored results of a board: name them with --predictions"):
         submissions_for("", [copied], tell=silent)
 
 

@@ -97,5 +97,5 @@ def test_a_matcher_that_bears_a_shipped_name_is_refused_before_it_is_asked_or_tr
 
 def test_answers_to_private_queries_stay_beside_them(made):
     task = made / "out" / "private" / "tasks" / "clean" / "town-riverside"
-    with pytest.raises(ConfigError, match=r"is of a private seed, whose answers stay beside it: say --out .*private"):
+    with pytest.raises(ConfigError, match=r"is of a private seed, whose answers stay with it: say --out .*private"):
         plan_run(RunRequest(spec="random", tasks=[task], out=made / "out"))

@@ -46,27 +46,21 @@ LOOPBACK = ("127.", "localhost", "::1")
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that are quick and those that share a fixture, and skip those on real data where there is none."""
+    """Mark the tests that are quick, and skip those on real data, with the reason, where there is none."""
     skip = pytest.mark.skip(reason="real extracts: SASGEO_EXTRACTS names no folder with *.osm.pbf files")
     has_extracts = _extracts_folder() is not None
     for item in items:
         if _is_quick(item):
             item.add_marker("quick")
-        if any(fixture.scope == "module" for fixture in _fixtures(item)):
-            item.add_marker(pytest.mark.xdist_group(item.path.as_posix()))  # in one process, which makes it once
         if item.get_closest_marker("real") and not has_extracts:
             item.add_marker(skip)
 
 
 def _is_quick(item: pytest.Item) -> bool:
     """Whether a test shares no fixture of ours with others, as whatever takes long is shared, nor builds for itself."""
-    shared = {one.argname for one in _fixtures(item) if one.scope != "function" and one.baseid}
-    return shared <= {"_no_network"} and not item.get_closest_marker("real") and item.path.name not in BUILDERS
-
-
-def _fixtures(item: pytest.Item) -> list[pytest.FixtureDef[object]]:
     found = getattr(item, "_fixtureinfo").name2fixturedefs.values()  # noqa: B009 - of a function or a docstring's example
-    return [each[-1] for each in found]
+    shared = {each[-1].argname for each in found if each[-1].scope != "function" and each[-1].baseid}
+    return shared <= {"_no_network"} and not item.get_closest_marker("real") and item.path.name not in BUILDERS
 
 
 @pytest.fixture(scope="session")

@@ -63,10 +63,10 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 test test-quick: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
-	$(VENV_PYTHON) -m pytest -n 3 --dist worksteal -p no:benchmark -rs $(ARGS)
+	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)
 
 test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built for several of them
-	$(VENV_PYTHON) -m pytest -n 2 --dist worksteal -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
+	$(VENV_PYTHON) -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)

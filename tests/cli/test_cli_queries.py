@@ -269,7 +269,10 @@ def test_a_damaged_task_json_gets_one_line(command, text, told, mistake, tmp_pat
 
 @pytest.mark.parametrize(
     ("target", "words"),
-    [("nothing", "holds no region.json"), ("clean/nowhere", "holds no task clean/nowhere: draw it with make-queries --suite clean")],
+    [
+        ("nothing", "holds no region.json"),
+        ("clean/nowhere", "holds no task clean/nowhere: draw it with make-queries --suite clean"),
+    ],
 )
 def test_a_target_that_is_nothing_gets_one_line(target, words, mistake):
     assert words in mistake("inspect", target)

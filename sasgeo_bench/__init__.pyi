@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # The public names, and where each comes from: for type checkers, and for `lazy_loader`, which reads them here.
 
-from .bounds import MOST_CANDIDATES as MOST_CANDIDATES
 from .cli.boards import score as score
 from .cli.publishing import publish as publish
 from .cli.queries import make_tasks as make_tasks
@@ -60,5 +59,6 @@ from .tasks.query import Truth as Truth
 from .tasks.task_files import read_queries as read_queries
 from .tasks.task_files import read_task as read_task
 from .tasks.task_files import read_truths as read_truths
+from .texts import MOST_CANDIDATES as MOST_CANDIDATES
 
 __version__: str

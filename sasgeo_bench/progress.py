@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Show the progress of long work: as a line now and then, or as a terminal shows it."""
+"""Spread long work over processes, and show its progress: as a line now and then, or as a terminal shows it."""
 
 import time
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from signal import SIG_DFL, SIGINT, signal
+from typing import Protocol, TypeVar
 
 EVERY_S = 10.0  # read when progress begins to be shown, so that a test can silence it on a slow machine
 
@@ -51,3 +54,22 @@ class Lines:
         done = self._done[label]
         rate = done / max(now - begun, 1e-9)
         self._tell(f"{label}: {done} of {total}, {rate:.1f} a second, {(total - done) / rate:.0f} s left")
+
+
+Item = TypeVar("Item")
+Found = TypeVar("Found")
+
+
+def spread(work: Callable[[Item], Found], items: Sequence[Item], *, jobs: int = 1) -> Iterator[Found]:
+    """Yield `work(item)` for each item, in order, computed by several processes if there are several jobs and items.
+
+    Another process must be able to import `work`, and to receive items and send results. The first error is raised
+    here.
+    """
+    if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
+        yield from map(work, items)
+        return
+    # An interrupt ends the processes at once: files are written whole or not at all, and the next run resumes.
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=signal, initargs=(SIGINT, SIG_DFL)) as pool:
+        yield from pool.map(work, items)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # that is added to a folder edits nothing here.
 HOUSE = (
     # What any program needs.
-    *("texts", "errors", "bounds", "config", "parallel", "progress", "files", "canvas"),
+    *("texts", "errors", "config", "progress", "files", "canvas"),
     # The pipeline.
     *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks", "matching", "sasgeo", "running"),
     *("scoring", "leaderboard", "publishing", "importers", "experiments", "cli"),

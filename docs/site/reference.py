@@ -50,7 +50,7 @@ from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, TRUTH_SCHEMA
 # Headings of the API pages, by the folder that a public name comes from.
 STAGES: Final = {
     "cli": "Stages as functions",
-    "bounds": "Bounds of an answer",
+    "texts": "Bounds of an answer",
     "geometry": "Poses and grids",
     "osm": "OpenStreetMap features",
     "regions": "Regions and evidence",

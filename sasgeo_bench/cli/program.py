@@ -11,10 +11,10 @@ from typing import Annotated, Any, Final, TextIO
 import typer
 from typer.core import TyperGroup
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.cli.console import EXIT_USER, say, tell
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.texts import one_line
 
 EXIT_INTERRUPTED: Final = 130
 HELP: Final = (

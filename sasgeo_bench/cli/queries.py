@@ -13,8 +13,7 @@ from sasgeo_bench.cli.console import say, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.parallel import spread
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite

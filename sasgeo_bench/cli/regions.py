@@ -10,7 +10,7 @@ import typer
 
 from sasgeo_bench.cli.console import read_date, say, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.parallel import spread
+from sasgeo_bench.progress import spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 

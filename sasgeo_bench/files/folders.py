@@ -14,10 +14,10 @@ from typing import Annotated, Final, NamedTuple
 from filelock import FileLock, Timeout
 from pydantic import ConfigDict, Field
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.config import Document
 from sasgeo_bench.errors import StoreError, named
 from sasgeo_bench.files.json import read_json
+from sasgeo_bench.texts import one_line
 
 
 def remove_tree(folder: Path) -> None:

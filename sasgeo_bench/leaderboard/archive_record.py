@@ -5,11 +5,10 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring.entries import CardRecord
-from sasgeo_bench.texts import FOLDER
+from sasgeo_bench.texts import FOLDER, one_line
 
 Model = TypeVar("Model", bound=BaseModel)
 Plain = Annotated[str, Field(pattern=FOLDER)]  # of what may become a folder

@@ -9,7 +9,6 @@ from typing import Any, Final
 import pandas as pd
 import pyarrow as pa
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import (
     FIGURE_FILES,
@@ -29,7 +28,7 @@ from sasgeo_bench.scoring import controls, protection
 from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.rows import Row
-from sasgeo_bench.texts import csv_cell, json_text
+from sasgeo_bench.texts import csv_cell, json_text, one_line
 
 LEADERBOARD: Final = "leaderboard"
 PROTECTION: Final = "protection"

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import PICTURES_FILE, Extra
@@ -36,7 +35,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
 from sasgeo_bench.tasks.sheet import sheet_figure
-from sasgeo_bench.texts import json_text
+from sasgeo_bench.texts import json_text, one_line
 
 REGION_BYTES: Final = 15_000
 SUITE_BYTES: Final = 38_000

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.matching.matcher import check_learned
+from sasgeo_bench.texts import one_line
 
 FOLDER: Final = "learned"  # next to the suites of a run
 

@@ -11,13 +11,22 @@ from typing import Final, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.bounds import BOUNDS, MOST_CANDIDATES, MOST_DIAGNOSTICS, MOST_NAME, bounds_text, is_line, one_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Head, Query, Track, Truth
-from sasgeo_bench.texts import NAME, VERSION
+from sasgeo_bench.texts import (
+    BOUNDS,
+    MOST_CANDIDATES,
+    MOST_DIAGNOSTICS,
+    MOST_NAME,
+    NAME,
+    VERSION,
+    bounds_text,
+    is_line,
+    one_line,
+)
 
 Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)

@@ -9,8 +9,8 @@ from functools import lru_cache, partial
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, Final
 
-from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:
     from sasgeo_bench.matching.matcher import Matcher, Rejector

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
@@ -35,6 +34,7 @@ from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import read_ids
+from sasgeo_bench.texts import one_line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

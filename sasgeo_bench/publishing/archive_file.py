@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import SITE_FOLDERS, fresh_folder, hashes_of, list_files, locked, resolve_link
 from sasgeo_bench.files.json import parse_json
@@ -52,7 +51,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row, predictions_of
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under
-from sasgeo_bench.texts import FOLDER, json_text
+from sasgeo_bench.texts import FOLDER, json_text, one_line
 
 MOST_BYTES: Final = 10_000_000
 _LEVEL: Final = 19

@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.files.folders import (
     FIGURE_FILES,
@@ -30,6 +29,7 @@ from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 from sasgeo_bench.running.prediction_rows import differing_columns, row_faults
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, TRUTH_SCHEMA, VIEW_BYTES
+from sasgeo_bench.texts import one_line
 
 PACK: Final = "pack.json"
 SCHEMA_VERSION: Final = 3

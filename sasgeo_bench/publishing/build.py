@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, resolve_link
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOARD, check_shape, read_board
@@ -37,6 +36,7 @@ from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 from sasgeo_bench.tasks.task_files import PRIVATE
+from sasgeo_bench.texts import one_line
 
 _MAP: Final = "places.svg"
 _RATES: Final = "ageing-rates.svg"

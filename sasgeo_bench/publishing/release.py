@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Tell
@@ -39,7 +38,7 @@ from sasgeo_bench.tasks.build import built_anew, is_of_region
 from sasgeo_bench.tasks.private_seed import LEAST_BITS
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, read_split_file
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.texts import FOLDER
+from sasgeo_bench.texts import FOLDER, one_line
 
 HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
 _EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": "rio-cogeo"}

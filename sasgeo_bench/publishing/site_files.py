@@ -14,7 +14,6 @@ from xml.etree import ElementTree as ET
 import pandas as pd
 import pyarrow as pa
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import IMAGES, SITE_FOLDERS, check_site, fresh_folder, list_files, locked
 from sasgeo_bench.files.folders import SITE_MANIFEST as MANIFEST
@@ -25,7 +24,7 @@ from sasgeo_bench.leaderboard.board_files import BOARD, FIGURES, LEADERBOARD, ME
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.texts import json_text
+from sasgeo_bench.texts import json_text, one_line
 
 _TAGS: Final = frozenset(  # of SVG: what shapes and texts are made of
     {

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final, Generic, TypeVar
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.matching.matcher import check_match, lacks
 from sasgeo_bench.matching.plugins import ORACLE
@@ -26,6 +25,7 @@ from sasgeo_bench.running.worker import Worker
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_rows import asked_under
+from sasgeo_bench.texts import one_line
 
 Item = TypeVar("Item")
 

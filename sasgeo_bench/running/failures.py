@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.texts import message_of, one_line
 
 LOG: Final = "failures.log"  # in the folder of a run; next to that of a board
 _DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})

@@ -16,7 +16,7 @@ from typing import Final, Self
 
 import psutil
 
-from sasgeo_bench.bounds import message_of
+from sasgeo_bench.texts import message_of
 
 _PREFIX: Final = "sasgeo-bench-"
 _NEEDED: Final = ("memory", "pids")

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
@@ -27,7 +26,7 @@ from sasgeo_bench.running.prediction_rows import (
     row_faults,
 )
 from sasgeo_bench.tasks.task_rows import ASKED, asked_under
-from sasgeo_bench.texts import json_text
+from sasgeo_bench.texts import json_text, one_line
 
 RUN: Final = "run.json"
 _MEND: Final = "write it again, or remove it where it is a part of a run"

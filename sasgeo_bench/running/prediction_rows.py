@@ -10,7 +10,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from sasgeo_bench.bounds import (
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import STATUSES, Prediction
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, is_like, poses_of
+from sasgeo_bench.texts import (
     BOUNDS,
     MOST_CANDIDATES,
     MOST_DIAGNOSTICS,
@@ -19,10 +23,6 @@ from sasgeo_bench.bounds import (
     bounds_text,
     is_line,
 )
-from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import STATUSES, Prediction
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, is_like, poses_of
 
 SCHEMA_VERSION: Final = 1
 _CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
@@ -132,7 +132,7 @@ class RowFault:
 
 
 def row_faults(table: pa.Table) -> Iterator[RowFault]:
-    """Check every number, name and text of rows against the bounds of an answer (`bounds`).
+    """Check every number, name and text of rows against the bounds of an answer (`texts.BOUNDS`).
 
     The table must have all columns of predictions. Faults come by column, then by row.
     """

@@ -7,7 +7,12 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
 
-from sasgeo_bench.bounds import (
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import MOST_SAID, Match, MatcherCard, Need, check_learned
+from sasgeo_bench.matching.results import Status
+from sasgeo_bench.tasks.query import Track
+from sasgeo_bench.texts import (
     BOUNDS,
     MOST_CANDIDATES,
     MOST_DIAGNOSTICS,
@@ -17,11 +22,6 @@ from sasgeo_bench.bounds import (
     is_line,
     one_line,
 )
-from sasgeo_bench.errors import MatchError
-from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import MOST_SAID, Match, MatcherCard, Need, check_learned
-from sasgeo_bench.matching.results import Status
-from sasgeo_bench.tasks.query import Track
 
 _MOST_BYTES: Final = 2**50  # of memory
 _MOST_PLACES: Final = 1000

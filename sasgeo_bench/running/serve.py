@@ -15,7 +15,6 @@ from typing import Any, Final, Self
 
 import psutil
 
-from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import Learner, Match, Matcher, Training, check_learned, check_match
 from sasgeo_bench.matching.plugins import load_matcher
@@ -23,6 +22,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
 from sasgeo_bench.tasks.task_rows import pairs_from, query_from
+from sasgeo_bench.texts import message_of, one_line
 
 MOST_MAPS: Final = 2  # cached while a matcher trains
 # Modules of this package that answers depend on: after a change there, queries are asked anew.

@@ -4,7 +4,6 @@
 from collections.abc import Callable
 from functools import partial
 
-from sasgeo_bench.bounds import message_of, one_line
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.learned_file import read_learned, write_learned
@@ -14,6 +13,7 @@ from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_tr
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import Worker
+from sasgeo_bench.texts import message_of, one_line
 
 
 def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:

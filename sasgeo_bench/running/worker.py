@@ -22,7 +22,6 @@ from typing import IO, Any, Final, Self
 import psutil
 
 import sasgeo_bench.running.child
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import remove_tree
 from sasgeo_bench.running import wire
@@ -32,6 +31,7 @@ from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.replies import Reply, read_reply
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_rows import pairs_bytes
+from sasgeo_bench.texts import one_line
 
 _KEEPER_S: Final = 5.0  # for the keeper of a matcher's process to end all its descendants
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)

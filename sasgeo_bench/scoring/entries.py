@@ -12,7 +12,6 @@ from typing import Any, Final
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
@@ -26,6 +25,7 @@ from sasgeo_bench.scoring.rows import AS_SUBMITTED, RUN_HERE, is_unranked
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.texts import one_line
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")

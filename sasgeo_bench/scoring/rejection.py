@@ -11,13 +11,11 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.bounds import message_of
 from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.parallel import spread
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.base import Bools, Floats, weighted_mean
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept, presence_weights
@@ -27,6 +25,7 @@ from sasgeo_bench.scoring.metrics import REJECTION, RISKS, THRESHOLDS, Rejection
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, to_frame
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.texts import message_of
 
 AS_DRAWN: Final = "as drawn"
 _CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time

@@ -11,7 +11,6 @@ from typing import Final
 
 import pyarrow as pa
 
-from sasgeo_bench.bounds import MOST_MESSAGE
 from sasgeo_bench.config import check_document, parse_toml
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import file_record, fresh_folder, locked
@@ -21,7 +20,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, SubmittedFile
 from sasgeo_bench.running.prediction_rows import RUN_SCHEMA, prediction_row
 from sasgeo_bench.tasks.task_rows import ASKED
-from sasgeo_bench.texts import json_text
+from sasgeo_bench.texts import MOST_MESSAGE, json_text
 
 SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"

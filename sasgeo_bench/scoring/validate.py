@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.bounds import MOST_CANDIDATES
 from sasgeo_bench.errors import MatchError, StoreError, counted
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match, check_match
@@ -21,6 +20,7 @@ from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.tasks.task_rows import ASKED
+from sasgeo_bench.texts import MOST_CANDIDATES
 
 Bounds = tuple[float, float, float, float]  # west, south, east, north, metres
 

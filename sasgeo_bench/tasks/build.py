@@ -18,8 +18,7 @@ import numpy as np
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import fresh_folder, locked
-from sasgeo_bench.parallel import spread
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_edited, build_region, plan_build
 from sasgeo_bench.regions.evidence import LayerBits

@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.bounds import one_line
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.texts import one_line
 
 SAID = {"name": "half", "version": "1", "title": "Half", "source": "original", "ours": "all", "licence": "MIT"}
 

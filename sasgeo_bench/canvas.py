@@ -21,6 +21,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -150,14 +151,20 @@ class PlainFigure(Figure):
         engine.execute(self)
 
     def write(self, path: Path, about: Page) -> None:
-        """Write the figure as .svg or .png; the same figure gives the same bytes."""
+        """Write the figure as .svg or .png; the same figure gives the same bytes.
+
+        Its layout is done, so the canvas prints it at once: `savefig` would draw everything twice.
+        """
+        title, data = plain(about.title), plain(about.data)
         if ".svg" in path.suffixes:  # of a file that is not yet in its place, too
             drawn = io.StringIO()
-            metadata = {"Date": None, "Creator": None, "Rights": about.data, "Title": about.title}
-            self.savefig(drawn, format="svg", metadata=metadata)
+            metadata = {"Date": None, "Creator": None, "Rights": data, "Title": title}
+            canvas: Any = FigureCanvasSVG(self)  # whose printing has no types
+            canvas.print_svg(drawn, metadata=metadata)
             path.write_text(_rounded(drawn.getvalue()), encoding="utf-8")
         else:
-            self.savefig(path, format="png", metadata={"Title": about.title, "Copyright": about.data, "Software": None})
+            canvas = FigureCanvasAgg(self)
+            canvas.print_png(path, metadata={"Title": title, "Copyright": data, "Software": None})
 
     def savefig(self, fname: Any, **options: Any) -> None:  # noqa: ANN401 - as the figure's own
         """Write the figure; each entry of its metadata is one line."""

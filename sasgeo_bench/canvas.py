@@ -222,7 +222,7 @@ def _broken(text: str, width_inches: float, points: float) -> str:
     'one two\nthree'
     """
     letters = max(1, int(width_inches * _LETTERS / points))
-    return "\n".join(textwrap.fill(line, letters) for line in text.split("\n"))
+    return "\n".join(textwrap.fill(line, letters, break_on_hyphens=False) for line in text.split("\n"))
 
 
 def _keys_across(names: Sequence[str], width_inches: float) -> int:

@@ -7,8 +7,11 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -16,6 +19,7 @@ from hypothesis import HealthCheck, settings
 
 from sasgeo_bench import cli, progress
 from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.publishing import archive
 from sasgeo_bench.regions.build import build_region, plan_build
@@ -211,6 +215,20 @@ def without_drawings() -> Iterator[None]:
         for maker in (pipeline, archive):
             for name in ("figures_extra", "pictures_extra"):
                 patch.setattr(maker, name, lambda *_, **__: Extra())
+        yield
+
+
+@pytest.fixture(scope="module")
+def few_figures() -> Iterator[None]:
+    """Boards of pipelines and of the program have two of their figures: all are drawn where the test is about them."""
+
+    def few(*about: Any, **more: Any) -> Extra:
+        extra = figures_extra(*about, **more)
+        return replace(extra, figures=dict(islice(extra.figures.items(), 2)))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for maker in (pipeline, archive):
+            patch.setattr(maker, "figures_extra", few)
         yield
 
 

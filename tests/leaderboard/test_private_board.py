@@ -31,6 +31,8 @@ from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.scoring.test_tables import scores
 
+pytestmark = pytest.mark.usefixtures("few_figures")
+
 SEED = PrivateSeed("0f1e2d3c4b5a69788796a5b4c3d2e1f0")
 PIPELINE = {"id": "little", "sha256": "ab" * 32}
 PIPELINE_TEXT = """

@@ -31,6 +31,8 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.query import base_of
 from tests.threaded import threaded
 
+pytestmark = pytest.mark.usefixtures("few_figures")
+
 PIPELINE = """
 id = "kept"
 title = "Kept"

@@ -41,6 +41,8 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
 from tests.threaded import threaded
 
+pytestmark = pytest.mark.usefixtures("few_figures")
+
 CARD = {
     "name": "mine",
     "version": "1",

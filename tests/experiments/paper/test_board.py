@@ -13,7 +13,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded
 
-pytestmark = pytest.mark.usefixtures("in_threads")
+pytestmark = pytest.mark.usefixtures("in_threads", "few_figures")
 
 TEXT = """
 id = "few"

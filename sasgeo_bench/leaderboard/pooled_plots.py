@@ -74,6 +74,7 @@ def _suite_panels(
     )
 
     def dressed(charts: list[list[Axes]]) -> Iterator[tuple[Axes, pd.DataFrame]]:
+        """Yield the panel and rows of each suite; set its title and axis when the caller has drawn."""
         for number, chart in panels(charts, len(suites)):
             mine = rows[rows["suite"] == suites[number]]
             part = mine["stratum"].iloc[0]

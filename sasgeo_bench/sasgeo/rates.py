@@ -121,6 +121,7 @@ def tally(
     """Count the cells of a view against `rings` of the map under it, both of shape (C, rows, cols)."""
 
     def count(state: int) -> NDArray[np.int64]:
+        """Count the cells of a state by ring, shape (C, FAR + 1)."""
         return np.stack(
             [
                 np.bincount(ring[view == state], minlength=NOWHERE + 1)[: FAR + 1]
@@ -219,6 +220,7 @@ def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[n
     start = _to_vector(hand)
 
     def loss(vector: NDArray[np.float64]) -> float:
+        """Return the negative log posterior of the rates, counted in witnesses."""
         mapped, empty = _chances(vector, ages_years)
         chances = np.stack((mapped, 1 - mapped, empty, 1 - empty), axis=1)
         losses = np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS

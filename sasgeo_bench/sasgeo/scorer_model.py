@@ -59,6 +59,7 @@ def fit_scaling(
     owner = np.repeat(np.arange(len(choices)), [len(one) for one in choices])
 
     def loss(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Return the negative log posterior of the logarithms of exponents, and its gradient."""
         exponents = np.exp(logs)
         sums = rows @ exponents
         highest = np.maximum.reduceat(sums, starts)

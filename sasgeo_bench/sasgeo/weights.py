@@ -256,6 +256,7 @@ def stamp_tally(seen: NDArray[np.uint8], under: NDArray[np.uint8], stratum: NDAr
     """
 
     def count(state: int, where: NDArray[np.uint8], index: int) -> NDArray[np.int64]:
+        """Count the cells of a state where an index stands, shape (C,)."""
         return np.asarray(((seen == state) & (where == index)).sum(axis=(1, 2)), dtype=np.int64)
 
     on = np.where(under == 0, stratum, np.uint8(NEVER))

@@ -38,6 +38,7 @@ def dense(
     locks = [Lock() for _ in tiles]
 
     def peaks_of(base: Pose) -> list[tuple[int, _Peaks]]:
+        """Return the peaks of each tile at the turns of one base pose, and keep the highest scores."""
         found = []
         for at, turn, score in votes.scores(base):
             score[~tiles[at].allowed] = _LOW
@@ -79,6 +80,7 @@ class _Votes:
 
     @classmethod
     def of(cls, level: Level, template: Template, tiles: Sequence[Tile], turns: Turns) -> Self:
+        """Transform the windows of all tiles once, padded by the reach of the largest template."""
         step_m, largest = level.grid.cell_size_m, max(base.scale for base in turns.bases)
         half = math.ceil(template.reach_m * largest / step_m) + 1
         shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)

@@ -102,6 +102,7 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
     size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
 
     def view(pose: Pose) -> Evidence:
+        """Return the map at a pose, of the size and classes of the query."""
         return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
 
     at_truth = view(truth.pose)

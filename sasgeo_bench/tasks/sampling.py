@@ -151,6 +151,7 @@ class Drawer:
         )
 
         def share(center_m: tuple[float, float], radius_m: float) -> float:
+            """Return the share of a disc that is mapped, from points on a spiral."""
             row, col = state.grid.to_cells(center_m + radius_m * spiral).T
             inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
             return float(state.known[row[inside], col[inside]].sum()) / _SAMPLES

@@ -153,10 +153,12 @@ class _Look:
     mixed_up: Field
 
     def noise(self, width_m: float, rng: np.random.Generator) -> Field:
+        """Take smooth noise of a width from the pool."""
         return self.pool.take(width_m / self.cell_size_m, rng)
 
     @property
     def is_thin(self) -> bool:
+        """Return whether the class is drawn as lines."""
         return self.name in thin_classes()
 
     def lose(self, rng: np.random.Generator) -> tuple[Mask, Mask | None]:

@@ -86,6 +86,7 @@ def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np
     scale_m = rms_m * np.sqrt(2 / _WAVES)
 
     def shifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (N, 2) moved by the field of waves."""
         angle = points @ waves.T
         return np.asarray(points + scale_m * np.column_stack([np.cos(angle + phase).sum(axis=1) for phase in phases]))
 

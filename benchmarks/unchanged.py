@@ -24,8 +24,8 @@ import pandas as pd
 
 STORED: Final = Path(__file__).parents[1] / "docs" / "results"
 REGIONS: Final = ("town-riverside", "vaduz")
-# What depends on the machine, in the tables of a board: figures of time and memory.
-_MEASURED: Final = r"latency|seconds|_s$|peak|memory|cpu|map_mb|bytes"
+# What depends on the machine or the code, in the tables of a board: figures of time and storage, and the code's hash.
+_MEASURED: Final = r"latency|seconds|_s$|peak|memory|cpu|map_|bytes|^prepare$|^index$|^hash$"
 
 
 def make(out: Path, *, is_quick: bool) -> Iterator[tuple[str, str]]:

@@ -74,8 +74,9 @@ class Failures:
 
     def note(self, name: str, error: Exception) -> None:
         """Record a failure; log the traceback of an error that is not a `SasgeoError`."""
-        line = one_line(str(error))
-        if not isinstance(error, SasgeoError):
+        if isinstance(error, SasgeoError):
+            line = one_line(str(error))
+        else:  # its text may be of a plugin, and fail in turn
             line = f"{message_of(error)} ({self.log.name} says where)"
             write_log(self.log, name, error)
         self.errors.setdefault(name, error)

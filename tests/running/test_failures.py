@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What fails costs its own name alone, whatever its error does; refusals of the disk stop everything."""
+
+import errno
+
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.running.failures import LOG, Failures, log_beside, stops_all
+
+
+class UnspeakableError(RuntimeError):
+    """An error of a plugin whose text cannot be made."""
+
+    def __str__(self):
+        raise RuntimeError
+
+
+def test_an_error_without_a_text_is_recorded_as_any_other(tmp_path):
+    lines = []
+    failures = Failures(tmp_path / LOG, tell=lines.append)
+    with failures.of("mine"):
+        raise UnspeakableError
+    assert failures.found == {"mine": f"UnspeakableError ({LOG} says where)"}
+    assert lines == [f"mine failed: UnspeakableError ({LOG} says where)"]
+    assert "UnspeakableError" in (tmp_path / LOG).read_text(encoding="utf-8")
+
+
+def test_a_named_fault_stands_in_its_own_words_and_once(tmp_path):
+    lines = []
+    failures = Failures(tmp_path / LOG, tell=lines.append)
+    for _ in range(2):
+        with failures.of("mine"):
+            message = "mine: no answers, run again"
+            raise StoreError(message)
+    assert lines == ["mine failed: no answers, run again"] * 2
+    assert not (tmp_path / LOG).exists()
+
+
+def test_a_full_disk_stops_all_and_a_fault_of_one_does_not():
+    full = StoreError("full")
+    full.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    assert stops_all(full)
+    assert not stops_all(ValueError("mine"))
+
+
+def test_the_log_of_a_board_lies_next_to_it(tmp_path):
+    assert log_beside(tmp_path / "board") == tmp_path / "board.failures.log"
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, MemoryError])
+def test_what_stops_everything_is_not_recorded_but_a_lack_of_memory_is(tmp_path, stop):
+    failures = Failures(tmp_path / LOG, tell=lambda _: None)
+    if stop is KeyboardInterrupt:
+        with pytest.raises(stop), failures.of("mine"):
+            raise stop
+        assert failures.found == {}
+    else:
+        with failures.of("mine"):
+            raise stop
+        assert failures.found.keys() == {"mine"}

@@ -114,12 +114,14 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
     scratch = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield scratch
-        _flush(scratch)
-        scratch.rename(path)
+        try:
+            yield scratch
+            _flush(scratch)
+            scratch.rename(path)
+        finally:  # also of an interrupt; once it is renamed there is none
+            with suppress(OSError):
+                scratch.unlink()
     except OSError as error:
-        with suppress(OSError):
-            scratch.unlink()
         message = f"{path} cannot be written ({error.strerror or error}): {mend}"
         raise StoreError(message) from error
 

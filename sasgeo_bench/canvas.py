@@ -105,7 +105,7 @@ class PlainFigure(Figure):
                 x = text.get_position()[0]
                 room = 2 * min(x, 1 - x) * width
             points = float(text.get_fontsize()) * (1.2 if text.get_fontweight() == "bold" else 1.0)
-            text.set(x=x, text=_broken(given, room, points))
+            text.set(x=x, text=broken(given, room, points))
         for item in self.findobj(Text):
             if isinstance(item, Text):
                 item.set_parse_math(False)
@@ -131,7 +131,7 @@ class PlainFigure(Figure):
         return inner
 
     def fit(self, first: Axes, last: Axes, about: Page) -> None:
-        """Set the size of the figure so that each panel of a grid, from `first` to `last`, is as large as asked."""
+        """Set the size of the figure so that each panel, from `first` to `last`, is at least as large as asked."""
         self.arrange()
         box, end = (one.get_position(original=True).transformed(one.figure.transSubfigure) for one in (first, last))
         for text in self._words:
@@ -195,7 +195,7 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
         charts = figure.framed(about).subplots(about.rows, about.columns, squeeze=False)
         yield charts.tolist()
         for chart in charts.flat:
-            chart.set_title(_broken(chart.get_title("left"), wide, 8.0))
+            chart.set_title(broken(chart.get_title("left"), wide, 8.0))
         figure.fit(charts[0, 0], charts[-1, -1], about)
         figure.write(path, about)
 
@@ -215,10 +215,10 @@ def without_ticks(chart: Axes) -> None:
     chart.spines[:].set_visible(True)
 
 
-def _broken(text: str, width_inches: float, points: float) -> str:
-    r"""Break each line of a text where it is wider than that.
+def broken(text: str, width_inches: float, points: float) -> str:
+    r"""Break each line of a text where it is wider than that many inches, in a font of so many points.
 
-    >>> _broken("one two\nthree", 0.5, 8.0)
+    >>> broken("one two\nthree", 0.5, 8.0)
     'one two\nthree'
     """
     letters = max(1, int(width_inches * _LETTERS / points))

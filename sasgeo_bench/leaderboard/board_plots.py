@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from sasgeo_bench.canvas import Page, page, panels
+from sasgeo_bench.canvas import Page, broken, page, panels
 from sasgeo_bench.errors import counted
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.base import Floats
@@ -64,6 +64,7 @@ INTERVALS: Final = (
     "n: queries of each point."
 )
 ACROSS: Final = 4  # panels side by side
+_NAME_INCHES: Final = 2.6  # of a name next to its bar, before it is broken
 HALVES: Final = (0.0, 0.5, 1.0)
 
 
@@ -154,7 +155,7 @@ def _draw_bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
             chart.hlines(at, row["lo"], row["hi"], color="#000000", lw=1.0)
             chart.vlines([row["lo"], row["hi"]], at - 0.18, at + 0.18, color="#000000", lw=1.0)
             chart.text(1.03, at, f"{row['value']:.2f}", fontsize=6.5, va="center")
-    chart.set_yticks(range(len(names)), list(names))
+    chart.set_yticks(range(len(names)), [broken(name, _NAME_INCHES, 8.5) for name in names])
     chart.set_ylim(len(names) - 0.4, -0.6)
     chart.set_xlim(0.0, 1.0)
     chart.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])

@@ -37,7 +37,7 @@ from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 
 # Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
-WORTH: Final = (
+WEIGHT: Final = (
     "weight",
     "weight of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
     1,
@@ -80,7 +80,7 @@ def weights_command(
         name: class_weight_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
         for name, (known, arm) in arms.items()
     }
-    for column, title, factor, digits in (WORTH, *(GAINS if model else ()), INFORMATION):
+    for column, title, factor, digits in (WEIGHT, *(GAINS if model else ()), INFORMATION):
         say(title)
         print_table(_table(side_by_side(tables, column) * factor, digits))
     if place is not None:

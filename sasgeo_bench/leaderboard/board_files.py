@@ -180,7 +180,7 @@ _FINDING: Final = {item.name: item.type for item in fields(Finding)}
 _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
     "leaderboard": {item.name: item.type for item in fields(Row)},
     "contrasts": _FINDING,
-    "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in controls.COLUMNS},
+    "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in controls.FALSIFIER_COLUMNS},
     "controls": {item.name: item.type for item in fields(Verdict)},
     "protection": {name: str if name in _TEXTS else float for name in protection.COLUMNS},
     "scores": {

@@ -44,7 +44,6 @@ MOST_BYTES: Final = 3_000_000  # of all pictures of a board
 _THUMB_CELLS: Final = 1100  # a level of the layers that is not much finer than a thumbnail
 _SHEET_DPI: Final = 72
 _EACH: Final = 4  # cases of one class and matcher
-_CLASSED: Final = ("matcher", "query_id", "failure")  # of a case
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.@+]+")
 
 

@@ -226,9 +226,9 @@ def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
     Raises
     ------
     MatchError
-        If it is not a Match, has more than `top_k` poses, another number of scores, a number out of `bounds.BOUNDS`,
+        If it is not a Match, has more than `top_k` poses, another number of scores, a number out of `texts.BOUNDS`,
         scores out of order, a pose twice or one that is no candidate of a retrieval query, or a diagnostic whose name
-        is no line of at most `bounds.MOST_NAME` characters.
+        is no line of at most `texts.MOST_NAME` characters.
     """
     if not isinstance(match, Match):
         message = f"match() returned {type(match).__name__}, expected sasgeo_bench.matching.matcher.Match"

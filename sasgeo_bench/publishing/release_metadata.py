@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metadata of a release: `croissant.json` with the meaning of every column, and `stac/` for its maps."""
+"""Metadata of a release: `croissant.json` with the meaning of every column, and STAC in `stac/` for maps."""
 
 import datetime as dt
 from collections.abc import Iterator, Mapping
@@ -89,6 +89,7 @@ FEATURE_TEXTS: Final = {
 
 if TYPE_CHECKING:
     import mlcroissant as mlc
+    import pystac
 
 CROISSANT: Final = "croissant.json"
 PARQUET: Final = "application/x-parquet"
@@ -289,9 +290,6 @@ def _type(kind: pa.DataType) -> str:
     """Return Croissant's type of a column."""
     return next((name for is_it, name in _TYPES if is_it(kind)), f"{_SCHEMA_ORG}Text")
 
-
-if TYPE_CHECKING:
-    import pystac
 
 STAC: Final = "stac"
 _COLLECTION: Final = "regions"

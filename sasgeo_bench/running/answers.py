@@ -399,8 +399,8 @@ class _Writer:
 
 def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
     """Return the cost of a process and its map."""
-    is_shut_in = "truth" in worker.isolation
-    isolation = {} if is_shut_in else dict.fromkeys(PROMISES, "trusted code, not shut in")
+    is_described = "truth" in worker.isolation
+    isolation = {} if is_described else dict.fromkeys(PROMISES, "trusted code, not shut in")
     return Cost(
         prepare_s=ready.own_s if ready.own_s is None or ready.seconds is None else min(ready.own_s, ready.seconds),
         index_bytes=ready.grown_bytes,

@@ -3,6 +3,9 @@
 
 Learn-then-Test (Angelopoulos, Bates, Candes, Jordan and Lei, 2021): thresholds are tested in an order that was fixed
 beforehand, each by a p-value that holds for finite numbers of answers. The probabilities need not be calibrated.
+
+Of the protection levels the separation leaves out one class at a time; the conformal multiple of `sigma_m` is fitted in
+`scoring.protection`.
 """
 
 import math

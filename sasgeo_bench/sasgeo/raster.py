@@ -52,7 +52,7 @@ def read_field(
     """Return a map for the search: the degree to which each cell is on a class or near it.
 
     `likeness`, shape (C, FAR + 1), is that of `rates.likeness` or `likeness_by_hand`; `trust`, shape (C, STRATA), that
-    of `edit_age.fit_trust`, 1 without it. Cells have a whole number of map cells a side, of about `cell_size_m`.
+    of `weights.fit_trust`, 1 without it. Cells have a whole number of map cells a side, of about `cell_size_m`.
     """
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)

@@ -32,7 +32,8 @@ class ClassRates:
 
     `hit` and `false_alarm` are the probabilities that a cell is seen as the class where the class is, and where it is
     not; `missing` that the class is on a cell where a map of age 0 lacks it. `vanish_per_year` and `appear_per_year`
-    are the yearly rates of mapped and unmapped cells. `mapped` is the share of cells on which the class is mapped.
+    are the yearly rates at which mapped cells vanish and unmapped ones appear. `mapped` is the share of cells on which
+    the class is mapped.
 
     Raises
     ------
@@ -118,7 +119,10 @@ def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.ui
 def tally(
     classes: tuple[str, ...], seen: NDArray[np.uint8], under: NDArray[np.uint8], *, age_years: float, block: str
 ) -> Tally:
-    """Count the cells of a view against `rings` of the map under it, both of shape (C, rows, cols)."""
+    """Count the cells of a view against `rings` of the map under it, both of shape (C, rows, cols).
+
+    `age_years` is from the map to the view, `block` the place of the view.
+    """
 
     def count(state: int) -> NDArray[np.int64]:
         """Count the cells of a state by ring, shape (C, FAR + 1)."""

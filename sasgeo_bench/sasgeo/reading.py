@@ -185,7 +185,7 @@ def age_years(query: Query, region: Region) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Reader:
-    """A map prepared for one ablation; `model` is the model in the order of its classes."""
+    """A map prepared for one ablation; `model` has the classes of the map, in its order."""
 
     region: Region
     model: ScorerModel

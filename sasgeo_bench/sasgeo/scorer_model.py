@@ -93,7 +93,7 @@ class ScorerModel:
     `likeness`, shape (C, FAR + 1), is that of cells near a class on the map to cells on it; `missed_share`, shape (C,),
     the share of `Gains.missed` for one degree of it. `scaling`, shape (C,), scales the score of each class, since
     neighbouring cells are not independent (`temper` in the file). `trust`, shape (C, STRATA), is that in features by
-    edit age (`edit_age.fit_trust`); `seasons` the visible share of a mapped class, shape (C,), by season; `blend`
+    edit age (`weights.fit_trust`); `seasons` the visible share of a mapped class, shape (C,), by season; `blend`
     weighs the joint score. `views` and `blocks` are the size of the training data, 0 for a model set by hand.
     """
 

@@ -128,7 +128,7 @@ def information(rates: ClassRates, *, age_years: float, persists: float = 1.0) -
 
 
 # Visible share of a mapped class: our guesses, for want of a source; 1 for classes not named.
-HAND: Final[Mapping[str, Mapping[str, float]]] = {
+SEASON_SHARES: Final[Mapping[str, Mapping[str, float]]] = {
     "leaf_on": {"road_minor": 0.8, "path_track": 0.5, "railway": 0.9, "waterway": 0.7, "field_boundary": 0.8},
     "snow": {
         "road_minor": 0.6,
@@ -144,14 +144,14 @@ HAND: Final[Mapping[str, Mapping[str, float]]] = {
     "low_water": {"water": 0.7, "waterway": 0.6, "coastline": 0.8},
     "harvest": {"farmland": 0.5, "field_boundary": 0.9},
 }
-SEASONS: Final = tuple(HAND)
+SEASONS: Final = tuple(SEASON_SHARES)
 _CELLS_PER_WITNESS: Final = 200.0  # as for rates: a house or a piece of road is right or wrong as a whole
 _HAND_WITNESSES: Final = 20.0  # weight of a factor by hand
 
 
 def by_hand(season: str, classes: Sequence[str]) -> NDArray[np.float64]:
     """Return the factors of a season set by hand, shape (C,); 1 for an unknown season."""
-    factors = HAND.get(season, {})
+    factors = SEASON_SHARES.get(season, {})
     return np.array([factors.get(name, 1.0) for name in classes], dtype=np.float64)
 
 

@@ -266,14 +266,14 @@ def _unstressed(frame: pd.DataFrame) -> "pd.Series[bool]":
 
 
 _TOLD: Final = ("first_value", "second_value", "difference", "lo", "hi", "n", "blocks", "first_only", "second_only")
-COLUMNS: Final = ("contrast", "suite", "kind", "first", "second", *_TOLD, "verdict")
+FALSIFIER_COLUMNS: Final = ("contrast", "suite", "kind", "first", "second", *_TOLD, "verdict")
 
 
 def falsifier_frame(found: Sequence[Falsifier]) -> pd.DataFrame:
-    """Return falsifiers as a table with the columns `COLUMNS`."""
+    """Return falsifiers as a table with the columns `FALSIFIER_COLUMNS`."""
     rows = [
         {name: getattr(item.finding, name) for name in ("first", "second", *_TOLD)}
         | {"contrast": item.contrast, "suite": item.suite, "kind": item.kind, "verdict": item.verdict}
         for item in found
     ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(FALSIFIER_COLUMNS))

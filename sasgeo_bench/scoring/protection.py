@@ -155,7 +155,7 @@ def protection_frame(
     """Return how the protection levels of one matcher held, pooled over all suites of localization.
 
     There is a row for each prior group, method, risk and alert limit; none if no answer has a level in its diagnostics
-    (`sasgeo.protection.PROTECTION`). Shares are of all queries: an answer without a level is unavailable, one at an
+    (`sasgeo.conformal.PROTECTION`). Shares are of all queries: an answer without a level is unavailable, one at an
     absent place has an infinite error. Intervals are Wilson's over sites. `supports` states which risk the counts
     support. `split` assigns the places that calibrate conformal levels; of a hold-out split the test part counts.
     """

@@ -46,7 +46,7 @@ class Score:
     is_answered : bool
         There is a fix that could be accepted.
     above, tied, right : int
-        Rank of the right candidate (`ranking.Rank`); 0, 0, 0 for a miss and for localization.
+        Rank of the right candidate (`pose.Rank`); 0, 0, 0 for a miss and for localization.
     position_error_m, yaw_error_deg, log_scale_error : float
         Of the first pose, for localization of a present place; infinite without an answer, else NaN.
     is_right : bool

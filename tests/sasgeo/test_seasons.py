@@ -6,7 +6,7 @@ import pytest
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally
-from sasgeo_bench.sasgeo.weights import HAND, SEASONS, by_hand, fit_season, likelihood_gains
+from sasgeo_bench.sasgeo.weights import SEASON_SHARES, SEASONS, by_hand, fit_season, likelihood_gains
 
 RATES = ClassRates(hit=0.9, false_alarm=0.01, missing=0.01, vanish_per_year=0.03, appear_per_year=0.01, mapped=0.1)
 
@@ -32,7 +32,7 @@ def test_the_true_factor_comes_back(factor):
 
 def test_where_little_was_seen_the_hand_decides():
     (few,) = fit_season("snow", winters(1.0, views=1, cells=20), [RATES])
-    assert few == pytest.approx(HAND["snow"]["path_track"], abs=0.03)
+    assert few == pytest.approx(SEASON_SHARES["snow"]["path_track"], abs=0.03)
 
 
 def test_a_season_that_nobody_tells_changes_nothing():
@@ -44,7 +44,7 @@ def test_a_season_that_nobody_tells_changes_nothing():
 def test_hands_name_classes_that_exist_and_shares():
     names = set(load_taxonomy().names)
     assert set(SEASONS) == {"leaf_on", "snow", "low_water", "harvest"}
-    for factors in HAND.values():
+    for factors in SEASON_SHARES.values():
         assert set(factors) <= names
         assert all(0 < factor < 1 for factor in factors.values())
 

@@ -143,12 +143,13 @@ def draw_bar_panels(
         for number, chart in panels(charts, len(values)):
             mine = rows[rows[column] == values[number]]
             panel_title(chart, values[number], mine.iloc[0])
-            _draw_bars(chart, mine, names)
+            draw_bars(chart, mine, names)
             if number % across:
                 chart.set_yticklabels([])
 
 
-def _draw_bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
+def draw_bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
+    """Draw a bar with its interval for each matcher, the first on top."""
     for at, name in enumerate(names):
         for row in mine[mine["matcher"] == name].to_dict("records"):
             chart.barh(at, row["value"], height=0.72, color=look_of(at).colour, alpha=0.75)

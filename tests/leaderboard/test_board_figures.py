@@ -12,7 +12,7 @@ from sasgeo_bench.canvas import page
 from sasgeo_bench.leaderboard import board_figures
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.board_plots import BoardPage
+from sasgeo_bench.leaderboard.board_plots import BoardPage, draw_bars
 from sasgeo_bench.leaderboard.plot_tables import (
     BEYOND_M,
     MOST_MATCHERS,
@@ -289,3 +289,12 @@ def test_a_contrast_at_one_place_is_that_of_a_board_of_the_place(board, contrast
         assert (one.n, one.blocks) == (alone.n, alone.blocks)
         assert one.difference == pytest.approx(alone.difference)
         assert one.lo <= one.difference <= one.hi
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["m" * 121, "m" * 60 + " " + "m" * 60])
+def test_the_widest_names_leave_room_for_their_bars(tmp_path, name):
+    mine = pd.DataFrame({"matcher": [name, "sasgeo"], "value": [0.3, 0.5], "lo": [0.1, 0.2], "hi": [0.5, 0.8]})
+    with page(tmp_path / "bars.svg", BoardPage(title="Bars", panel_inches=(3.0, 0.8))) as ((chart,),):
+        draw_bars(chart, mine, [name, "sasgeo"])
+    assert chart.bbox.width / chart.get_figure(root=True).dpi > 2.9  # inches

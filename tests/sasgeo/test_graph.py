@@ -12,7 +12,7 @@ from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.sasgeo.graph import GraphScore, verify
+from sasgeo_bench.sasgeo.graph import GraphRules, GraphScore, by_area, by_arms, by_degree, verify
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
@@ -216,3 +216,12 @@ def test_a_bent_view_keeps_its_place_while_its_cells_miss_the_map(town):
         first += found[0].score > max(one.score for one in found[1:])
     assert first >= 4
     assert np.mean(overlaps) < 0.75
+
+
+def test_ratios_favour_what_is_alike_and_say_nothing_of_what_is_unknown():
+    rules = GraphRules()
+    assert by_degree(np.array([3, 3, 3, 0]), np.array([3, 4, 5, 3]), rules).tolist() == [0.4, -1.2, -2.5, 0.0]
+    areas = by_area(np.array([100.0, 100.0, np.nan]), np.array([100.0, 300.0, 50.0]), rules)
+    assert areas.round(1).tolist() == [1.7, -3.0, 0.0]
+    arms = by_arms(np.array([[10.0], [90.0], [np.nan]]), np.array([[0.0, 180.0]] * 3), rules)
+    assert arms.round(1).tolist() == [1.3, -3.0, 0.0]

@@ -21,7 +21,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.tasks.build import check_task, has_truths, make_tasks
+from sasgeo_bench.tasks.build import check_task, has_truths, is_of_region, make_tasks
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.task_files import (
     QUERIES,
@@ -551,3 +551,11 @@ def test_one_query_is_found_by_the_beginning_of_its_id_and_an_unknown_one_is_tol
     assert shown.query.query_id == name
     with pytest.raises(ConfigError, match="holds no query 'zzz'"):
         panels(folder, truth_of(folder), out=tasks, query_id="zzz")
+
+
+@pytest.mark.parametrize(
+    ("name", "is_of_it"),
+    [("vaduz", True), ("vaduz@2015-07-27", True), ("vaduz@2015-07-27+alias", True), ("vaduz-north", False)],
+)
+def test_dates_and_edits_of_a_map_are_of_its_region_and_no_other_one_is(name, is_of_it):
+    assert is_of_region(name, "vaduz") is is_of_it

@@ -17,10 +17,11 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
-from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_means, effective_count, seed_of_text, share_interval
+from sasgeo_bench.scoring.draws import seed_of_text
+from sasgeo_bench.scoring.intervals import BoardDraws, share_interval
 from sasgeo_bench.scoring.metrics import primary_of, ranks_of
 from sasgeo_bench.scoring.pose import Ranks, hits, rank_pose
-from sasgeo_bench.scoring.rejection import SLOW_DRAWS, answers_of
+from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, GROUP, STRESS
@@ -40,12 +41,14 @@ _FIGURE: Final = ("n", "blocks", "value", "lo", "hi")
 
 def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any]]:
     """Return means of columns of values in [0, 1] with intervals as of a board; the same queries share draws."""
-    blocks, sites = (np.unique(rows[name], return_inverse=True)[1] for name in ("block", "pair_id"))
-    drawn = ClusterDraws(blocks=blocks, sites=sites, seed=seed_of_text(text), draws=SLOW_DRAWS)
-    means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.empty((0, table.shape[1]))
-    trials, values = effective_count(sites), table.mean(axis=0)
-    found = [share_interval(float(value), means[:, at], trials)[0] for at, value in enumerate(values)]
-    counts = {"n": len(rows), "blocks": drawn.blocks_count}
+    names = (np.unique(rows[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
+    drawn = BoardDraws.of(*names, seed=seed_of_text(text), draws=SLOW_DRAWS)
+    means = drawn.means(table)
+    found = [
+        share_interval(float(value), (means[0][:, at], means[1][:, at]), drawn.trials)
+        for at, value in enumerate(table.mean(axis=0))
+    ]
+    counts = {"n": len(rows), "blocks": drawn.by_block.units_count}
     return [{**counts, "value": one.value, "lo": one.lo, "hi": one.hi} for one in found]
 
 

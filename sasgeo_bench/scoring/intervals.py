@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Confidence intervals: a bootstrap over blocks and sites, never narrower than Wilson's interval of as many sites.
+"""Confidence intervals: a bootstrap over places, blocks and sites, never narrower than Wilson's interval of the sites.
+
+Places are the unit: blocks of one town share its mappers, its streets and its detector's luck, so a claim about other
+towns is as sure as its towns are many. Intervals over blocks alone stand beside, for the towns that were asked.
 
 Bootstrap intervals are percentile intervals: they keep to the range of the metric, commute with monotone maps, and the
 same draws serve every metric and difference. BCa intervals need an acceleration from leaving out blocks, which is
@@ -9,170 +12,21 @@ Hinkley 1997, Sec. 3.8), by up to sqrt(2) if sites of a block are independent. F
 nothing where all answers are right, so `share_interval` compares them with Wilson's.
 """
 
-import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
+from numpy.typing import ArrayLike
 from statsmodels.stats.proportion import proportion_confint
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Floats, Ints, block_codes, check_column, check_weights, weighted_mean
-
-DRAWS: Final = 10_000
-_CHUNK_CELLS: Final = 2**21  # draws x queries in memory at once: 16 MB per column, about ten columns at most
-
-
-def seed_of_text(text: str) -> int:
-    """Return a seed in [0, 2^64): the first eight bytes of the SHA-256 of a text."""
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClusterDraws:
-    """Draws with replacement: first blocks, then sites within each drawn block, with all their queries.
-
-    Metrics with the same seed, blocks, sites and number of draws share draws. `blocks` holds the block of each of N
-    queries, `sites` the site within its block; by default each query is a site. Queries of a site show one place, so
-    they are drawn together. Without `draws_within`, whole blocks are drawn. A block of n sites that is drawn c times
-    gives c n sites, each drawn from its n. Sample sizes differ between draws if blocks or sites differ in size; means
-    are ratios of sums and account for that. Raise MetricError if the number of draws is not positive, or the numbers of
-    sites and blocks differ.
-
-    Two queries of one site are drawn together:
-
-    >>> drawn = ClusterDraws(blocks=["a", "a", "b"], sites=["p", "p", "q"], seed=1, draws=1000)
-    >>> all((some[:, 0] == some[:, 1]).all() for some in drawn.weights())
-    True
-    """
-
-    blocks: Sequence[str] | Ints
-    seed: int
-    sites: Sequence[str] | Ints | None = None
-    draws: int = DRAWS
-    draws_within: bool = True
-    count: int = field(init=False)  # of queries
-    blocks_count: int = field(init=False)
-    _sites_count: int = field(init=False, repr=False)
-    _site: Ints | None = field(init=False, repr=False)  # site of each query; None if each has its own
-    _sizes: tuple[tuple[int, Ints, Ints], ...] = field(init=False, repr=False)  # size, blocks (K,), sites (K, size)
-
-    def __post_init__(self) -> None:
-        """Group blocks by size, so that drawing takes few vectorized steps."""
-        if self.draws < 1:
-            message = f"draws must be at least 1, got {self.draws!r}"
-            raise MetricError(message)
-        _, block = block_codes(self.blocks, len(self.blocks))
-        site, first_of = _numbered(block, self.sites)
-        sizes, code = block_codes(block[first_of], len(first_of))
-        order = np.argsort(code, kind="stable")
-        first = np.cumsum(sizes) - sizes
-        grouped = []
-        for size in np.unique(sizes):
-            same = np.flatnonzero(sizes == size)
-            grouped.append((int(size), same, order[first[same][:, None] + np.arange(size)]))
-        object.__setattr__(self, "count", len(block))
-        object.__setattr__(self, "_site", None if len(first_of) == len(block) else site)
-        object.__setattr__(self, "_sites_count", len(first_of))
-        object.__setattr__(self, "blocks_count", len(sizes))
-        object.__setattr__(self, "_sizes", tuple(grouped))
-
-    def weights(self) -> Iterator[Floats]:
-        """Yield how often each query is drawn, shape (D, N), in chunks that sum to `draws` rows."""
-        for rows, parts in self._chunks():
-            drawn = np.empty((rows, self._sites_count))
-            for part in parts:
-                drawn[:, part.sites] = part.weights(rows)
-            yield drawn if self._site is None else drawn[:, self._site]
-
-    def sums(self, table: Floats) -> Iterator[Floats]:
-        """Yield the sums of a table's columns, shape (N, M), over the queries of each draw, shape (D, M), in chunks.
-
-        Equals `weights() @ table` up to rounding, but is several times faster: no weights are stored.
-        """
-        if self._site is not None:
-            order = np.argsort(self._site, kind="stable")
-            table = np.add.reduceat(table[order], np.flatnonzero(np.diff(self._site[order], prepend=-1)))
-        for rows, parts in self._chunks():
-            total = np.zeros((rows, table.shape[1]))
-            for part in parts:
-                total += part.picks(rows) @ table[part.sites]
-            yield total
-
-    def _chunks(self) -> Iterator[tuple[int, Iterator["_Picked"]]]:
-        """Yield the number of draws of a chunk, and its picks from the blocks of each size."""
-        rng = np.random.default_rng(self.seed)
-        step = max(1, _CHUNK_CELLS // max(self.count, 1))
-        for begin in range(0, self.draws if self.count else 0, step):
-            rows = min(step, self.draws - begin)
-            yield rows, self._some(rng, rows)
-
-    def _some(self, rng: np.random.Generator, rows: int) -> Iterator["_Picked"]:
-        """Draw blocks, then sites in them."""
-        blocks = self.blocks_count
-        shifted = rng.integers(0, blocks, size=(rows, blocks))
-        shifted += blocks * np.arange(rows)[:, None]
-        times = np.bincount(shifted.ravel(), minlength=rows * blocks).reshape(rows, blocks)
-        for size, which, sites in self._sizes:
-            copies = times[:, which]
-            if size == 1 or not self.draws_within:
-                yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=None)
-                continue
-            # For each draw and block, as many sites are drawn as the block has, times its copies.
-            dtype = np.uint16 if size <= np.iinfo(np.uint16).max else np.uint32
-            within = rng.integers(0, size, size=int(copies.sum()) * size, dtype=dtype)
-            yield _Picked(size=size, sites=sites.ravel(), copies=copies, within=within)
-
-
-def _numbered(block: Ints, sites: Sequence[str] | Ints | None) -> tuple[Ints, Ints]:
-    """Return each query's site by first appearance, shape (N,), and the first query of each site, shape (S,)."""
-    if sites is None:
-        return np.arange(len(block)), np.arange(len(block))
-    _, code = block_codes(sites, len(block))
-    within = block * (1 + int(code.max(initial=0))) + code  # a site in two blocks counts as two
-    _, first, inverse = np.unique(within, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse], np.sort(first)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Picked:
-    """Draws from K blocks of one size.
-
-    `sites`, shape (K * size,), are those of the blocks, one block after the other; `copies`, shape (D, K), counts how
-    often each block is drawn. `within` are the drawn positions in the block, by draw and block; None takes each site as
-    often as its block.
-    """
-
-    size: int
-    sites: Ints
-    copies: Ints
-    within: NDArray[np.integer] | None
-
-    def weights(self, rows: int) -> Floats:
-        """Return how often each site is drawn, shape (D, K * size)."""
-        if self.within is None:
-            return np.repeat(self.copies, self.size, axis=1).astype(np.float64)
-        cells = self.copies.ravel() * self.size
-        flat = np.repeat(np.arange(len(cells)) * self.size, cells) + self.within
-        return np.bincount(flat, minlength=len(cells) * self.size).reshape(rows, -1).astype(np.float64)
-
-    def picks(self, rows: int) -> csr_array | Floats:
-        """Return the same as a sparse table with one entry per drawn site."""
-        if self.within is None and self.size > 1:
-            return self.weights(rows)
-        first = np.arange(self.copies.shape[1], dtype=np.int32) * self.size
-        column = np.repeat(np.tile(first, rows), self.copies.ravel() * self.size)
-        if self.within is not None:
-            column += self.within
-        ends = np.concatenate(([0], np.cumsum(self.copies.sum(axis=1) * self.size)))
-        return csr_array((np.ones(len(column)), column, ends), shape=(rows, len(self.sites)))
-
+from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
 
 LEVEL: Final = 0.95
+_Names = Sequence[str] | Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -298,29 +152,101 @@ def effective_count(groups: Sequence[str] | Ints, weights: ArrayLike | None = No
     return float(mass.sum()) ** 2 / squared if squared > 0 else 0.0
 
 
-def share_interval(value: float, draws: ArrayLike, trials: float) -> tuple[Interval, str]:
-    """Return the 95 % interval of a metric in [0, 1], and how it was found; NaN gives NaN and "".
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardInterval:
+    """A value with its 95 % interval by places and, beside it, by blocks; NaN where unknown.
 
-    `draws`, shape (D,), are its bootstrap draws, empty for a single block; `trials` is the effective number of
-    independent trials, as sites by `effective_count`. The ends are percentiles of the draws, but never inside Wilson's
-    interval. "blocks" means that draws decide both ends, "wilson" that Wilson's lies farther out at one.
+    `how` says which of "places", "blocks" and "wilson" lies farthest out at either end; "" without an interval.
+    """
+
+    value: float
+    lo: float = math.nan
+    hi: float = math.nan
+    lo_blocks: float = math.nan
+    hi_blocks: float = math.nan
+    how: str = ""
+
+    def mapped(self, change: Callable[[float], float], value: float) -> Self:
+        """Return another value with the ends changed by a monotone function."""
+        lo, hi, lo_blocks, hi_blocks = map(change, (self.lo, self.hi, self.lo_blocks, self.hi_blocks))
+        return replace(self, value=value, lo=lo, hi=hi, lo_blocks=lo_blocks, hi_blocks=hi_blocks)
+
+
+def share_interval(value: float, drawn: tuple[ArrayLike, ArrayLike], trials: float) -> BoardInterval:
+    """Return the 95 % intervals of a metric in [0, 1]; NaN for a value of NaN.
+
+    `drawn` are its bootstrap draws over places and over blocks, shape (D,) each, empty for a single one; `trials` is
+    the effective number of independent trials, as sites by `effective_count`. The ends by blocks are percentiles of
+    their draws, but never inside Wilson's interval; those by places are never inside either.
 
     A mean of values in [0, 1] varies at most as much as a proportion, so Wilson's interval of as many sites is wide
-    enough if blocks add no correlation. Draws alone are too narrow for few sites, and a point where all answers are
+    enough if blocks add no correlation. Draws alone are too narrow for few clusters, and a point where all answers are
     right. The wider end keeps the order: a method that is right wherever another one is has both ends at least as high.
 
     Four sites, all found:
 
-    >>> found, how = share_interval(1.0, np.ones(100), 4)
-    >>> round(found.lo, 2), found.hi, how
+    >>> found = share_interval(1.0, (np.ones(100), np.ones(100)), 4)
+    >>> round(found.lo, 2), found.hi, found.how
     (0.51, 1.0, 'wilson')
     """
     if math.isnan(value):
-        return Interval(value=value, lo=value, hi=value), ""
+        return BoardInterval(value=value)
     exact = wilson_share(max(value, 0.0), trials)
-    drawn = percentile_interval(value, draws)
-    ends = Interval(value=value, lo=float(np.fmin(drawn.lo, exact.lo)), hi=float(np.fmax(drawn.hi, exact.hi)))
-    return ends, "blocks" if (ends.lo, ends.hi) == (drawn.lo, drawn.hi) else "wilson"
+    parts = {
+        "places": percentile_interval(value, drawn[0]),
+        "blocks": percentile_interval(value, drawn[1]),
+        "wilson": exact,
+    }
+    lo, hi = float(np.nanmin([one.lo for one in parts.values()])), float(np.nanmax([one.hi for one in parts.values()]))
+    rest = "wilson" if exact.lo == lo or exact.hi == hi else "blocks"
+    return BoardInterval(
+        value=value,
+        lo=lo,
+        hi=hi,
+        lo_blocks=float(np.fmin(parts["blocks"].lo, exact.lo)),
+        hi_blocks=float(np.fmax(parts["blocks"].hi, exact.hi)),
+        how=next((name for name, one in parts.items() if (one.lo, one.hi) == (lo, hi)), rest),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardDraws:
+    """Draws of the same queries by places and, beside them, by blocks; sites are drawn within either.
+
+    `trials` is the effective number of sites, for Wilson's interval.
+
+    >>> rows = {"place": ["a", "a", "b"], "block": ["a/0", "a/1", "b/0"], "site": ["p", "q", "r"]}
+    >>> drawn = BoardDraws.of(rows["place"], rows["block"], rows["site"], seed=1, draws=500)
+    >>> [means.shape for means in drawn.means(np.eye(3))]
+    [(500, 3), (500, 3)]
+    """
+
+    by_place: ClusterDraws
+    by_block: ClusterDraws
+    trials: float
+
+    @classmethod
+    def of(cls, places: _Names, blocks: _Names, sites: _Names, *, seed: int, draws: int = DRAWS) -> Self:
+        """Draw N queries by their places, blocks and sites, shape (N,) each."""
+        by_place = ClusterDraws(places=places, blocks=blocks, sites=sites, seed=seed, draws=draws)
+        by_block = ClusterDraws(blocks=blocks, sites=sites, seed=seed, draws=draws)
+        return cls(by_place=by_place, by_block=by_block, trials=effective_count(sites))
+
+    @property
+    def both(self) -> tuple[ClusterDraws, ClusterDraws]:
+        """Return the draws by places and those by blocks."""
+        return self.by_place, self.by_block
+
+    def means(self, table: ArrayLike, weights: ArrayLike | None = None) -> tuple[Floats, Floats]:
+        """Return `bootstrap_means` by places and by blocks; without rows for a single cluster."""
+        return self.of_both(lambda drawn: bootstrap_means(table, drawn, weights))
+
+    def of_both(self, statistic: Callable[[ClusterDraws], Floats]) -> tuple[Floats, Floats]:
+        """Return a statistic of each draw by places and by blocks; without rows for a single cluster."""
+        first, second = (
+            statistic(one) if one.units_count > 1 else statistic(replace(one, draws=1))[:0] for one in self.both
+        )
+        return first, second
 
 
 def difference_interval(first: Interval, second: Interval) -> Interval:

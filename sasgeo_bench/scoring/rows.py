@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 import pandas as pd
 
 from sasgeo_bench.matching.plugins import YARDSTICK
-from sasgeo_bench.scoring.intervals import Interval
+from sasgeo_bench.scoring.intervals import BoardInterval
 from sasgeo_bench.scoring.metrics import Metric
 from sasgeo_bench.scoring.score import MISSING
 
@@ -79,20 +79,12 @@ class RowKey:
             places=int(scores["place"].nunique()),
         )
 
-    def row(self, metric: Metric, found: Interval, how: str = "", **more: Any) -> "Row":  # noqa: ANN401
+    def row(self, metric: Metric, found: BoardInterval, **more: Any) -> "Row":  # noqa: ANN401
         """Return the row of one metric on these queries; `more` are other fields of a `Row`."""
         key = {field.name: getattr(self, field.name) for field in fields(RowKey)}
-        return Row(
-            **key,
-            metric=metric.name,
-            unit=metric.unit,
-            better=metric.better,
-            value=found.value,
-            lo=found.lo,
-            hi=found.hi,
-            interval="" if math.isnan(found.lo) else how,
-            **more,
-        )
+        ends = {name: getattr(found, name) for name in ("value", "lo", "hi", "lo_blocks", "hi_blocks")}
+        how = "" if math.isnan(found.lo) else found.how
+        return Row(**key, metric=metric.name, unit=metric.unit, better=metric.better, **ends, interval=how, **more)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,14 +96,16 @@ class Row(RowKey):
     metric, unit, better : str
         Definition, see `metrics.Metric`.
     value, lo, hi : float
-        The value and its 95 % interval; NaN if missing.
+        The value and its 95 % interval by places; NaN if missing.
+    lo_blocks, hi_blocks : float
+        Its interval by blocks: of the places that were asked, rather than of places like them.
     interval : str
-        Method of the interval: "blocks" (bootstrap over blocks, then sites), "wilson" (Wilson's over sites lies farther
-        out at one end or both: few sites, or nothing varies), or "".
+        What lies farthest out: "places" (bootstrap over places, then blocks, then sites), "blocks" (over blocks, then
+        sites: few places), "wilson" (Wilson's over sites: few sites, or nothing varies), or "".
     is_applicable : bool
         False if the matcher's card excludes the task; then there is no value.
     rank_best, rank_worst : int
-        Rank interval among the ranked matchers; None for others, and with fewer than `LEAST_BLOCKS` blocks.
+        Rank interval among the ranked matchers; None for others, and with fewer than `LEAST_PLACES` places.
     detectable : float
         Least difference from the best rival that these queries can show (alpha 5 %, power 80 %); NaN without a rank.
     """
@@ -122,6 +116,8 @@ class Row(RowKey):
     value: float
     lo: float = math.nan
     hi: float = math.nan
+    lo_blocks: float = math.nan
+    hi_blocks: float = math.nan
     interval: str = ""
     is_applicable: bool = True
     rank_best: int | None = None
@@ -166,9 +162,9 @@ def is_unranked(matcher: str) -> bool:
     return name in UNRANKED or name.startswith(YARDSTICK)
 
 
-def bare(value: float) -> Interval:
+def bare(value: float) -> BoardInterval:
     """Return a value without an interval."""
-    return Interval(value=value, lo=math.nan, hi=math.nan)
+    return BoardInterval(value=value)
 
 
 def to_frame(rows: list[Row]) -> pd.DataFrame:

@@ -14,21 +14,15 @@ from numpy.typing import ArrayLike
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.progress import Progress
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS, RankInterval, distinguishable, rank_intervals, sensitivity
+from sasgeo_bench.scoring.compare import RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
-from sasgeo_bench.scoring.intervals import (
-    DRAWS,
-    ClusterDraws,
-    Interval,
-    bootstrap_means,
-    effective_count,
-    seed_of_text,
-    share_interval,
-)
+from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, share_interval
 from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, strata
+from sasgeo_bench.scoring.verdicts import LEAST_PLACES
 
 INTERVALS: Final = "intervals of suites"  # what progress is shown of
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
@@ -197,22 +191,38 @@ def _rows_of_group(
 def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
     """Yield rows of means that share a denominator and draws."""
     group, count = cell.group, len(cell.group.names)
-    keys, sites = cell.keys(), group.sites[cell.chosen]
-    trials = effective_count(sites)
+    keys, chosen = cell.keys(), cell.chosen
     below = list(_thresholds(cell, metrics))
-    columns = [group.measured[metric.name][cell.chosen] for metric in metrics]
+    columns = [group.measured[metric.name][chosen] for metric in metrics]
     table = np.column_stack((*columns, *(item.is_below for item in below)))
-    drawn = ClusterDraws(blocks=group.blocks[cell.chosen], sites=sites, seed=cell.seed, draws=cell.draws)
-    means = bootstrap_means(table, drawn) if drawn.blocks_count > 1 else np.full((0, table.shape[1]), np.nan)
+    names = (group.places[chosen], group.blocks[chosen], group.sites[chosen])
+    drawn = BoardDraws.of(*names, seed=cell.seed, draws=cell.draws)
+    means = _Means(table=table, drawn=drawn.means(table), trials=drawn.trials)
     for number, metric in enumerate(metrics):
-        part = slice(number * count, (number + 1) * count)
-        yield from _ranked(cell, keys, metric, table[:, part], means[:, part], trials)
+        yield from _ranked(cell, keys, metric, means.some(slice(number * count, (number + 1) * count)))
     for at, item in enumerate(below, start=len(metrics) * count):
-        found, how = share_interval(item.quantile.share, means[:, at], trials)
-        errors = group.errors[item.quantile.column][cell.chosen, item.matcher]
-        lo, hi = (_inverse(errors, share) for share in (found.lo, found.hi))
-        interval = Interval(value=item.value, lo=lo, hi=hi)
-        yield keys[item.matcher].row(item.quantile, interval, how)
+        errors = group.errors[item.quantile.column][chosen, item.matcher]
+        found = means.interval(at, item.quantile.share).mapped(partial(_inverse, errors), item.value)
+        yield keys[item.matcher].row(item.quantile, found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Means:
+    """Columns of values in [0, 1], shape (N, M), and their means in draws by places and by blocks, shape (D, M)."""
+
+    table: Floats
+    drawn: tuple[Floats, Floats]
+    trials: float
+
+    def some(self, columns: slice) -> Self:
+        """Return some columns."""
+        by_place, by_block = (means[:, columns] for means in self.drawn)
+        return replace(self, table=self.table[:, columns], drawn=(by_place, by_block))
+
+    def interval(self, column: int, value: float) -> BoardInterval:
+        """Return the intervals of one column's mean."""
+        by_place, by_block = (means[:, column] for means in self.drawn)
+        return share_interval(value, (by_place, by_block), self.trials)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,22 +259,19 @@ def _inverse(errors: Floats, share: float) -> float:
     return weighted_quantile(errors, min(share, 1.0)) if share > 0 else 0.0
 
 
-def _ranked(
-    cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, table: Floats, means: Floats, trials: float
-) -> Iterator[Row]:
+def _ranked(cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, means: _Means) -> Iterator[Row]:
     """Yield the rows of one metric, with ranks for the primary one."""
-    names, blocks = cell.group.names, cell.group.blocks[cell.chosen]
-    found = [share_interval(float(table[:, at].mean()), means[:, at], trials) for at in range(len(names))]
-    is_decidable = metric.is_primary and keys[0].blocks >= LEAST_BLOCKS
-    ranks = _ranks(cell.group, [interval.value for interval, _ in found], means, metric) if is_decidable else {}
+    names, places, table = cell.group.names, cell.group.places[cell.chosen], means.table
+    found = [means.interval(at, float(table[:, at].mean())) for at in range(len(names))]
+    is_decidable = metric.is_primary and keys[0].places >= LEAST_PLACES
+    values = [interval.value for interval in found]
+    ranks = _ranks(cell.group, values, means.drawn[0], metric) if is_decidable else {}
     for at, name in enumerate(names):
-        interval, how = found[at]
         rank = ranks.get(name)
-        detectable = _detectable(name, cell.group, table, blocks) if is_decidable else math.nan
+        detectable = _detectable(name, cell.group, table, places) if is_decidable else math.nan
         yield keys[at].row(
             metric,
-            interval,
-            how,
+            found[at],
             rank_best=None if rank is None else rank.best,
             rank_worst=None if rank is None else rank.worst,
             detectable=detectable,
@@ -280,13 +287,13 @@ def _ranks(group: _Group, values: Sequence[float], means: Floats, metric: MeanMe
     return {group.names[at]: rank for at, rank in zip(chosen, rank_intervals(better), strict=True)}
 
 
-def _detectable(name: str, group: _Group, table: Floats, blocks: Ints) -> float:
+def _detectable(name: str, group: _Group, table: Floats, places: Ints) -> float:
     """Return the detectable difference from the best other rival."""
     others = [group.names.index(other) for other in group.rivals if other != name]
     if not others or name not in group.rivals:
         return math.nan
     best = max(others, key=lambda at: float(table[:, at].mean()))
-    return sensitivity(table[:, group.names.index(name)], table[:, best], blocks)
+    return sensitivity(table[:, group.names.index(name)], table[:, best], places)
 
 
 def cost_figures(matcher: str, costs: Costs) -> pd.DataFrame:

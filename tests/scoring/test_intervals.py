@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, bootstrap
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring import intervals
+from sasgeo_bench.scoring import draws
+from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.intervals import (
-    ClusterDraws,
+    BoardDraws,
     Interval,
     bootstrap_means,
     bootstrap_statistic,
@@ -93,7 +94,7 @@ def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch)
     assert bootstrap_means(values, one).tolist() == bootstrap_means(values, same).tolist()
     assert bootstrap_means(values, one).tolist() == bootstrap_means(values, one).tolist()
     assert bootstrap_means(values, one).tolist() != bootstrap_means(values, other).tolist()
-    monkeypatch.setattr(intervals, "_CHUNK_CELLS", 6 * 8)
+    monkeypatch.setattr(draws, "_CHUNK_CELLS", 6 * 8)
     chunks = list(one.weights())
     assert [len(chunk) for chunk in chunks] == [8] * 6 + [2]
     assert not np.array_equal(chunks[0], chunks[1])
@@ -248,17 +249,22 @@ def test_sites_count_by_their_mass() -> None:
 def test_an_interval_is_the_wider_of_both_at_each_end() -> None:
     # z^2 = 3.8415: of 3 in 4 Wilson's is (0.75 + 0.4802 -+ 1.96 sqrt(0.1875 / 4 + 0.0600)) / 1.9604.
     lo, hi = 0.30064, 0.95441
-    few, how = share_interval(0.75, np.array([0.7, 0.75, 0.8]), 4)
-    assert (few.lo, few.hi, how) == (pytest.approx(lo, abs=1e-4), pytest.approx(hi, abs=1e-4), "wilson")
-    apart, how = share_interval(0.75, np.linspace(0.2, 1.0, 1001), 4)
-    assert (apart.lo, apart.hi, how) == (pytest.approx(0.22), pytest.approx(0.98), "blocks")
-    one_sided, how = share_interval(0.75, np.linspace(0.5, 1.0, 1001), 4)
-    assert (one_sided.lo, one_sided.hi, how) == (pytest.approx(lo, abs=1e-4), pytest.approx(0.9875), "wilson")
-    alone, how = share_interval(0.75, [], 4)
-    assert (alone, how) == (wilson(3, 4), "wilson")
-    nothing, how = share_interval(math.nan, [math.nan], 4)
+    narrow, wide = np.array([0.7, 0.75, 0.8]), np.linspace(0.2, 1.0, 1001)
+    few = share_interval(0.75, (narrow, narrow), 4)
+    assert (few.lo, few.hi, few.how) == (pytest.approx(lo, abs=1e-4), pytest.approx(hi, abs=1e-4), "wilson")
+    by_place = share_interval(0.75, (wide, narrow), 4)
+    assert (by_place.lo, by_place.hi, by_place.how) == (pytest.approx(0.22), pytest.approx(0.98), "places")
+    assert (by_place.lo_blocks, by_place.hi_blocks) == (few.lo, few.hi)
+    by_block = share_interval(0.75, (narrow, wide), 4)
+    assert (by_block.lo, by_block.hi, by_block.how) == (by_place.lo, by_place.hi, "blocks")
+    one_sided = share_interval(0.75, (np.linspace(0.5, 1.0, 1001), narrow), 4)
+    assert (one_sided.lo, one_sided.hi) == (pytest.approx(lo, abs=1e-4), pytest.approx(0.9875))
+    assert one_sided.how == "wilson"
+    alone = share_interval(0.75, ([], []), 4)
+    assert (alone.lo, alone.hi, alone.how) == (wilson(3, 4).lo, wilson(3, 4).hi, "wilson")
+    nothing = share_interval(math.nan, ([math.nan], [math.nan]), 4)
     assert math.isnan(nothing.lo)
-    assert how == ""
+    assert nothing.how == ""
 
 
 @given(
@@ -269,9 +275,11 @@ def test_an_interval_is_the_wider_of_both_at_each_end() -> None:
 def test_who_is_right_wherever_another_one_is_has_no_lower_end(sites, seed, shares) -> None:
     lot = np.random.default_rng(seed).random(len(sites))
     table = np.column_stack([lot < share for share in sorted(shares)] + [np.ones(len(sites))]).astype(float)
-    drawn = ClusterDraws(blocks=[str(site % 3) for site in sites], sites=sites, seed=seed, draws=50)
-    means, trials = bootstrap_means(table, drawn), effective_count(sites)
-    ends = [share_interval(float(table[:, at].mean()), means[:, at], trials)[0] for at in range(3)]
+    places = [str(site % 2) for site in sites]
+    drawn = BoardDraws.of(places, [str(site % 4) for site in sites], sites, seed=seed, draws=50)
+    means = drawn.means(table)
+    values = table.mean(axis=0)
+    ends = [share_interval(values[at], (means[0][:, at], means[1][:, at]), drawn.trials) for at in range(3)]
     assert sorted(end.lo for end in ends) == [end.lo for end in ends]
     assert sorted(end.hi for end in ends) == [end.hi for end in ends]
 
@@ -280,3 +288,34 @@ def test_a_difference_of_shares_has_both_their_doubts() -> None:
     ours, theirs = Interval(value=0.5, lo=0.2, hi=0.8), Interval(value=0.1, lo=0.0, hi=0.5)
     found = difference_interval(ours, theirs)
     assert (found.value, found.lo, found.hi) == pytest.approx((0.4, 0.4 - 0.5, 0.4 + math.hypot(0.3, 0.1)))
+
+
+# Places
+
+
+@given(
+    places=st.lists(st.integers(0, 4), min_size=1, max_size=12),
+    seed=st.integers(0, 2**40),
+)
+def test_a_draw_takes_as_many_places_as_there_are_and_from_each_as_many_blocks_as_it_has(places, seed) -> None:
+    blocks = np.repeat(np.arange(len(places)), 2)  # two queries a block
+    of_query = np.array(places)[blocks]
+    drawn = ClusterDraws(blocks=blocks, places=of_query, seed=seed, draws=20)
+    weights = np.vstack(list(drawn.weights()))
+    assert drawn.units_count == len(set(places))
+    copies = np.stack([weights[:, of_query == one].sum(axis=1) / (of_query == one).sum() for one in set(places)])
+    assert (copies == np.round(copies)).all()
+    assert (copies.sum(axis=0) == len(set(places))).all()
+    table = np.random.default_rng(6).random((len(blocks), 2))
+    np.testing.assert_allclose(np.vstack(list(drawn.sums(table))), weights @ table, rtol=1e-12)
+
+
+def test_places_that_differ_widen_what_their_blocks_make_narrow() -> None:
+    # Four places of ten blocks, right everywhere in two of them and nowhere in the others.
+    places, blocks = np.repeat(np.arange(4), 10), np.arange(40)
+    hits = (places < 2).astype(float)[:, None]
+    by_place, by_block = BoardDraws.of(places, blocks, blocks, seed=1, draws=2000).means(hits)
+    assert by_place.std() == pytest.approx(0.25, abs=0.02)  # sqrt(1/4 / 4)
+    assert by_block.std() == pytest.approx(0.079, abs=0.02 * 0.4)  # sqrt(1/4 / 40)
+    with pytest.raises(MetricError, match="two places"):
+        ClusterDraws(blocks=["a", "a"], places=["p", "q"], seed=1)

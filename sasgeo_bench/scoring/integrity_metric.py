@@ -92,23 +92,26 @@ def _area(group: Floats, false: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrawnAreas:
-    """`aurc` and `augrc` of D draws, each of shape (D,); NaN for a draw of no queries."""
+    """Areas of D draws, each of shape (D,), by the functions of their names; NaN where a draw has none."""
 
     aurc: Floats
+    e_aurc: Floats
     augrc: Floats
+    auroc: Floats
 
 
 def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
-    """Return `aurc` and `augrc` for each row of weights, shape (D, N); several times faster than one by one.
+    """Return all areas for each row of weights, shape (D, N); several times faster than one by one.
 
     >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 0], is_present=[1, 1])
     >>> found = drawn_areas(some, np.array([[1.0, 1.0], [2.0, 0.0]]))
-    >>> found.aurc.tolist(), found.augrc.tolist()
-    ([0.25, 0.0], [0.125, 0.0])
+    >>> found.aurc.tolist(), found.augrc.tolist(), found.auroc.tolist()
+    ([0.25, 0.0], [0.125, 0.0], [1.0, nan])
     """
     order = np.argsort(answers.tie, kind="stable")
     if not len(order):
-        return DrawnAreas(aurc=np.full(len(weights), np.nan), augrc=np.full(len(weights), np.nan))
+        none = np.full(len(weights), np.nan)
+        return DrawnAreas(aurc=none, e_aurc=none, augrc=none, auroc=none)
     first = np.flatnonzero(np.diff(answers.tie[order], prepend=-1))
     sorted_mass = weights[:, order]
     group, false = sorted_mass, sorted_mass * ~answers.is_right[order]
@@ -116,12 +119,40 @@ def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
         group, false = (np.add.reduceat(each, first, axis=1) for each in (group, false))
     accepted = np.cumsum(group, axis=1)
     total, after = accepted[:, -1], np.cumsum(false, axis=1)
+    wrong = after[:, -1]
     harmonic = np.diff(digamma(accepted + 1.0), axis=1, prepend=digamma(1.0))
     slope = np.divide(false, group, out=np.zeros_like(group), where=group > 0)
     area = (false + (after - false - (accepted - group) * slope) * harmonic).sum(axis=1)
+    least = wrong - (total - wrong) * (digamma(total + 1.0) - digamma(total - wrong + 1.0))
     undetected = (group * (after - false / 2)).sum(axis=1)
     some = np.where(total > 0, total, np.nan)
-    return DrawnAreas(aurc=np.clip(area / some, 0.0, 1.0), augrc=np.asarray(undetected / some**2))
+    aurc_ = np.clip(area / some, 0.0, 1.0)
+    is_given = answers.tie[order][first] < len(answers.steps)  # the last group may hold queries without an answer
+    right, lost = (group - false) * is_given, false * is_given
+    above = np.cumsum(right, axis=1) - right / 2
+    pairs = right.sum(axis=1) * lost.sum(axis=1)
+    return DrawnAreas(
+        aurc=aurc_,
+        e_aurc=np.maximum(aurc_ - least / some, 0.0),
+        augrc=np.asarray(undetected / some**2),
+        auroc=np.asarray((lost * above).sum(axis=1) / np.where(pairs > 0, pairs, np.nan)),
+    )
+
+
+def auroc(answers: Answers, weights: ArrayLike | None = None) -> float:
+    """Return the chance that a right answer is more confident than a false one; ties count half.
+
+    In [0, 1]; NaN without answers of both kinds. Queries without an answer do not count. It does not depend on the
+    share of false answers, so it compares rejectors where that share is large, too.
+
+    Hanley and McNeil, Radiology 1982.
+
+    >>> facts = {"is_answered": [1] * 4, "is_right": [1, 0, 1, 0], "is_present": [1] * 4}
+    >>> auroc(Answers(confidence=[0.9, 0.8, 0.8, 0.1], **facts))
+    0.875
+    """
+    mass = check_weights(weights, len(answers))
+    return float(drawn_areas(answers, mass[None]).auroc[0])
 
 
 def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
@@ -186,6 +217,31 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     return float(np.interp(coverage * total, accepted, wrong) / (coverage * total))
 
 
+def choose_absent_threshold(calibration: Answers, rate: float) -> float:
+    """Return the threshold of largest coverage that accepts at most a share `rate` of the absent calibration places.
+
+    The result is as that of `choose_threshold`; NaN without an absent place. Raise MetricError if the rate is not in
+    [0, 1].
+
+    >>> facts = {"is_answered": [1] * 3, "is_right": [1, 0, 1], "is_present": [1, 0, 1]}
+    >>> choose_absent_threshold(Answers(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
+    0.9
+    """
+    _check_share(rate, "rate")
+    absent = ~calibration.is_present
+    if not absent.any():
+        return math.nan
+    accepted = np.cumsum(np.bincount(calibration.tie, weights=absent, minlength=len(calibration.steps) + 1))[:-1]
+    allowed = np.flatnonzero(accepted / absent.sum() <= rate)
+    return float(calibration.steps[allowed[-1]]) if len(allowed) else math.inf
+
+
+def _check_share(value: float, name: str) -> None:
+    if not 0 <= value <= 1:
+        message = f"{name} must lie in [0, 1], got {value!r}"
+        raise MetricError(message)
+
+
 def choose_threshold(calibration: Answers, risk: float) -> float:
     """Return the threshold of largest coverage whose risk on calibration blocks is at most `risk`.
 
@@ -197,9 +253,7 @@ def choose_threshold(calibration: Answers, risk: float) -> float:
     >>> choose_threshold(Answers(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
     0.8
     """
-    if not 0 <= risk <= 1:
-        message = f"risk must lie in [0, 1], got {risk!r}"
-        raise MetricError(message)
+    _check_share(risk, "risk")
     curve = risk_coverage(calibration)
     allowed = np.flatnonzero(curve.risk <= risk)
     return float(curve.threshold[allowed[-1]]) if len(allowed) else math.inf

@@ -15,10 +15,11 @@ import pandas as pd
 from sasgeo_bench.scoring import cost
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.decisions import COST_RATIOS, brier, calibration_error, decision_cost
-from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc, false_fix_rate
+from sasgeo_bench.scoring.integrity_metric import augrc, aurc, auroc, excess_aurc, false_fix_rate
 from sasgeo_bench.scoring.pose import PoseErrors, Ranks, area_values, hits, reciprocal_ranks, successes
 
 RISKS: Final = (0.01, 0.05)  # of a false fix among accepted answers; thresholds are chosen for them
+ABSENT_RATES: Final = (0.01, 0.05)  # of absent places that are accepted; thresholds are chosen for them
 TRACKS: Final = ("localization", "retrieval")
 SUCCESS_M: Final = (25.0, 10.0, 5.0)
 RECALL_AT: Final = (1, 5)
@@ -84,10 +85,21 @@ class RejectionMetric(Metric):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThresholdMetric(Metric):
-    """A share of queries at the threshold that kept false fixes at `risk` on calibration places."""
+    """A share of queries at a threshold chosen on calibration places.
 
-    risk: float
-    is_of_accepted: bool
+    The threshold kept the false fixes among the accepted ones at `limit`, or, if it `is_of_absent`, the accepted ones
+    among absent places. `what` is the share: of all queries that are "covered", of the accepted ones that are false
+    ("risk"), of the present places whose fix is right and accepted ("right"), or of the "absent" ones accepted.
+    """
+
+    limit: float
+    what: Literal["covered", "risk", "right", "absent"]
+    is_of_absent: bool = False
+
+    @property
+    def accepted(self) -> str:
+        """Return the column of judged rows with what the threshold accepts."""
+        return f"accepted_absent_{self.limit:g}" if self.is_of_absent else f"accepted_{self.limit:g}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,10 +158,18 @@ FALSE_ABSENT: Final = MeanMetric(
 )
 WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metric
     name="within_25m",
-    meaning="The same as success_25m whatever the heading: what counts as a fix that is not false",
-    source="share of queries within metres",
-    tracks=TRACKS[:1],
-    values=partial(_successes, within_m=SUCCESS_M[0], within_deg=180.0),
+    meaning="Share of queries with a fix within 25 m of the place, whatever the heading and whichever candidate: what "
+    "counts as a fix that is not false",
+    source="the SASGeo paper, Eq. (12)",
+    tracks=TRACKS,
+    values=lambda scores: scores["is_right"].to_numpy(float),
+)
+CEILING: Final = _mean(  # the same for every matcher
+    name="ceiling",
+    meaning="The most that a matcher can expect of the first figure: 1 in k where k places are the same",
+    source="measured by the suite",
+    tracks=TRACKS,
+    values=lambda scores: scores["ceiling"].to_numpy(float),
 )
 CHANCE: Final = _mean(  # the same for every matcher
     name="chance_1",
@@ -171,6 +191,7 @@ _MEANS: Final = (
         for within_m in SUCCESS_M
     ),
     WITHIN,
+    CEILING,
     _mean(
         name="success_auc_50m",
         meaning="Area under the success rate over its tolerance, up to 50 m",
@@ -241,6 +262,15 @@ REJECTION: Final = (
         meaning="AURC less that of the best order of the same answers",
         source="Geifman et al., ICLR 2019; exact for N",
         compute=excess_aurc,
+        has_interval=True,
+    ),
+    RejectionMetric(
+        name="auroc",
+        meaning="Chance that a right fix is surer than a false one; 0.5 for a guess, whatever the share of false ones",
+        source="Hanley and McNeil, Radiology 1982; ties count half",
+        better="higher",
+        compute=auroc,
+        has_interval=True,
     ),
     RejectionMetric(
         name="augrc",
@@ -301,25 +331,39 @@ REJECTION: Final = (
         for ratio in COST_RATIOS
     ),
 )
+_threshold = partial(ThresholdMetric, source="threshold chosen on other places")
+_absent = partial(_threshold, is_of_absent=True)
 THRESHOLDS: Final = tuple(
     metric
-    for risk in RISKS
+    for risk, rate in zip(RISKS, ABSENT_RATES, strict=True)
     for metric in (
-        ThresholdMetric(
+        _threshold(
             name=f"coverage_at_risk_{risk:g}",
             meaning=f"Share of queries accepted by the threshold that kept false fixes at {100 * risk:g} % on "
             "calibration places",
-            source="threshold chosen on other blocks",
             better="higher",
-            risk=risk,
-            is_of_accepted=False,
+            limit=risk,
+            what="covered",
         ),
-        ThresholdMetric(
+        _threshold(
             name=f"risk_reached_at_{risk:g}",
             meaning=f"Share of false fixes among those accepted so, here. Above {risk:g} the promise did not hold",
-            source="threshold chosen on other blocks",
-            risk=risk,
-            is_of_accepted=True,
+            limit=risk,
+            what="risk",
+        ),
+        _absent(
+            name=f"right_at_absent_{rate:g}",
+            meaning=f"Share of present places whose fix is right and accepted, by the threshold that accepted "
+            f"{100 * rate:g} % of the absent calibration places",
+            better="higher",
+            limit=rate,
+            what="right",
+        ),
+        _absent(
+            name=f"absent_reached_at_{rate:g}",
+            meaning=f"Share of absent places accepted so, here. Above {rate:g} the promise did not hold",
+            limit=rate,
+            what="absent",
         ),
     )
 )
@@ -386,7 +430,7 @@ def means_of(track: str) -> tuple[MeanMetric, ...]:
     """Return the metrics of a track that are means over queries.
 
     >>> [metric.name for metric in means_of("retrieval")]
-    ['recall_1', 'recall_5', 'chance_1', 'mrr', 'answered', 'answered_absent']
+    ['within_25m', 'ceiling', 'recall_1', 'recall_5', 'chance_1', 'mrr', 'answered', 'answered_absent']
     """
     return tuple(metric for metric in _MEANS if track in metric.tracks)
 

@@ -4,8 +4,9 @@
 A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,123 +18,16 @@ from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.scoring.base import Bools, Floats, weighted_mean
-from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept, presence_weights
-from sasgeo_bench.scoring.integrity_metric import choose_threshold, drawn_areas
-from sasgeo_bench.scoring.intervals import ClusterDraws, Interval, effective_count, seed_of_text, share_interval
-from sasgeo_bench.scoring.metrics import REJECTION, RISKS, THRESHOLDS, RejectionMetric, ThresholdMetric
-from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, to_frame
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept
+from sasgeo_bench.scoring.integrity_metric import choose_absent_threshold, choose_threshold
+from sasgeo_bench.scoring.metrics import THRESHOLDS
+from sasgeo_bench.scoring.prior_shift import at_share
+from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows, shifted_column
+from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.texts import message_of
-
-AS_DRAWN: Final = "as drawn"
-_CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
-SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
-
-
-def integrity_rows(matcher: str, rejector: str, rows: pd.DataFrame, *, is_calibrated: bool = True) -> Iterator[Row]:
-    """Yield every integrity metric of a matcher with a rejector, from rows of `rejection.judge` or `own_confidence`.
-
-    They cover each suite, track and prior group, and all suites of a track and prior group together. The latter also
-    come with present places reweighted to a share of 0.9, 0.7 and 0.5. Without `is_calibrated`, skip metrics that need
-    probabilities.
-    """
-    names = {"matcher": matcher, "rejector": rejector, "stratum": AS_DRAWN}
-    parts = [
-        (RowKey.of(part, GroupKey(str(suite), str(track), str(prior_group)), **names), part)
-        for (track, prior_group), whole in rows.groupby(["track", "prior_group"], sort=True)
-        for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]
-    ]
-    metrics = [metric for metric in REJECTION if is_calibrated or not metric.needs_chances]
-    yield from in_threads(lambda item: _rows(*item, metrics), parts)
-
-
-def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -> Iterator[Row]:
-    some = answers_of(part)
-    # The seed depends on the queries alone, so that all rejectors share draws.
-    seed = seed_of_text(f"{key.suite}/{key.track}/{key.prior_group}")
-    sites = np.unique(part["pair_id"], return_inverse=True)[1]
-    drawn = ClusterDraws(blocks=part["block"].tolist(), sites=sites, seed=seed, draws=SLOW_DRAWS)
-    is_pooled = key.suite == ALL_SUITES
-    mixtures = dict(mixtures_of(some, is_pooled=is_pooled))
-    areas = _drawn_areas(some, mixtures, drawn) if is_pooled and drawn.blocks_count > 1 else {}
-    shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
-    drawn_shares = iter(_drawn_shares([share for listed in shares.values() for share in listed], drawn))
-    for stratum, mass in mixtures.items():
-        mine, trials = replace(key, stratum=stratum), effective_count(sites, mass)
-        for metric in metrics:
-            value = metric.compute(some, weights=mass)
-            if not (is_pooled and metric.has_interval):
-                yield mine.row(metric, bare(value))
-                continue
-            most = metric.bounds[1]  # an area is a mean risk: scale it to [0, 1] and back
-            area = areas.get((stratum, metric.name), np.empty(0))
-            found, how = share_interval(value / most, area / most, trials)
-            yield mine.row(metric, Interval(value=value, lo=found.lo * most, hi=found.hi * most), how)
-        for share in shares[stratum]:
-            value = weighted_mean(share.counted, share.mass)
-            found, how = share_interval(value, next(drawn_shares), effective_count(sites, share.mass))
-            yield mine.row(share.metric, found, how)
-
-
-def _drawn_areas(
-    answers: Answers, mixtures: Mapping[str, Floats], drawn: ClusterDraws
-) -> Mapping[tuple[str, str], Floats]:
-    """Return every draw of the areas that have intervals, by mixture and name."""
-    found: dict[tuple[str, str], list[Floats]] = {}
-    parts = (part for some in drawn.weights() for part in np.array_split(some, 1 + some.size // _CACHED))
-    for weights in parts:
-        for stratum, mass in mixtures.items():
-            areas = drawn_areas(answers, weights * mass)
-            found.setdefault((stratum, "aurc"), []).append(areas.aurc)
-            found.setdefault((stratum, "augrc"), []).append(areas.augrc)
-    return {key: np.concatenate(listed) for key, listed in found.items()}
-
-
-def mixtures_of(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
-    """Yield names and weights: as drawn, and for pooled suites the declared mixtures of present and absent places."""
-    yield AS_DRAWN, np.ones(len(some))
-    if is_pooled and some.is_present.any() and not some.is_present.all():
-        for share in PRESENT_SHARES:
-            yield f"present {share:g}", presence_weights(some.is_present, share)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Share:
-    """A weighted share of the queries, as the coverage of a threshold; each column has shape (N,)."""
-
-    metric: ThresholdMetric
-    counted: Floats
-    mass: Floats
-
-
-def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
-    """Yield the coverage at thresholds chosen on calibration places, and the risk reached here.
-
-    Skip thresholds that some rows lack: the coverage of the others would not be that of these queries.
-    """
-    is_false = (~part["is_right"].to_numpy(bool)).astype(float)
-    for metric in THRESHOLDS:
-        column = part[f"accepted_{metric.risk:g}"]
-        if not column.isna().any():
-            accepted = column.to_numpy(float)
-            counted, counts = (is_false, mass * accepted) if metric.is_of_accepted else (accepted, mass)
-            yield _Share(metric=metric, counted=counted, mass=counts)
-
-
-def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Floats]:
-    """Yield each share in every draw, with one pass over the draws; NaN where a draw has no weight.
-
-    For fewer than two blocks the draws are empty.
-    """
-    if not shares or drawn.blocks_count < 2:  # noqa: PLR2004 - one block cannot differ from itself
-        yield from (np.empty(0) for _ in shares)
-        return
-    columns = [share.counted * share.mass for share in shares] + [share.mass for share in shares]
-    top, bottom = np.hsplit(np.vstack(list(drawn.sums(np.column_stack(columns)))), 2)
-    yield from np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0).T
-
 
 JUDGED: Final = "rejectors"  # what progress is shown of
 OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
@@ -224,9 +118,7 @@ def judge(
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
-    return _together(
-        frames, [*scores.columns, "p_right", "remark", "is_calibrated", *map(_accepted, RISKS), "is_own_calibration"]
-    )
+    return _together(frames, [*scores.columns, "p_right", "remark", "is_calibrated", *_DECIDED, "is_own_calibration"])
 
 
 def remarks_of(judged: pd.DataFrame) -> list[str]:
@@ -271,16 +163,16 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
         p_right = np.where(group["is_answered"].to_numpy(bool), group["confidence"].to_numpy(float), np.nan)
         if not np.isnan(p_right).all():
             frames.append(_own_of_group(group.assign(p_right=p_right), split, is_taught=is_taught))
-    return _together(frames, [*scores.columns, "p_right", *map(_accepted, RISKS)])
+    return _together(frames, [*scores.columns, "p_right", *_DECIDED])
 
 
 def _own_of_group(group: pd.DataFrame, split: Split | None, *, is_taught: bool) -> pd.DataFrame:
     """Return the tested rows of one track and prior group, with the fixes that thresholds of other places accept."""
-    accepted = {_accepted(risk): np.full(len(group), np.nan) for risk in RISKS}
+    accepted = {name: np.full(len(group), np.nan) for name in _DECIDED}
     for turn in () if split is None else turns(group, split, is_taught=is_taught):
         known = group[turn.calibration]
         if known["is_answered"].any():
-            for name, taken in _accepted_rows(known, group[turn.test]).items():
+            for name, taken in _decided(known, group[turn.test]).items():
                 accepted[name][turn.test] = taken
     group = group.assign(**accepted)
     is_holdout = split is not None and split.spec.kind == "holdout"
@@ -291,23 +183,42 @@ def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.Data
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
 
 
-def _accepted(risk: float) -> str:
-    return f"accepted_{risk:g}"
-
-
 def _judged(
     test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
 ) -> pd.DataFrame:
     p_false, remark = _fit_and_apply(make, calibration, test, predictions)
     asked = test.assign(p_right=1.0 - p_false, remark=remark, is_calibrated=make().card.is_calibrated)
     known = calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
-    return asked.assign(**_accepted_rows(known, asked))
+    return asked.assign(**_decided(known, asked))
 
 
-def _accepted_rows(known: pd.DataFrame, asked: pd.DataFrame) -> dict[str, Bools]:
-    """Return which fixes the thresholds chosen on some rows accept, by column name."""
+# What is decided about rows from the calibration places: acceptance by each threshold, chances at each declared share.
+_DECIDED: Final = (*dict.fromkeys(metric.accepted for metric in THRESHOLDS), *map(shifted_column, PRESENT_SHARES))
+
+
+def _decided(known: pd.DataFrame, asked: pd.DataFrame) -> dict[str, Floats]:
+    """Return the fixes that thresholds chosen on some rows accept, and chances at declared shares, by column name.
+
+    NaN where a threshold or a share needs absent places and the calibration has none.
+    """
     calibration, test = answers_of(known), answers_of(asked)
-    return {_accepted(risk): accept(test, choose_threshold(calibration, risk)) for risk in RISKS}
+    found = {}
+    for metric in THRESHOLDS:
+        choose = choose_absent_threshold if metric.is_of_absent else choose_threshold
+        threshold = choose(calibration, metric.limit)
+        taken = accept(test, threshold).astype(float)
+        found[metric.accepted] = np.full(len(test), np.nan) if math.isnan(threshold) else taken
+    are_chances = _are_chances(calibration) and _are_chances(test)
+    for share in PRESENT_SHARES:
+        nothing = np.full(len(test), np.nan)
+        found[shifted_column(share)] = at_share(calibration, share, test.confidence) if are_chances else nothing
+    return found
+
+
+def _are_chances(answers: Answers) -> bool:
+    """Return whether all confidences lie in [0, 1]; a margin is only an order."""
+    given = answers.confidence[~np.isnan(answers.confidence)]
+    return bool(((given >= 0) & (given <= 1)).all())
 
 
 def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
@@ -346,16 +257,6 @@ def _fit_and_apply(
 
 def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Sequence[Prediction]:
     return [predictions[name] for name in rows["query_id"]]
-
-
-def answers_of(judged: pd.DataFrame) -> Answers:
-    """Return rows of `judge` as `decisions.Answers`."""
-    return Answers(
-        confidence=judged["p_right"].to_numpy(float),
-        is_answered=judged["is_answered"].to_numpy(bool),
-        is_right=judged["is_right"].to_numpy(bool),
-        is_present=judged["is_present"].to_numpy(bool),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

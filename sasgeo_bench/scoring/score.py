@@ -13,9 +13,9 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.pose import MISS, Rank, first_pose, pose_errors, rank_candidate, rank_of
-from sasgeo_bench.tasks.query import Head, Truth, base_of
+from sasgeo_bench.tasks.query import CEILING, COPIES, Head, Truth, base_of
 
-SCORER_VERSION: Final = 4  # raise it if the same predictions get other scores; a board has one version
+SCORER_VERSION: Final = 5  # raise it if the same predictions get other scores; a board has one version
 FIX_M: Final = 25.0  # mission tolerance e_max of Eq. 12: a fix beyond it is false, on both tracks
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"
@@ -43,6 +43,9 @@ class Score:
     status : str
         Of the prediction, or "missing". "not applicable" must cover all queries of a suite, track and prior group, so
         that a submission cannot choose its queries.
+    ceiling : float
+        The most that any matcher can expect of the primary metric: 0 for an absent place, 1 in k where k places are the
+        same, else 1.
     is_answered : bool
         There is a fix that could be accepted.
     above, tied, right : int
@@ -82,6 +85,7 @@ class Score:
     scene: str
     is_present: bool
     status: str
+    ceiling: float
     is_answered: bool
     above: int
     tied: int
@@ -158,6 +162,7 @@ def _score(
         place=place_of.get(truth.block, base),
         pool=len(head.candidates),
         status=MISSING if prediction is None else prediction.status,
+        ceiling=ceiling_of(truth),
         is_answered=first_pose(prediction) is not None,
         above=rank.above,
         tied=rank.tied,
@@ -169,6 +174,18 @@ def _score(
         confidence=math.nan if prediction is None or prediction.confidence is None else prediction.confidence,
         latency_s=math.nan if prediction is None or prediction.latency_s is None else prediction.latency_s,
     )
+
+
+def ceiling_of(truth: Truth) -> float:
+    """Return the most that a matcher can expect of the primary metric at a query, in [0, 1].
+
+    Suites measure it where copies of a place leave nothing to tell them by. Tasks of version 1 and 2 only count the
+    copies among the candidates of `alias`.
+    """
+    if not truth.is_present:
+        return 0.0
+    copies = truth.measured.get(COPIES, 0.0)
+    return truth.measured.get(CEILING, 1.0 / (1.0 + copies))
 
 
 def _rank(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:

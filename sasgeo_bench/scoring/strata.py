@@ -67,6 +67,24 @@ def control_name(view_cells: int) -> str:
     return f"{CONTROL}, {view_cells} cells"
 
 
+def is_step(stratum: str) -> bool:
+    """Return whether a stratum is a step of a ladder, or the controls of one size of view, and not a kind.
+
+    >>> is_step("G1 5, 96 cells"), is_step("control, 96 cells"), is_step("G1")
+    (True, True, False)
+    """
+    return stratum.endswith(" cells")
+
+
+def is_bin(stratum: str) -> bool:
+    """Return whether a stratum is a bin of a measured property.
+
+    >>> is_bin("alias_index 0.7-0.8"), is_bin("S1")
+    (True, False)
+    """
+    return stratum.split(" ", maxsplit=1)[0] in _EDGES
+
+
 def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:
     """Yield bins of measured properties, without the controls."""
     is_mapping = (

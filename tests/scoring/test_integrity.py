@@ -8,14 +8,22 @@ import pytest
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.scoring.decisions import COST_RATIOS
+from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.integrity_metric import aurc
-from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_statistic, percentile_interval, wilson
-from sasgeo_bench.scoring.rejection import OWN, answers_of, integrity_rows, own_confidence, turns, why_not
+from sasgeo_bench.scoring.intervals import bootstrap_statistic, percentile_interval, wilson
+from sasgeo_bench.scoring.rejection import OWN, own_confidence, turns, why_not
+from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.tasks.split import SplitFile, make_split
-from tests.scoring.test_tables import scores
+from tests.scoring.test_tables import scores as one_place_a_block
 
 ERRORS = np.where(np.arange(120) % 3 > 0, 1.0, 99.0)  # two of three are right
+
+
+def scores(errors_m, **changes):
+    """Rows of two places by turns, unless other places are given."""
+    table = one_place_a_block(errors_m, **changes)
+    return table if "place" in changes else table.assign(place=[f"place{at % 2}" for at in range(len(table))])
 
 
 def rows_of(table, split=None):

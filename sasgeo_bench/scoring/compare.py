@@ -8,16 +8,18 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2, norm
+from scipy.stats import chi2, norm, permutation_test
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, block_codes, check_column
+from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.integrity_metric import drawn_areas
 from sasgeo_bench.scoring.intervals import LEVEL
 
-# With fewer blocks there are no ranks and no decisions: an exact sign test cannot reach 5 %, since 2 / 2^5 > 5 %.
-LEAST_BLOCKS: Final = 6
+_FLIPS: Final = 2**18  # of signs, at most: exact up to 18 places
+_SWAPS: Final = 1999  # of sides at places, where each takes a sort
 _NOTHING: Final = 1e-12  # a smaller difference or spread is a rounding error
 
 
@@ -89,6 +91,80 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
         p_value = float(chi2.sf(statistic, 1))
     gained, lost = int((ours & ~theirs).sum()), int((~ours & theirs).sum())
     return PairedTest(first_only=gained, second_only=lost, p_value=p_value)
+
+
+def sign_flip(sums: Floats) -> float:
+    """Return the two-sided p-value of the sign-flip test over places; NaN for fewer than two.
+
+    `sums`, shape (K,), are the sums of the differences of two methods in each place. If the methods are equally good,
+    either could have had the other's answers in all of a place, so each sum could as well have the other sign. The
+    p-value is the share of all 2^K choices of signs, or of 2^18 random ones, whose sum is as far from 0.
+
+    Fisher, The Design of Experiments, 1935; as a test over clusters Canay, Romano and Shaikh, Econometrica 2017.
+
+    Six places that all favour the first:
+
+    >>> sign_flip(np.array([1.0, 2.0, 1.0, 3.0, 1.0, 1.0]))  # 2 / 2^6
+    0.03125
+    """
+    if len(sums) < 2:  # noqa: PLR2004 - one place cannot differ from itself
+        return math.nan
+    if not sums.any():
+        return 1.0
+    found = permutation_test(
+        (sums,),
+        lambda values, axis: values.sum(axis=axis),
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=_FLIPS,
+        batch=2**14,
+        rng=np.random.default_rng(0),
+    )
+    return min(float(found.pvalue), 1.0)
+
+
+def areas(answers: Answers, weights: Floats, name: str) -> Floats:
+    """Return one of `integrity_metric.DrawnAreas` for each row of weights, shape (D,)."""
+    found: Floats = getattr(drawn_areas(answers, weights), name)
+    return found
+
+
+def swap_places(first: Answers, second: Answers, place: Ints, name: str) -> float:
+    """Return the p-value of swapping two sides at random places, for an area, which is no sum over places.
+
+    `first` and `second` are answers to the same N queries, `place` the number of the place of each, shape (N,), `name`
+    the area. As `sign_flip`, but with all of a place swapped; NaN for fewer than two places. Confidences become ranks
+    among the side's own answers, so that both sides share one scale; this changes no area.
+    """
+    count = int(place.max(initial=-1)) + 1
+    if count < 2:  # noqa: PLR2004 - one place cannot differ from itself
+        return math.nan
+    both = _stacked(first, second)
+    swapped = np.random.default_rng(0).random((_SWAPS, count))[:, place] < 0.5  # noqa: PLR2004 - a fair coin
+    swapped = np.vstack((np.zeros(len(place), dtype=bool), swapped))
+    gaps = np.concatenate(
+        [
+            areas(both, np.hstack((~part, part)).astype(float), name)
+            - areas(both, np.hstack((part, ~part)).astype(float), name)
+            for part in np.array_split(swapped, 16)
+        ]
+    )
+    return float((np.abs(gaps) >= abs(gaps[0]) - _NOTHING).mean())
+
+
+def _stacked(first: Answers, second: Answers) -> Answers:
+    """Return the answers of both sides one after the other, with ranks for confidences."""
+    ranks = []
+    for answers in (first, second):
+        sizes = np.bincount(answers.tie, minlength=len(answers.steps) + 1)
+        middle = np.cumsum(sizes) - sizes / 2
+        ranks.append(np.where(np.isnan(answers.confidence), np.nan, -middle[answers.tie]))
+    return Answers(
+        confidence=np.concatenate(ranks),
+        is_answered=np.concatenate((first.is_answered, second.is_answered)),
+        is_right=np.concatenate((first.is_right, second.is_right)),
+        is_present=np.concatenate((first.is_present, second.is_present)),
+    )
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:

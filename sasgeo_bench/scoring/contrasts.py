@@ -3,44 +3,52 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS, holm, mcnemar_clustered, mcnemar_exact, sensitivity
-from sasgeo_bench.scoring.integrity_metric import aurc, drawn_areas
-from sasgeo_bench.scoring.intervals import (
-    DRAWS,
-    ClusterDraws,
-    Interval,
-    bootstrap_statistic,
-    difference_interval,
-    effective_count,
-    mean_interval,
-    percentile_interval,
-    seed_of_text,
-    wilson_share,
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.compare import (
+    areas,
+    holm,
+    mcnemar_clustered,
+    mcnemar_exact,
+    sensitivity,
+    sign_flip,
+    swap_places,
 )
-from sasgeo_bench.scoring.metrics import primary_of
-from sasgeo_bench.scoring.rejection import SLOW_DRAWS, answers_of
+from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
+from sasgeo_bench.scoring.integrity_metric import aurc, auroc, excess_aurc
+from sasgeo_bench.scoring.intervals import BoardDraws, Interval, difference_interval, percentile_interval, wilson_share
+from sasgeo_bench.scoring.metrics import THRESHOLDS, primary_of
+from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
+from sasgeo_bench.scoring.verdicts import COLUMNS, LEAST_PLACES, OF_MATCHERS, ContrastMetric, Finding
 
-ALPHA: Final = 0.05
-LESS_THAN_MATTERS: Final = ", by less than would matter"  # suffix of a verdict
+PRIMARY: Final = "primary"
+INTERACTION: Final = "interaction"
+AREAS: Final = {"aurc": aurc, "e_aurc": excess_aurc, "auroc": auroc}
+ACCEPTED: Final = {metric.name: metric.accepted for metric in THRESHOLDS if metric.what == "right"}
+_RELATIVE: Final = frozenset({"aurc", "e_aurc"})  # their least difference is a share of the second side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contrast:
     """Two methods and the queries they are compared on, as a pipeline file registers it.
 
-    The difference is `first` less `second`: matchers, or for the metric "aurc" each "matcher x rejector". The queries
-    are those of `suites`, pooled, on one track; `kinds` are prefixes of the kinds that count, as in "U2", all if empty.
-    The metric is "primary", success or recall at 1 on present places, or "aurc", the area under the risk-coverage curve
-    on all places. `min_effect` is the least relevant difference: of fractions, or for "aurc" relative to the second
-    method.
+    The difference is `first` less `second`: matchers, or for metrics of rejectors each "matcher x rejector". The
+    queries are those of `suites`, pooled, on one track; `kinds` are prefixes of the kinds that count, as in "U2", all
+    if empty.
+
+    The metric is "primary", success or recall at 1 on present places under stress; "interaction", the same less what
+    the method reaches on the control of the same site and view, so that the difference is what the stress adds to the
+    difference; or of rejectors, on all places: "e_aurc", the area under the risk-coverage curve above that of a perfect
+    order; "auroc", the chance that a right answer is surer than a false one; "right_at_absent_0.05", the share of
+    present places that are rightly accepted where 5 % of the absent ones are; "aurc", the whole area, of which a
+    perfect order has much where many answers are false. `min_effect` is the least relevant difference: of fractions,
+    or for "aurc" and "e_aurc" relative to the second method.
     """
 
     name: str
@@ -48,45 +56,9 @@ class Contrast:
     second: str
     suites: tuple[str, ...]
     kinds: tuple[str, ...] = ()
-    metric: str = "primary"
+    metric: ContrastMetric = "primary"
     track: str = "localization"
     min_effect: float = 0.03
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
-    """Result of a contrast.
-
-    The difference is first less second, `lo` and `hi` its paired 95 % interval; NaN without draws. Fewer than
-    `LEAST_BLOCKS` blocks decide nothing. `first_only` and `second_only` are the discordant queries; 0 for "aurc".
-    `p_exact` is from McNemar's exact test, which assumes independent queries, `p_clustered` from Obuchowski's for
-    blocks, and `p_holm` is the latter adjusted by Holm over all registered contrasts. For "aurc" twice the fraction of
-    draws on the other side of zero replaces Obuchowski's. `detectable` is the least difference that these queries can
-    show; NaN for "aurc" and for too few blocks.
-    """
-
-    name: str
-    first: str
-    second: str
-    metric: str
-    n: int
-    blocks: int
-    first_value: float
-    second_value: float
-    difference: float
-    lo: float
-    hi: float
-    first_only: int
-    second_only: int
-    p_exact: float
-    p_clustered: float
-    p_holm: float
-    detectable: float
-    min_effect: float
-    verdict: str
-
-
-COLUMNS: Final = tuple(field.name for field in fields(Finding))
 
 
 def hold_contrasts(
@@ -108,11 +80,11 @@ def hold_contrasts(
     found = [
         _tested(contrast, scores, rejections, draws)
         if not failed or {contrast.first, contrast.second} <= there
-        else replace(_nothing(contrast), verdict=_undecided(contrast, there, failed))
+        else replace(_nothing(contrast), note=_undecided(contrast, there, failed))
         for contrast in contrasts
     ]
-    adjusted = holm({item.name: 1.0 if math.isnan(item.p_clustered) else item.p_clustered for item in found})
-    return tuple(_with_verdict(replace(item, p_holm=adjusted[item.name])) for item in found)
+    adjusted = holm({item.name: 1.0 if math.isnan(item.p_places) else item.p_places for item in found})
+    return tuple(replace(item, p_holm=adjusted[item.name]) for item in found)
 
 
 def _undecided(contrast: Contrast, there: Collection[str], failed: Collection[str]) -> str:
@@ -129,17 +101,20 @@ def _tested(
     draws: int,
 ) -> Finding:
     first, second = _pair(contrast, scores, rejections)
-    if first.empty:
-        return _nothing(contrast)
-    is_mean = contrast.metric == "primary"
-    return mean_finding(contrast, first, second, draws) if is_mean else _areas(contrast, first, second)
+    if contrast.metric in AREAS:
+        return _area_finding(contrast, first, second) if len(first) else _nothing(contrast)
+    if contrast.metric == INTERACTION:
+        sides = _less_control(contrast, scores, first, second)
+        return _value_finding(contrast, first[sides.is_counted], sides, draws)
+    return mean_finding(contrast, first, second, draws)
 
 
 def _pair(
     contrast: Contrast, scores: Mapping[str, pd.DataFrame], rejections: Mapping[tuple[str, str], pd.DataFrame]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of both sides for the same queries in the same order."""
-    known = scores if contrast.metric == "primary" else {" x ".join(key): rows for key, rows in rejections.items()}
+    is_of_rejectors = contrast.metric not in OF_MATCHERS
+    known = {" x ".join(key): rows for key, rows in rejections.items()} if is_of_rejectors else scores
     return both_on(contrast, known, _counted(contrast))
 
 
@@ -184,32 +159,31 @@ def by_place(
 ) -> tuple[PlaceDifference, ...]:
     """Return the difference of a contrast at each place, by name; exploratory, not part of the registered test.
 
-    Parameters and errors are those of `hold_contrasts`; draws are resampled within each place.
+    Parameters and errors are those of `hold_contrasts`; blocks are resampled within each place.
     """
     first, second = _pair(contrast, scores, rejections)
     places = first["place"].to_numpy(str)
     return tuple(
-        _at_place(contrast, first[places == place], second[places == place], str(place), draws)
+        _at_place(contrast, scores, (first[places == place], second[places == place]), draws)
         for place in np.unique(places)
     )
 
 
-def _at_place(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, place: str, draws: int) -> PlaceDifference:
-    drawn = _drawn(contrast, first, draws)
-    if contrast.metric == "primary":
-        interval = _mean_interval(*_hits(contrast, first, second), drawn)
+def _at_place(
+    contrast: Contrast, scores: Mapping[str, pd.DataFrame], rows: tuple[pd.DataFrame, pd.DataFrame], draws: int
+) -> PlaceDifference:
+    if contrast.metric in AREAS:
+        found = _area_finding(contrast, *rows)
     else:
-        both = [answers_of(frame) for frame in (first, second)]
-        sides = (aurc(both[0]), aurc(both[1]))
-        areas = [np.concatenate([drawn_areas(some, row).aurc for row in drawn.weights()]) for some in both]
-        interval = _guarded(percentile_interval(sides[0] - sides[1], areas[0] - areas[1]), sides, drawn)
+        sides = _sides(contrast, *rows) if contrast.metric != INTERACTION else _less_control(contrast, scores, *rows)
+        found = _value_finding(contrast, rows[0][sides.is_counted], sides, draws)
     return PlaceDifference(
-        place=place,
-        n=len(first),
-        blocks=drawn.blocks_count,
-        difference=interval.value,
-        lo=interval.lo,
-        hi=interval.hi,
+        place=str(rows[0]["place"].iloc[0]),
+        n=found.n,
+        blocks=found.blocks,
+        difference=found.difference,
+        lo=found.lo_blocks,
+        hi=found.hi_blocks,
     )
 
 
@@ -230,9 +204,11 @@ def _rows_of(
 
 def _counted(contrast: Contrast) -> Callable[[pd.DataFrame], "pd.Series[bool]"]:
     """Return a function that masks the rows a contrast counts: present places under stress, or all but falsifiers."""
-    if contrast.metric == "primary":
-        return lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "stress")
-    return lambda rows: rows["role"] != "falsifier"
+    if contrast.metric in AREAS:
+        return lambda rows: rows["role"] != "falsifier"
+    if contrast.metric in ACCEPTED:
+        return lambda rows: rows["is_present"].astype(bool) & (rows["role"] != "falsifier")
+    return lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "stress")
 
 
 def _nothing(contrast: Contrast) -> Finding:
@@ -241,127 +217,159 @@ def _nothing(contrast: Contrast) -> Finding:
         first=contrast.first,
         second=contrast.second,
         metric=contrast.metric,
-        min_effect=contrast.min_effect,
-        n=0,
-        blocks=0,
-        first_only=0,
-        second_only=0,
-        verdict="",
-        **dict.fromkeys(_NUMBERS, math.nan),
+        least=contrast.min_effect,
+        is_lower_better=contrast.metric in _RELATIVE,
     )
 
 
-_NUMBERS: Final = (
-    *("first_value", "second_value", "difference", "lo", "hi"),
-    *("p_exact", "p_clustered", "p_holm", "detectable"),
-)
+def _drawn(contrast: Contrast, rows: pd.DataFrame, draws: int) -> BoardDraws:
+    names = (rows[name].tolist() for name in ("place", "block", "pair_id"))
+    return BoardDraws.of(*names, seed=seed_of_text(contrast.name), draws=draws)
 
 
-def _drawn(contrast: Contrast, rows: pd.DataFrame, draws: int) -> ClusterDraws:
-    seed = seed_of_text(contrast.name)
-    return ClusterDraws(blocks=rows["block"].tolist(), sites=rows["pair_id"].tolist(), seed=seed, draws=draws)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sides:
+    """Values of both sides per counted query, the best ones the first side could have, shape (N,) each.
+
+    `is_counted` masks the rows of the pair that have a value.
+    """
+
+    ours: Floats
+    theirs: Floats
+    best: Floats
+    is_counted: Bools
 
 
-def _hits(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> tuple[Floats, Floats]:
-    """Return the primary metric of both sides per query, shape (N,) each."""
-    metric = primary_of(contrast.track)
-    return metric.values(first), metric.values(second)
+def _sides(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> _Sides:
+    """Return the primary metric of both sides, or which present places they rightly accept."""
+    every = np.ones(len(first), dtype=bool)
+    if contrast.metric == PRIMARY:
+        metric = primary_of(contrast.track)
+        best: Floats = first["ceiling"].to_numpy(float)
+        return _Sides(ours=metric.values(first), theirs=metric.values(second), best=best, is_counted=every)
+    column = ACCEPTED[contrast.metric]
+    every = (first[column].notna() & second[column].notna()).to_numpy(bool)
+    ours, theirs = (
+        (rows[column].to_numpy(float) * rows["is_right"].to_numpy(float))[every] for rows in (first, second)
+    )
+    return _Sides(ours=ours, theirs=theirs, best=first["is_right"].to_numpy(float)[every], is_counted=every)
 
 
-def _mean_interval(ours: Floats, theirs: Floats, drawn: ClusterDraws) -> Interval:
-    gaps = ours - theirs
-    sides = (float(np.maximum(gaps, 0.0).mean()), float(np.maximum(-gaps, 0.0).mean()))
-    return _guarded(mean_interval(gaps, drawn), sides, drawn)
+def _less_control(
+    contrast: Contrast, scores: Mapping[str, pd.DataFrame], first: pd.DataFrame, second: pd.DataFrame
+) -> _Sides:
+    """Return the primary metric of both sides less that on the control of the same site and size of view."""
+    metric, key = primary_of(contrast.track), ["suite", "pair_id", "view_cells"]
+    controls = both_on(contrast, scores, lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "control"))
+    before = []
+    for rows, control in zip((first, second), controls, strict=True):
+        of_site = pd.Series(metric.values(control), index=pd.MultiIndex.from_frame(control[key]))
+        mean = of_site.groupby(level=key).mean()
+        before.append(mean.reindex(pd.MultiIndex.from_frame(rows[key])).to_numpy(float))
+    is_counted = ~(np.isnan(before[0]) | np.isnan(before[1]))
+    ours, theirs = (
+        (metric.values(rows) - control)[is_counted] for rows, control in zip((first, second), before, strict=True)
+    )
+    best = np.asarray((first["ceiling"].to_numpy(float) - before[0])[is_counted], dtype=np.float64)
+    return _Sides(ours=ours, theirs=theirs, best=best, is_counted=is_counted)
 
 
 def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
-    """Return the finding by success or recall on the same queries in the same order, without a verdict."""
-    ours, theirs = _hits(contrast, first, second)
-    blocks, drawn = first["block"].tolist(), _drawn(contrast, first, draws)
-    interval = _mean_interval(ours, theirs, drawn)
-    won = [(values == 1).astype(float) for values in (ours, theirs)]  # a shared tie is no win
+    """Return the finding by success or recall on the same queries in the same order, without Holm's adjustment."""
+    sides = _sides(contrast, first, second)
+    found = _value_finding(contrast, first[sides.is_counted], sides, draws)
+    if not found.n:
+        return found
+    won = [(values == 1).astype(float) for values in (sides.ours, sides.theirs)]  # a shared tie is no win
+    blocks = first["block"][sides.is_counted].tolist()
     exact, clustered = mcnemar_exact(won[0], won[1]), mcnemar_clustered(won[0], won[1], blocks)
+    places = first["place"][sides.is_counted].tolist()
+    is_enough = found.places >= LEAST_PLACES
     return replace(
-        _nothing(contrast),
-        n=len(ours),
-        blocks=drawn.blocks_count,
-        first_value=float(ours.mean()),
-        second_value=float(theirs.mean()),
-        difference=interval.value,
-        lo=interval.lo,
-        hi=interval.hi,
+        found,
         first_only=exact.first_only,
         second_only=exact.second_only,
         p_exact=exact.p_value,
         p_clustered=clustered.p_value,
-        detectable=sensitivity(ours, theirs, blocks) if drawn.blocks_count >= LEAST_BLOCKS else math.nan,
+        detectable=sensitivity(sides.ours, sides.theirs, places) if is_enough else math.nan,
     )
 
 
-def _areas(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
-    ours, theirs = (answers_of(frame) for frame in (first, second))
+def _value_finding(contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws: int) -> Finding:
+    """Return the finding by means of values; `rows` are those of the counted queries."""
+    if not len(rows):
+        return _nothing(contrast)
+    gaps = sides.ours - sides.theirs
+    drawn = _drawn(contrast, rows, draws)
+    won = (float(np.maximum(gaps, 0.0).mean()), float(np.maximum(-gaps, 0.0).mean()))
+    means = drawn.means(gaps[:, None])
+    place = np.unique(rows["place"], return_inverse=True)[1]
+    found = replace(
+        _nothing(contrast),
+        n=len(gaps),
+        blocks=drawn.by_block.units_count,
+        places=drawn.by_place.units_count,
+        first_value=float(sides.ours.mean()),
+        second_value=float(sides.theirs.mean()),
+        best=float(sides.best.mean()),
+        difference=float(gaps.mean()),
+        first_only=int((gaps > 0).sum()),
+        second_only=int((gaps < 0).sum()),
+        p_places=sign_flip(np.bincount(place, weights=gaps).astype(float)),
+    )
+    return _with_ends(found, (means[0][:, 0], means[1][:, 0]), won, drawn)
+
+
+def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
+    """Return the finding by an area of the answers of both sides."""
+    both = [answers_of(frame) for frame in (first, second)]
+    area = AREAS[contrast.metric]
+    ours, theirs = (area(answers) for answers in both)
     drawn = _drawn(contrast, first, SLOW_DRAWS)
-    values = (aurc(ours), aurc(theirs))
-    draws = (
-        bootstrap_statistic(lambda mass: aurc(ours, mass) - aurc(theirs, mass), drawn)
-        if drawn.blocks_count > 1
-        else np.empty(0)
+    gaps = drawn.of_both(
+        lambda one: np.concatenate(
+            [areas(both[0], row, contrast.metric) - areas(both[1], row, contrast.metric) for row in one.weights()]
+        )
     )
-    interval = _guarded(percentile_interval(values[0] - values[1], draws), values, drawn)
-    return replace(
+    place = np.unique(first["place"], return_inverse=True)[1]
+    is_relative = contrast.metric in _RELATIVE
+    best = {"aurc": aurc(both[0]) - excess_aurc(both[0]), "e_aurc": 0.0, "auroc": 1.0}[contrast.metric]
+    found = replace(
         _nothing(contrast),
         n=len(first),
-        blocks=drawn.blocks_count,
-        first_value=values[0],
-        second_value=values[1],
-        difference=interval.value,
-        lo=interval.lo,
-        hi=interval.hi,
-        p_clustered=_p_of_draws(draws),
+        blocks=drawn.by_block.units_count,
+        places=drawn.by_place.units_count,
+        first_value=ours,
+        second_value=theirs,
+        best=best,
+        difference=ours - theirs,
+        p_places=swap_places(both[0], both[1], place, contrast.metric),
+        least=contrast.min_effect * (abs(theirs) if is_relative else 1.0),
     )
+    return _with_ends(found, gaps, (ours, theirs), drawn)
 
 
-def _guarded(found: Interval, sides: tuple[float, float], drawn: ClusterDraws) -> Interval:
-    """Return an interval no narrower than Wilson's over sites where draws say little: few blocks, or nothing varies.
+def _with_ends(found: Finding, draws: tuple[Floats, Floats], sides: tuple[float, float], drawn: BoardDraws) -> Finding:
+    """Return a finding with the ends of the intervals by places and by blocks; the former are never inside the latter.
 
-    `sides` are two fractions whose difference it is: of queries won and lost, or two areas.
+    Draws say little for few clusters, and nothing where nothing varies: then Wilson's intervals over sites of both
+    `sides`, two fractions whose difference it is (of queries won and lost, or two areas), set the least width.
     """
-    if drawn.blocks_count >= LEAST_BLOCKS and found.lo < found.hi:
-        return found
-    trials = effective_count(drawn.blocks if drawn.sites is None else drawn.sites)
-    won, lost = (wilson_share(side, trials) for side in sides)
-    wide = difference_interval(won, lost)
-    return Interval(value=found.value, lo=float(np.fmin(found.lo, wide.lo)), hi=float(np.fmax(found.hi, wide.hi)))
+    wide = difference_interval(*(wilson_share(side, drawn.trials) for side in sides))
+    both: list[Interval] = []
+    for values, one in zip(draws, drawn.both, strict=True):
+        ends = percentile_interval(found.difference, values)
+        is_enough = one.units_count >= LEAST_PLACES and ends.lo < ends.hi
+        both.append(ends if is_enough else _around(ends, wide))
+    places, blocks = _around(*both), both[1]
+    return replace(found, lo=places.lo, hi=places.hi, lo_blocks=blocks.lo, hi_blocks=blocks.hi)
 
 
-def _p_of_draws(draws: Floats) -> float:
-    """Return twice the share of draws on the rarer side of zero, with one draw added; NaN without draws."""
-    if not len(draws):
-        return math.nan
-    rarer = min(int((draws <= 0).sum()), int((draws >= 0).sum()))
-    return min(1.0, 2 * (rarer + 1) / (len(draws) + 1))
-
-
-def _with_verdict(found: Finding) -> Finding:
-    """Return a finding with its verdict; a null is a result."""
-    is_mean = found.metric == "primary"
-    least = found.min_effect * (1.0 if is_mean else abs(found.second_value))
-    if not found.n:
-        verdict = found.verdict or "not tested: no query"
-    elif found.blocks < LEAST_BLOCKS:
-        verdict = f"not decided: {counted(found.blocks, 'block')}, at least {LEAST_BLOCKS} are needed"
-    elif found.p_holm <= ALPHA and (found.lo > 0 or found.hi < 0):
-        is_better = found.difference > 0 if is_mean else found.difference < 0
-        verdict = f"{found.first if is_better else found.second} is better" + (
-            "" if abs(found.difference) >= least else LESS_THAN_MATTERS
-        )
-    elif -least < found.lo and found.hi < least:
-        verdict = "null: any difference is smaller than would matter"
-    else:
-        verdict = "null: no difference shown, and one that matters is not ruled out"
-    return replace(found, verdict=verdict)
+def _around(first: Interval, second: Interval) -> Interval:
+    """Return the interval around two; NaN counts as inside."""
+    return Interval(value=first.value, lo=float(np.fmin(first.lo, second.lo)), hi=float(np.fmax(first.hi, second.hi)))
 
 
 def contrast_frame(findings: Sequence[Finding]) -> pd.DataFrame:
-    """Return findings as a table with a column per field."""
-    return pd.DataFrame(list(findings), columns=list(COLUMNS))
+    """Return findings as a table with a column per field, and what follows from them."""
+    return pd.DataFrame([item.to_row() for item in findings], columns=list(COLUMNS))

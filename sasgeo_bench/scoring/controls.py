@@ -11,12 +11,12 @@ import pandas as pd
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.scoring.base import Bools, Floats
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS
-from sasgeo_bench.scoring.contrasts import Contrast, Finding, both_on, mean_finding
-from sasgeo_bench.scoring.intervals import DRAWS
+from sasgeo_bench.scoring.contrasts import PRIMARY, Contrast, both_on, mean_finding
+from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.metrics import is_present, primary_of
 from sasgeo_bench.scoring.rows import UNRANKED, name_alone
 from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
+from sasgeo_bench.scoring.verdicts import LEAST_PLACES, Finding
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
 ORACLE: Final = "oracle_pose"
@@ -221,8 +221,8 @@ class Falsifier:
     def verdict(self) -> str:
         """Return in words whether the first method gains where it should not."""
         found = self.finding
-        if found.blocks < LEAST_BLOCKS:
-            return f"not decided: {counted(found.blocks, 'block')}"
+        if found.places < LEAST_PLACES:
+            return f"not decided: {counted(found.places, 'place')}"
         if found.lo > 0:
             return "GAIN without the stress"
         return "loss without the stress" if found.hi < 0 else "no gain shown"
@@ -236,7 +236,7 @@ def hold_falsifiers(
     The order is by contrast: all suites together, then suite by suite. Raise ConfigError if a contrast names a method
     that is not on the board.
     """
-    means = (contrast for contrast in contrasts if contrast.metric == "primary")
+    means = (contrast for contrast in contrasts if contrast.metric == PRIMARY)
     return tuple(item for contrast in means for item in _of(contrast, scores, draws))
 
 
@@ -265,8 +265,19 @@ def _unstressed(frame: pd.DataFrame) -> "pd.Series[bool]":
     return frame["is_present"].astype(bool) & (frame["role"] != "stress") & (frame["unknown_share"] < 1)
 
 
-_TOLD: Final = ("first_value", "second_value", "difference", "lo", "hi", "n", "blocks", "first_only", "second_only")
+_TOLD: Final = (
+    *("first_value", "second_value", "difference", "lo", "hi", "lo_blocks", "hi_blocks"),
+    *("n", "blocks", "places", "first_only", "second_only"),
+)
 FALSIFIER_COLUMNS: Final = ("contrast", "suite", "kind", "first", "second", *_TOLD, "verdict")
+
+
+def gains_without_stress(falsifiers: Sequence[Falsifier]) -> dict[str, bool]:
+    """Return by contrast whether its first method gains where it should not: all suites of it together."""
+    found: dict[str, bool] = {}
+    for item in falsifiers:  # the first of a contrast is of all its suites
+        found.setdefault(item.contrast, item.finding.places >= LEAST_PLACES and item.finding.lo > 0)
+    return found
 
 
 def falsifier_frame(found: Sequence[Falsifier]) -> pd.DataFrame:

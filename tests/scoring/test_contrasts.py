@@ -31,12 +31,13 @@ def test_a_real_difference_is_found_with_its_discordant_pairs():
     assert found.difference == pytest.approx((better < 25).mean() - (worse < 25).mean())
     assert 0 < found.lo < found.difference < found.hi
     assert found.p_holm < 0.001
-    assert found.verdict == "with is better"
+    assert found.verdict == "with is better, by as much as matters"
+    assert (found.outcome, found.places) == ("decided", 60)
     other = held(
         replace(CONTRAST, first="without", second="with"),
         **{"with": scores(better, blocks=60), "without": scores(worse, blocks=60)},
     )
-    assert other.verdict == "with is better"
+    assert other.verdict == "with is better, by as much as matters"
     assert other.difference == -found.difference
 
 
@@ -44,8 +45,11 @@ def test_a_small_difference_is_told_to_be_small():
     better = errors(0.5)
     worse = better.copy()
     worse[np.flatnonzero(better < 25)[:12]] = 99.0
-    found = held(CONTRAST, **{"with": scores(better, blocks=60), "without": scores(worse, blocks=60)})
-    assert found.verdict == "with is better, by less than would matter"
+    tables = {"with": scores(better, blocks=60), "without": scores(worse, blocks=60)}
+    found = held(CONTRAST, **tables)
+    assert found.verdict == "with is better; whether by as much as matters is not decided"
+    small = held(replace(CONTRAST, min_effect=0.1), **tables)
+    assert (small.outcome, small.verdict) == ("decided, small", "with is better, by less than would matter")
 
 
 def test_no_difference_is_a_null_and_says_how_sure_it_is():
@@ -55,15 +59,17 @@ def test_no_difference_is_a_null_and_says_how_sure_it_is():
     assert found.p_exact == 1.0
     few = errors(0.7, 40)
     unsure = held(CONTRAST, **{"with": scores(few, blocks=10), "without": scores(errors(0.7, 40, seed=9), blocks=10)})
-    assert unsure.verdict == "null: no difference shown, and one that matters is not ruled out"
+    assert unsure.verdict == "not decided: no difference shown, and one that matters is not ruled out"
 
 
 def test_of_few_sites_no_difference_is_not_ruled_out():
-    same = {name: scores(np.ones(6), blocks=6) for name in ("with", "without")}
+    same = {name: scores(np.full(6, 99.0), blocks=6) for name in ("with", "without")}
     found = held(CONTRAST, **same)
     most = wilson(0, 6).hi  # neither won a query: each may have, as often as 0 of 6 allows
     assert (found.lo, found.hi) == pytest.approx((-most, most))
-    assert found.verdict == "null: no difference shown, and one that matters is not ruled out"
+    assert found.verdict == "not decided: no difference shown, and one that matters is not ruled out"
+    full = held(CONTRAST, **{name: scores(np.ones(6), blocks=6) for name in ("with", "without")})
+    assert full.verdict == "not decided: at most 0.000 can be gained, and 0.030 was to matter"
 
 
 def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
@@ -75,9 +81,9 @@ def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
     assert (found.difference, found.hi) == (1.0, 1.0)
 
 
-def test_few_blocks_decide_nothing():
+def test_few_places_decide_nothing():
     found = held(CONTRAST, **{"with": scores(np.ones(100), blocks=5), "without": scores(99 * np.ones(100), blocks=5)})
-    assert found.verdict == "not decided: 5 blocks, at least 6 are needed"
+    assert found.verdict == "not decided: 5 places, at least 6 are needed"
 
 
 def test_kinds_choose_and_controls_and_falsifiers_do_not_count():
@@ -106,9 +112,9 @@ def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
     judged = {("mine", "logistic"): sure, ("mine", "margin"): blind}
     found = held(contrast, judged)
     assert found.difference < found.hi < 0
-    assert found.verdict == "mine x logistic is better"
+    assert found.verdict == "mine x logistic is better, by as much as matters"
     same = held(replace(contrast, first="mine x margin"), judged)
-    assert same.verdict.startswith("null")
+    assert same.outcome == "null"
 
 
 def test_holm_is_over_all_that_were_registered():

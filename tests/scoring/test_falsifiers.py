@@ -67,9 +67,9 @@ def test_views_that_are_all_unknown_and_absent_places_do_not_count():
     assert [item.kind for item in absent] == ["none"]
 
 
-def test_few_blocks_decide_nothing():
+def test_few_places_decide_nothing():
     found = held(np.ones(COUNT), np.full(COUNT, 99.0), blocks=5)
-    assert {item.verdict for item in found} == {"not decided: 5 blocks"}
+    assert {item.verdict for item in found} == {"not decided: 5 places"}
 
 
 def test_a_contrast_by_risk_has_none_and_an_unknown_arm_is_refused():

@@ -72,7 +72,8 @@ def test_nothing_is_told_where_no_answer_tells_a_level_or_of_another_track():
 
 def test_conformal_levels_are_fitted_on_other_places():
     # Place 0 errs by 2 m everywhere, place 1 by 20 m: each has the level of the other one.
-    table = scores(np.where(np.arange(400) % 2, 20.0, 2.0), block=[f"b{at % 8}" for at in range(400)])
+    names = {"block": [f"b{at % 8}" for at in range(400)], "place": [f"place{at % 2}" for at in range(400)]}
+    table = scores(np.where(np.arange(400) % 2, 20.0, 2.0), **names)
     answers = told(table, **{SCALE: 4.0})
     assert protection_frame("mine", table, answers).empty
     frame = protection_frame("mine", table, answers, split_of("crossfit"))

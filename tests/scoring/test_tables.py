@@ -12,16 +12,17 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown, tables_of, warnings_of
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.intervals import wilson
-from sasgeo_bench.scoring.rejection import integrity_rows, own_confidence
+from sasgeo_bench.scoring.rejection import own_confidence
+from sasgeo_bench.scoring.rejection_rows import integrity_rows
 from sasgeo_bench.scoring.rows import COLUMNS, EntryLabel, to_frame, with_entry_labels
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
 from sasgeo_bench.scoring.tables import cost_figures, leaderboard
+from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
 from sasgeo_bench.texts import markdown
 
 ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
@@ -39,7 +40,7 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
             "suite_version": 1,
             "part": "crossfit",
             "region": "vaduz",
-            "place": [f"place{at % 2}" for at in range(count)],
+            "place": "",
             "block": [f"b{at % blocks}" for at in range(count)],
             "prior_group": "r500-weak-s3",
             "view_cells": 192,
@@ -57,6 +58,7 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
             "scene": "urban",
             "is_present": True,
             "status": "ok",
+            "ceiling": 1.0,
             "is_answered": np.isfinite(errors_m),
             "above": 0,
             "tied": 0,
@@ -69,7 +71,8 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
             "latency_s": 0.1,
         }
     )
-    return table.assign(**changes)[list(SCORED)]
+    table = table.assign(**changes)
+    return table.assign(place=changes.get("place", "place of " + table["block"]))[list(SCORED)]
 
 
 def column_of(table, term):
@@ -99,9 +102,9 @@ def test_figures_are_what_they_are_by_hand():
     assert pick(board, "mine", "position_median")["value"] == 20.0
     assert pick(board, "mine", "position_p90")["value"] == math.inf
     row = pick(board, "mine", "success_25m")
-    assert (row["n"], row["answered"], row["missing"], row["blocks"], row["places"]) == (8, 7, 0, 4, 2)
+    assert (row["n"], row["answered"], row["missing"], row["blocks"], row["places"]) == (8, 7, 0, 4, 4)
     assert row["lo"] < row["value"] < row["hi"]
-    assert row["interval"] == "blocks"
+    assert row["interval"] == "places"
 
 
 def test_a_fix_that_is_near_and_turned_is_no_success_and_yet_within():
@@ -303,7 +306,7 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     text = board_markdown(board, ABOUT)
     assert "| mine | 0.250 [" in text
     assert "mine: 2 queries have no row and count as misses." in text
-    assert "4 blocks in 2 places: fewer than 36 in 12" in text
+    assert "4 blocks in 4 places: fewer than 36 in 12" in text
     assert "(c) OpenStreetMap contributors" in text
     latex = board_latex(board, ABOUT)
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a contrast shows, in words that follow from its figures by fixed rules; nobody writes a verdict by hand."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Final, Literal, Self
+
+from sasgeo_bench.errors import counted
+
+ALPHA: Final = 0.05
+# With fewer clusters there are no ranks and no decisions: an exact sign test cannot reach 5 %, since 2 / 2^5 > 5 %.
+LEAST_PLACES: Final = 6
+LEAST_BLOCKS: Final = LEAST_PLACES  # where the question is about the places that were asked, as of two seeds
+ContrastMetric = Literal[
+    "primary", "interaction", "aurc", "e_aurc", "auroc", "right_at_absent_0.01", "right_at_absent_0.05"
+]
+OF_MATCHERS: Final = frozenset({"primary", "interaction"})  # the sides of other metrics are "matcher x rejector"
+_NOTHING: Final = 1e-9  # a smaller excess is a rounding error
+Outcome = Literal["decided", "decided, small", "cause open", "null", "not decided", "not tested"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """Result of a contrast.
+
+    Parameters
+    ----------
+    name, first, second, metric : str
+        Of the contrast.
+    n, blocks, places : int
+        Queries and their clusters; places are the unit of intervals and tests. Fewer than `LEAST_PLACES` decide
+        nothing.
+    first_value, second_value : float
+        The metric of both sides.
+    best : float
+        The best value that the first side could have on these queries: the mean ceiling, or that of a perfect order.
+    difference, lo, hi, lo_blocks, hi_blocks : float
+        First less second, its paired 95 % interval by places, and by blocks; NaN without draws.
+    first_only, second_only : int
+        Discordant queries: better for one side only; 0 for areas.
+    p_exact, p_clustered, p_places, p_holm : float
+        McNemar's exact test, which assumes independent queries; Obuchowski's for blocks; the sign-flip test over
+        places; the latter adjusted by Holm over all registered contrasts. The first two are NaN where they do not
+        apply.
+    detectable : float
+        Least difference that as many places can show; NaN for areas and for too few places.
+    least : float
+        Least difference that matters, in units of the metric.
+    is_lower_better : bool
+        The metric is one of which less is better.
+    note : str
+        Why it was not tested or decided, if a side failed or there is no query.
+    gains_without_stress : bool
+        The first side is better without the stress, too, so the stress is not shown to be the cause.
+    """
+
+    name: str
+    first: str
+    second: str
+    metric: str
+    n: int = 0
+    blocks: int = 0
+    places: int = 0
+    first_value: float = math.nan
+    second_value: float = math.nan
+    best: float = math.nan
+    difference: float = math.nan
+    lo: float = math.nan
+    hi: float = math.nan
+    lo_blocks: float = math.nan
+    hi_blocks: float = math.nan
+    first_only: int = 0
+    second_only: int = 0
+    p_exact: float = math.nan
+    p_clustered: float = math.nan
+    p_places: float = math.nan
+    p_holm: float = math.nan
+    detectable: float = math.nan
+    least: float = math.nan
+    is_lower_better: bool = False
+    note: str = ""
+    gains_without_stress: bool = False
+
+    @property
+    def attainable(self) -> float:
+        """Return the most by which the first side could be better than the second."""
+        return abs(self.best - self.second_value)
+
+    @property
+    def gained_share(self) -> float:
+        """Return the gain of the first side as a share of what it could gain; negative for a loss, NaN for none."""
+        gain = -self.difference if self.is_lower_better else self.difference
+        return gain / self.attainable if self.attainable > _NOTHING else math.nan
+
+    @property
+    def is_out_of_reach(self) -> bool:
+        """Return whether the first side can gain less than was to matter; a loss can be shown all the same."""
+        is_lost = self.is_shown and self.winner == self.second
+        return self.least > self.attainable + _NOTHING and not is_lost
+
+    @property
+    def is_shown(self) -> bool:
+        """Return whether a difference is shown: the interval by places leaves out 0, after Holm's adjustment, too."""
+        return self.p_holm <= ALPHA and (self.lo > 0 or self.hi < 0)
+
+    @property
+    def winner(self) -> str:
+        """Return the side with the better figure."""
+        return self.first if (self.difference > 0) != self.is_lower_better else self.second
+
+    @property
+    def outcome(self) -> Outcome:
+        """Return the verdict in a word."""
+        if not self.n:
+            return "not decided" if self.note else "not tested"
+        if self.places < LEAST_PLACES or self.is_out_of_reach:
+            return "not decided"
+        if self.is_shown:
+            if max(abs(self.lo), abs(self.hi)) < self.least:
+                return "decided, small"
+            return "cause open" if self.gains_without_stress and self.winner == self.first else "decided"
+        return "null" if -self.least < self.lo and self.hi < self.least else "not decided"
+
+    @property
+    def verdict(self) -> str:
+        """Return the verdict in a line.
+
+        >>> found = Finding(name="graph", first="with", second="without", metric="primary", n=90, blocks=30, places=18,
+        ...     first_value=0.7, second_value=0.6, best=1.0, difference=0.1, lo=0.02, hi=0.2, p_holm=0.01, least=0.03)
+        >>> found.verdict
+        'with is better; whether by as much as matters is not decided'
+        >>> replace(found, gains_without_stress=True).outcome, replace(found, least=0.5).verdict
+        ('cause open', 'not decided: at most 0.400 can be gained, and 0.500 was to matter')
+        """
+        if not self.n:
+            return self.note or "not tested: no query"
+        if self.places < LEAST_PLACES:
+            return f"not decided: {counted(self.places, 'place')}, at least {LEAST_PLACES} are needed"
+        if self.is_out_of_reach:
+            return f"not decided: at most {self.attainable:.3f} can be gained, and {self.least:.3f} was to matter"
+        if not self.is_shown:
+            return self._unshown()
+        nearest, farthest = sorted((abs(self.lo), abs(self.hi)))
+        size = "; whether by as much as matters is not decided"
+        if nearest >= self.least:
+            size = ", by as much as matters"
+        elif farthest < self.least:
+            size = ", by less than would matter"
+        cause = "; cause open: it gains without the stress, too" if self.outcome == "cause open" else ""
+        return f"{self.winner} is better{size}{cause}"
+
+    def _unshown(self) -> str:
+        if self.outcome == "null":
+            return "null: any difference is smaller than would matter"
+        if self.lo > 0 or self.hi < 0:
+            return "not decided: no difference shown after Holm's adjustment"
+        return "not decided: no difference shown, and one that matters is not ruled out"
+
+    def to_row(self) -> dict[str, object]:
+        """Return all fields and what follows from them, as a row of `contrasts.parquet`."""
+        return {name: getattr(self, name) for name in COLUMNS}
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, object]) -> Self:
+        """Return the finding of a row of `to_row`."""
+        return cls(**{field.name: row[field.name] for field in fields(cls)})  # type: ignore[arg-type]
+
+
+COLUMNS: Final = (*(field.name for field in fields(Finding)), "attainable", "gained_share", "outcome", "verdict")
+
+
+def with_causes(findings: tuple[Finding, ...], gains: Mapping[str, bool]) -> tuple[Finding, ...]:
+    """Return findings that know whether their first side gains without the stress, too, by name of the contrast."""
+    return tuple(replace(item, gains_without_stress=gains.get(item.name, False)) for item in findings)

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registrations: what cannot be reached is refused before anybody is asked, and power is counted by places."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.registration import Pilot, check_contrasts, registered
+from tests.scoring.test_tables import scores
+
+ABSENT = Contrast(name="rejection", first="a x b", second="a x c", suites=("occlusion",), metric="aurc", min_effect=0.2)
+GRAPH = Contrast(name="graph", first="with", second="without", suites=("occlusion",))
+
+
+def design(count=100, **columns):
+    return scores(np.full(count, np.inf), blocks=20, **columns)
+
+
+def test_a_least_difference_beyond_what_a_perfect_order_gains_is_refused():
+    # 78 % of the answers are false, so a perfect order has 0.447 of the margin's 0.496, and a fifth of that is 0.099.
+    told = []
+    pilots = {"rejection": Pilot(second=0.496, false_share=0.78)}
+    with pytest.raises(ConfigError, match=r"'rejection' cannot be reached: at most 0\.049 .* and 0\.099 is to matter"):
+        check_contrasts([ABSENT], pilots, design(), tell=told.append)
+    assert len(told) == 1
+    excess = replace(ABSENT, metric="e_aurc")
+    (found,) = check_contrasts([excess], {"rejection": Pilot(second=0.05)}, design(), tell=told.append)
+    assert (found.best, found.attainable, found.least) == (0.0, 0.05, pytest.approx(0.01))
+
+
+def test_identical_places_lower_what_can_be_gained():
+    twins = design(ceiling=0.5)
+    with pytest.raises(ConfigError, match=r"at most 0\.020 can be gained"):
+        check_contrasts([GRAPH], {"graph": Pilot(second=0.48)}, twins, tell=str)
+    assert registered(GRAPH, Pilot(second=0.3), twins).attainable == pytest.approx(0.2)
+    assert registered(replace(GRAPH, suites=("alias",)), Pilot(), twins).queries == 0
+
+
+def test_power_counts_places_not_blocks():
+    pilot = Pilot(discordant=0.2)
+    many, few = (
+        registered(
+            GRAPH,
+            pilot,
+            design(400, place=[f"p{at % count}" for at in range(400)], block=[f"b{at % count}" for at in range(400)]),
+        )
+        for count in (40, 8)
+    )
+    assert (many.places, few.places) == (40, 8)
+    assert many.detectable < few.detectable
+    assert math.isnan(registered(replace(ABSENT, metric="auroc"), pilot, design()).detectable)
+    assert "too few to decide anything" in replace(few, places=5).to_text()

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import pandas as pd
+
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.experiments.paper.board import paper_extra
@@ -26,8 +28,12 @@ from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.scoring.contestants import read_scored_task
+from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
+from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.rows import is_unranked
+from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
@@ -284,11 +290,12 @@ def run_pipeline(
     if not tasks:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
+    contrasts = tuple(contrast_of(item.model_dump(exclude={"why", "pilot"})) for item in plan.spec.contrast)
+    _check_contrasts(plan, contrasts, tasks, tell)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
     folders = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
     split = plan.requests[0].split if plan.requests else None
-    contrasts = tuple(contrast_of(item.model_dump(exclude={"why"})) for item in plan.spec.contrast)
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
     pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
     request = ScoreRequest(
@@ -303,6 +310,7 @@ def run_pipeline(
         pipeline=plan.spec.identity,
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
+        by_block=(PAPER_SUITE,),
         jobs=plan.jobs,
         private=private,
         failed=failures.found,
@@ -311,6 +319,19 @@ def run_pipeline(
     if results is not None:
         tell(pack_board(board, request, results / plan.spec.id).to_text())
     return board
+
+
+def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: Sequence[Path], tell: Tell) -> None:
+    """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
+    if not contrasts:
+        return
+    split = plan.requests[0].split if plan.requests else None
+    place_of = {} if split is None else split.place_of
+    read = [read_scored_task(folder, plan.out / "truth") for folder in tasks]
+    frames = [score_task(task.heads, task.truths, {}, place_of=place_of) for task in read]
+    design = pd.concat(frames, ignore_index=True)
+    pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
+    check_contrasts(contrasts, pilots, design, tell=tell)
 
 
 def _run_all(

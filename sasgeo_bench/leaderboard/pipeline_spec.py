@@ -18,6 +18,7 @@ from sasgeo_bench.config import (
     list_documents,
     read_document,
 )
+from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
@@ -26,18 +27,39 @@ CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
 
 
+class PilotSpec(Document):
+    """What is known of a contrast from train places; see `scoring.registration.Pilot`."""
+
+    second: Annotated[float, Field(ge=0, le=1)] | None = None
+    false_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    discordant: Annotated[float, Field(ge=0, le=1)] | None = None
+    correlation: Annotated[float, Field(ge=0, le=1)] = 0.05
+
+
 class ContrastSpec(Document):
-    """One registered contrast; `first` and `second` are matchers, or "matcher x rejector" for the metric "aurc"."""
+    """One registered contrast; see `scoring.contrasts.Contrast`. `pilot` is for its registration alone."""
 
     name: Name
     first: str
     second: str
     suites: Annotated[list[str], Field(min_length=1)]
     kinds: list[Short] = []
-    metric: Literal["primary", "aurc"] = "primary"
+    metric: ContrastMetric = "primary"
     track: Literal["localization", "retrieval"] = "localization"
     min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
+    pilot: PilotSpec | None = None
     why: Prose = ""
+
+    @model_validator(mode="after")
+    def _can_be_judged(self) -> Self:
+        """Refuse a whole area of which nobody knows how much a perfect order has already."""
+        if self.metric == "aurc" and (self.pilot is None or None in (self.pilot.second, self.pilot.false_share)):
+            message = (
+                f"contrast {self.name!r} by aurc needs a pilot with second and false_share, from train places: where "
+                'many answers are false a perfect order gains little; metric = "e_aurc" needs none'
+            )
+            raise ValueError(message)
+        return self
 
 
 class TaskSpec(Document):
@@ -110,6 +132,9 @@ class PipelineFile(NamedDocument):
         """Hash of all that it says, defaults among it, as `board.json` names it."""
         # Files that leave a newer key out keep the hash that boards were made under before there was one.
         fields = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
+        for contrast in fields["contrast"]:
+            if contrast["pilot"] is None:
+                del contrast["pilot"]
         for task in fields["task"]:
             for name in CHOICE:
                 if not task[name]:
@@ -234,10 +259,11 @@ def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
 
 def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:
     """Refuse a contrast of methods that are not run."""
-    known = set(matchers) if item.metric == "primary" else {f"{one} x {two}" for one in matchers for two in rejectors}
+    is_of_rejectors = item.metric not in OF_MATCHERS
+    known = {f"{one} x {two}" for one in matchers for two in rejectors} if is_of_rejectors else set(matchers)
     lost = next((name for name in (item.first, item.second) if name not in known), None)
     if lost is not None:
-        kind = "matcher" if item.metric == "primary" else "matcher x rejector"
+        kind = "matcher x rejector" if is_of_rejectors else "matcher"
         message = f"contrast {item.name!r} names the unknown {kind} {lost!r}"
         raise ValueError(message)
 

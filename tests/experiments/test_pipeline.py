@@ -244,7 +244,7 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
         (
-            {'second = "prior_centre"': 'second = "prior_centre"\nmetric = "aurc"'},
+            {'second = "prior_centre"': 'second = "prior_centre"\nmetric = "e_aurc"'},
             "unknown matcher x rejector 'random'",
         ),
     ],
@@ -392,7 +392,11 @@ def test_an_oracle_with_a_contestants_name_is_refused(tmp_path, monkeypatch):
 def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     spec = small()
     assert "learning" in spec.model_dump()
-    newer = {"learning": True, "task": {"__all__": {"views_cells", "kinds", "tracks"}}}
+    newer = {
+        "learning": True,
+        "contrast": {"__all__": {"pilot"}},
+        "task": {"__all__": {"views_cells", "kinds", "tracks"}},
+    }
     assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude=newer).encode()).hexdigest()
     chosen = small(**{"sites = 1": "sites = 1\nviews_cells = [192]"})
     assert chosen.sha256 != spec.sha256

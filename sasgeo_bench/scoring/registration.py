@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a contrast could show at all, computed from its queries before anybody is asked.
+
+A registration whose least difference exceeds what can be gained is refused: no method could ever have been shown to
+matter. The rest of it, of how many places it will speak and which difference so many can show, is printed.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.scoring.base import block_codes
+from sasgeo_bench.scoring.compare import design_effect, detectable_difference
+from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
+from sasgeo_bench.scoring.verdicts import LEAST_PLACES
+
+CORRELATION: Final = 0.05  # of the differences of two queries of one place, unless a pilot says otherwise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pilot:
+    """What is known of a contrast from train places, before it is registered.
+
+    `second` is the metric of the second side, `false_share` the share of its answers that are false, `discordant` the
+    share of queries that just one side gets right, `correlation` how much more alike differences of one place are than
+    those of two. None where nothing is known.
+    """
+
+    second: float | None = None
+    false_share: float | None = None
+    discordant: float | None = None
+    correlation: float = CORRELATION
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registration:
+    """What a contrast could show: its queries, the best attainable value and gain, and the power of its places.
+
+    `attainable` is the most that the first side can gain on the second, `least` what is to matter; `detectable` the
+    least difference that so many places show at 5 % with a power of 80 %, NaN for areas.
+    """
+
+    name: str
+    queries: int
+    blocks: int
+    places: int
+    best: float
+    second: float | None
+    attainable: float
+    least: float
+    detectable: float
+
+    def to_text(self) -> str:
+        """Return the registration in a line.
+
+        >>> print(Registration(name="graph", queries=285, blocks=95, places=18, best=1.0, second=0.6, attainable=0.4,
+        ...     least=0.03, detectable=0.06).to_text())  # doctest: +NORMALIZE_WHITESPACE
+        graph: 285 queries in 95 blocks, 18 places; at most 0.400 can be gained (best 1.000, second 0.600), 0.030 is to
+        matter; so many places show 0.060 or more
+        """
+        known = "not known" if self.second is None else f"{self.second:.3f}"
+        power = "" if math.isnan(self.detectable) else f"; so many places show {self.detectable:.3f} or more"
+        few = "" if self.places >= LEAST_PLACES else f"; too few to decide anything, at least {LEAST_PLACES} are needed"
+        return (
+            f"{self.name}: {counted(self.queries, 'query', 'queries')} in {counted(self.blocks, 'block')}, "
+            f"{counted(self.places, 'place')}; at most {self.attainable:.3f} can be gained (best {self.best:.3f}, "
+            f"second {known}), {self.least:.3f} is to matter{power}{few}"
+        )
+
+
+def check_contrasts(
+    contrasts: Sequence[Contrast],
+    pilots: Mapping[str, Pilot],
+    design: pd.DataFrame,
+    *,
+    tell: Callable[[str], None],
+) -> tuple[Registration, ...]:
+    """Return what each contrast could show, and `tell` it.
+
+    `design` holds a row for each drawn query, as `score.score_task` returns them without predictions. Raise ConfigError
+    for the first contrast whose least difference cannot be reached.
+    """
+    found = tuple(registered(item, pilots.get(item.name, Pilot()), design) for item in contrasts)
+    for one in found:
+        tell(one.to_text())
+        if one.queries and one.least > one.attainable + 1e-9:
+            message = (
+                f"contrast {one.name!r} cannot be reached: at most {one.attainable:.3f} can be gained, and "
+                f"{one.least:.3f} is to matter: lower min_effect, or take another metric (e_aurc for aurc) or queries"
+            )
+            raise ConfigError(message)
+    return found
+
+
+def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame) -> Registration:
+    """Return what one contrast could show.
+
+    For "aurc" the best is the area of a perfect order where a share r of many answers is false, r + (1 - r) ln(1 - r)
+    (Geifman et al., ICLR 2019); without a pilot, the least share that absent places force, and a blind order for the
+    second side.
+
+    Three quarters of the places are absent, so a perfect order has most of the area already:
+
+    >>> names = {"suite": "absent", "track": "localization", "role": "stress", "kind": "outside"}
+    >>> some = pd.DataFrame([{**names, "is_present": at == 0, "ceiling": float(at == 0), "place": str(at),
+    ...     "block": str(at)} for at in range(4)])
+    >>> contrast = Contrast(name="r", first="a x b", second="a x c", suites=("absent",), metric="aurc", min_effect=0.2)
+    >>> found = registered(contrast, Pilot(second=0.45, false_share=0.75), some)
+    >>> round(found.best, 3), round(found.attainable, 3), round(found.least, 3)
+    (0.403, 0.047, 0.09)
+    """
+    rows = chosen_rows(contrast, design)
+    best, blind = _best_and_blind(contrast, pilot, rows)
+    second = pilot.second
+    value = blind if second is None else second
+    is_relative = contrast.metric in {"aurc", "e_aurc"}
+    return Registration(
+        name=contrast.name,
+        queries=len(rows),
+        blocks=int(rows["block"].nunique()),
+        places=int(rows["place"].nunique()),
+        best=best,
+        second=second,
+        attainable=abs(best - value),
+        least=contrast.min_effect * (value if is_relative else 1.0),
+        detectable=_detectable(contrast, pilot, rows),
+    )
+
+
+def _best_and_blind(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> tuple[float, float]:
+    """Return the best value, and the one that the second side reaches blindly, where nothing else is known of it."""
+    if not len(rows):
+        return math.nan, math.nan
+    if contrast.metric == "auroc":
+        return 1.0, 0.5
+    if contrast.metric in {"aurc", "e_aurc"}:
+        absent = 1.0 - float(rows["is_present"].mean())
+        false = absent if pilot.false_share is None else pilot.false_share
+        least = false + (1.0 - false) * math.log1p(-false) if false < 1 else 1.0
+        return (least, false) if contrast.metric == "aurc" else (0.0, false - least)
+    return float(rows["ceiling"].mean()), 0.0
+
+
+def _detectable(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> float:
+    """Return the least difference that the places show; the discordant queries are twice the least difference."""
+    if contrast.metric in {"aurc", "e_aurc", "auroc"} or not len(rows):
+        return math.nan
+    sizes, _ = block_codes(rows["place"].tolist(), len(rows))
+    share = min(1.0, 2 * contrast.min_effect) if pilot.discordant is None else pilot.discordant
+    return detectable_difference(len(rows) / design_effect(sizes, pilot.correlation), share)

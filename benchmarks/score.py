@@ -28,7 +28,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.intervals import DRAWS
+from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks import task_files

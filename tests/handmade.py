@@ -44,8 +44,8 @@ def asked(share, *, suite="real-age", track="localization", prior="r500-weak-s3"
         role=np.where(is_stress, "stress", "control"),
         strength=np.where(is_stress, np.where(at % 4 == 1, 5.0, 10.0), 0.0),
         query_id=[f"{suite}-{track}-{prior}-{one:05d}" for one in at],
-        place=[f"place{one % 4}" for one in at],
-        block=[f"place{one % 4}/{one % 40}" for one in at],
+        place=[f"place{one % 20}" for one in at],
+        block=[f"place{one % 20}/{one % 40}" for one in at],
         pool=10 if track == "retrieval" else 0,
         above=np.where(is_right, 0, 1),
         tied=1,
@@ -122,7 +122,7 @@ def draw(path):
 def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=None):
     """A board with all there can be but pictures; `changes` are of entries, by name, `tested` had the control."""
     scored = {name: asked_everything(share) for name, share in shares.items()}
-    facts = {"track": "localization", "n": 160, "answered": 160, "missing": 0, "blocks": 40, "places": 4}
+    facts = {"track": "localization", "n": 160, "answered": 160, "missing": 0, "blocks": 40, "places": 20}
     facts |= {"suite": "all suites", "prior_group": "r500-weak-s3", "better": "lower"}
     judged = [
         Row(
@@ -197,14 +197,14 @@ def many_rows(count):
                 answered=80,
                 missing=0,
                 blocks=20,
-                places=4,
+                places=20,
                 metric="success_25m",
                 unit="1",
                 better="higher",
                 value=value,
                 lo=max(0.0, value - 0.1),
                 hi=min(1.0, value + 0.1),
-                interval="blocks",
+                interval="places",
                 rank_best=max(1, at - 2),
                 rank_worst=min(count, at + 4),
                 detectable=0.1,

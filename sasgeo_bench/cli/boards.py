@@ -23,7 +23,7 @@ from sasgeo_bench.leaderboard.text import control_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.submissions import submissions_for
-from sasgeo_bench.scoring.intervals import DRAWS
+from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.tasks.private_seed import seed_record
 
 CONTROL_FAILED: Final = 3  # exit status

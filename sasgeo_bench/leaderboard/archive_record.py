@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring.entries import CardRecord
+from sasgeo_bench.scoring.verdicts import ContrastMetric
 from sasgeo_bench.texts import FOLDER, one_line
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -32,7 +33,7 @@ class ContrastRecord(_Record):
     second: str
     suites: list[str]
     kinds: list[str] = []
-    metric: Literal["primary", "aurc"] = "primary"
+    metric: ContrastMetric = "primary"
     track: Literal["localization", "retrieval"] = "localization"
     min_effect: Annotated[float, Field(ge=0, le=1)] = 0.03
 
@@ -67,6 +68,7 @@ class ArchiveRecord(_Record):
     contrasts: list[ContrastRecord]
     draws: Annotated[int, Field(ge=1, le=_MOST_DRAWS)]
     by_region: list[str]
+    by_block: list[str] = []
     pipeline: PipelineRecord | Annotated[dict[str, Any], Field(max_length=0)]  # empty where there was none
     contestants: list[str]
     dropped: str
@@ -171,6 +173,7 @@ class BoardRecord(_Record):
     draws: int | None = None
     contrasts: list[ContrastRecord] | None = None
     by_region: list[str] = []
+    by_block: list[str] = []
     without: list[str] = []
     rejectors: list[dict[str, str | bool | None]] = []
     remarks: list[str] = []

@@ -22,12 +22,13 @@ from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import LOG, Failures
 from sasgeo_bench.running.sandbox import joined
-from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame
+from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, Verdict, failed_controls, falsifier_frame, verdict_frame
+from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
-from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
+from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, Truth
 from sasgeo_bench.tasks.split import Split
@@ -47,8 +48,8 @@ class ScoreRequest:
 
     `split` assigns blocks to places, and names those that calibrate; rejectors (names, or module:Class) need it.
     `contrasts` are the registered ones. `draws` counts those of the bootstrap; suites in `by_region` are resampled by
-    region, not by block. `without` are regions to leave out, with all of their maps. `jobs` processes fit rejectors.
-    `extras` make, from the finished board, files that are written with it.
+    region, not by block; in suites of `by_block` each block is a place. `without` are regions to leave out, with all of
+    their maps. `jobs` processes fit rejectors. `extras` make, from the finished board, files that are written with it.
 
     `pipeline` is name and hash of the pipeline that requests the board, if one does. `private` is a board of a private
     seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
@@ -66,6 +67,7 @@ class ScoreRequest:
     rejectors: Sequence[str] = ()
     draws: int = DRAWS
     by_region: Collection[str] = ()
+    by_block: Collection[str] = ()
     pipeline: Mapping[str, str] = field(default_factory=dict)
     extras: Sequence[Callable[["Board"], Extra]] = ()
     without: Collection[str] = ()
@@ -175,6 +177,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
         "draws": request.draws,
         "contrasts": [asdict(item) for item in request.contrasts],
         "by_region": sorted(request.by_region),
+        "by_block": sorted(request.by_block),
         "without": sorted(set(request.without)),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "remarks": list(board.remarks),

@@ -25,9 +25,9 @@ from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring import controls, protection
-from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.rows import Row
+from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.texts import csv_cell, json_text, one_line
 
 LEADERBOARD: Final = "leaderboard"
@@ -176,7 +176,7 @@ def read_scores(folder: Path) -> pd.DataFrame:
 
 
 _TEXTS: Final = frozenset({"contrast", "suite", "kind", "matcher", "prior_group", "method", "supports"})
-_FINDING: Final = {item.name: item.type for item in fields(Finding)}
+_FINDING: Final = {item.name: item.type for item in fields(Finding)} | {"outcome": str, "verdict": str}
 _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
     "leaderboard": {item.name: item.type for item in fields(Row)},
     "contrasts": _FINDING,

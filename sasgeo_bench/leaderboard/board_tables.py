@@ -30,14 +30,14 @@ from sasgeo_bench.leaderboard.tables import (
     text_cells,
     ties_of,
 )
-from sasgeo_bench.scoring.metrics import CHANCE, FALSE_ABSENT, WITHIN, primary_of
-from sasgeo_bench.scoring.rejection import AS_DRAWN
+from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
-from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS
+from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, is_bin, is_step
 
 _REJECTION: Final = (  # metrics of the tables of rejectors
-    *("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
-    *("brier", "ece", "cost_20", "cost_20_place"),
+    *("aurc", "e_aurc", "auroc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
+    *("right_at_absent_0.05", "absent_reached_at_0.05", "ece", "cost_20"),
 )
 SHOWN_COSTS: Final = (  # and of the table of costs
     *("latency_p50", "latency_p95", "prepare", "peak_memory"),
@@ -45,6 +45,7 @@ SHOWN_COSTS: Final = (  # and of the table of costs
 )
 _SOUND: Final = ("ok", "not applicable")  # all else is a miss
 _PRIOR_ALONE: Final = "prior_centre"
+_WHOLE: Final = frozenset({ALL, STRESS})  # no kinds
 MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1280 px holds
 
 
@@ -150,6 +151,7 @@ class Section:
     suite_page: str
     counted: str
     for_nothing: str
+    attainable: str
     table: Table
     apart: Table | None = None
 
@@ -159,6 +161,7 @@ class Section:
         texts = [f"Prior group {self.prior_group}."]
         texts += [f"Stress that is counted: {self.counted}."] if self.counted else []
         texts += [f"Without looking at the view: {self.for_nothing}."] if self.for_nothing else []
+        texts += [f"Attainable: {self.attainable}."] if self.attainable else []
         return " ".join(texts)
 
 
@@ -184,6 +187,7 @@ def _section(book: Book, key: Key) -> Section:
         suite_page=book.suite_pages[suite],
         counted=", ".join(book.counted.get(key, ())),
         for_nothing=_for_nothing(book, key),
+        attainable=_attainable(book, key),
         table=replace(table, notes=tuple(lines)),
         apart=_apart(book, key, apart) if apart else None,
     )
@@ -275,6 +279,24 @@ def _for_nothing(book: Book, key: Key) -> str:
     return ", ".join(texts)
 
 
+def _attainable(book: Book, key: Key) -> str:
+    """Return the ceiling of the first figure, and that of each part with another one; "" if all is attainable.
+
+    It is that of any matcher: it depends on the queries alone.
+    """
+    name = book.matchers[key][0]
+    whole = book.main(key, name, CEILING.name)
+    if whole is None:
+        return ""
+    kinds = [part for part in book.strata[key] if not (part in _WHOLE or is_bin(part) or is_step(part))]
+    found = {part: book.pick(key, name, CEILING.name, part) for part in kinds}
+    lower = {part: row for part, row in found.items() if row is not None and float(row["value"]) < 1}
+    if not lower and float(whole["value"]) == 1:
+        return ""
+    parts = "; ".join(f"{part} {number_text(float(row['value']))}" for part, row in lower.items())
+    return f"{number_text(float(whole['value']))} of the first figure" + (f" ({parts})" if parts else "")
+
+
 def strata_tables(book: Book, key: Key) -> Iterator[Table]:
     """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
     names = book.matchers[key]
@@ -292,14 +314,16 @@ def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) ->
         counts = sorted({int(row["n"]) for row in found.values() if row is not None})
         if counts:
             first = Cell(text=stratum)
-            cells = [figure_cell(row) for row in found.values()]
-            rows.append(Row(cells=(first, Cell(text="-".join(map(str, counts)), key=float(counts[0])), *cells)))
+            n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
+            most = book.pick(key, names[0], CEILING.name, stratum)
+            ceiling = number_cell(math.nan if most is None else float(most["value"]))
+            rows.append(Row(cells=(first, n, ceiling, *(figure_cell(row) for row in found.values()))))
     meaning = column(primary).meaning
     columns = [column(primary, title=name) for name in names]
     return Table(
         name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
         title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
-        columns=(column("part", is_number=False), column("n"), *columns),
+        columns=(column("part", is_number=False), column("n"), column(CEILING.name), *columns),
         rows=tuple(rows),
         notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),
     )
@@ -371,7 +395,7 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
             *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
         ),
         rows=tuple(row for *_, row in rows),
-        notes=("Brier, ECE and costs have no interval on this board: they decide nothing.",),
+        notes=("ECE and costs have no interval on this board: they decide nothing.",),
     )
 
 

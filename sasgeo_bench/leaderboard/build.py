@@ -23,7 +23,7 @@ from sasgeo_bench.scoring.contestants import (
     score_entries,
 )
 from sasgeo_bench.scoring.contrasts import hold_contrasts
-from sasgeo_bench.scoring.controls import hold_controls, hold_falsifiers
+from sasgeo_bench.scoring.controls import gains_without_stress, hold_controls, hold_falsifiers
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.entries import find_entries, leave_out, set_apart
 from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
@@ -32,6 +32,7 @@ from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, evalu
 from sasgeo_bench.scoring.rows import EntryLabel, name_alone, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
+from sasgeo_bench.scoring.verdicts import with_causes
 from sasgeo_bench.tasks.query import base_of
 
 
@@ -88,7 +89,9 @@ def _contest(request: ScoreRequest, failures: Failures, tell: Tell) -> Contest:
     )
     tasks = read_tasks(answers, folders, request.truth or request.root / "truth")
     seed_of([task.about for task in tasks])  # refuse a mixture of seeds before it is scored
-    return score_entries(answers, tasks, split=request.split, by_region=request.by_region, failures=failures)
+    return score_entries(
+        answers, tasks, split=request.split, by_region=request.by_region, by_block=request.by_block, failures=failures
+    )
 
 
 def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell: Tell) -> Board:
@@ -175,7 +178,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
         board,
         judged={key: frame for key, frame in rejection.judged.items() if len(frame)},
         remarks=rejection.remarks,
-        findings=findings,
+        findings=with_causes(findings, gains_without_stress(falsifiers)),
         falsifiers=falsifiers,
         protection=pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(PROTECTION_COLUMNS)),
     )

@@ -6,24 +6,24 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, REPRODUCED, RUN_HERE
+from sasgeo_bench.scoring.verdicts import LEAST_PLACES
 from sasgeo_bench.tasks.query import PriorGroup
 
 _UNKNOWN: Final = "no meaning is written down for this column"
 _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "matcher": "Name of the entry. Controls have no rank: they show what a figure means that nobody earned",
     "rank": "Ranks that the matcher can have, all pairs compared at once. Matchers that share a rank cannot be "
-    f"distinguished. With fewer than {LEAST_BLOCKS} blocks nobody is ranked (-)",
+    f"distinguished. With fewer than {LEAST_PLACES} places nobody is ranked (-)",
     "control": "The same figure at the same places without the stress",
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
-    "detectable": "Smallest difference from the best other matcher that these queries can show (5 %, power 80 %); inf "
+    "detectable": "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf "
     "if none, - where nobody is ranked",
     "n": "Queries in the denominator, the same for every matcher",
     "missing": "Queries without a row; they count as misses",
     "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
-    "them",
+    "places, then blocks in them",
     "suite": "What is done to a view or a map",
     "part": "Which of the suite's queries: a role, a kind of stress, one of its steps at one size of view, or a bin "
     "of what was measured at the truth",
@@ -33,12 +33,17 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "contrast": "Pair of entries that was registered before anything was run",
     "first": "First entry of the pair, and what it reaches",
     "second": "Second entry of the pair, and what it reaches",
-    "difference": "First less second on the same queries, with its 95 % interval",
-    "p (Holm)": "Chance of a difference as large if there were none, counting blocks; adjusted by Holm for the number "
-    "of registered contrasts",
+    "difference": "First less second on the same queries, with its 95 % interval by places",
+    "by blocks": "The interval of the difference if blocks, not places, are resampled: of these places alone",
+    "attainable": "The most by which the first could be better than the second: up to the ceiling of these queries, or "
+    "to a perfect order",
+    "matters": "The least difference that was registered as mattering",
+    "p (Holm)": "Chance of a difference as large if there were none, by flipping the sides of whole places; adjusted "
+    "by Holm for the number of registered contrasts",
     "discordant": "Queries that only the first got right, and only the second",
-    "verdict": "Which is better at 5 %; null where neither is shown to be, with or without ruling out a difference "
-    f"that matters; not decided with fewer than {LEAST_BLOCKS} blocks",
+    "verdict": "Which is better at 5 %, and whether by as much as matters; null where a difference that matters is "
+    "ruled out; cause open where the first gains without the stress, too; not decided where neither is shown, where "
+    f"less can be gained than was to matter, and with fewer than {LEAST_PLACES} places",
     "control query": "Queries whose right score is known beforehand",
     "outcome": "held, or FAILED: then do not trust the rows of the matcher, nor the board if it is itself a control",
     "found": "How many were right, or were answered where none must be",
@@ -74,8 +79,9 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
 }
 MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS
 NOTE: Final = (
-    "Intervals are 95 %: a bootstrap over blocks, then sites ({draws} draws), and never narrower than Wilson's with as "
-    f"many trials as there are sites; {DAGGER} marks those where Wilson's is wider."
+    "Intervals are 95 %: a bootstrap over places, then blocks, then sites ({draws} draws), never narrower than over "
+    f"blocks alone, nor than Wilson's with as many trials as there are sites; {DAGGER} marks those where Wilson's is "
+    "wider."
 )
 RANKS_NOTE: Final = (
     "The first figure of a suite counts the stressed queries, or all where nothing is stressed; matchers are ranked by "

@@ -13,7 +13,7 @@ from sasgeo_bench.scoring.decisions import Answers, equal_mass_bins, stanford
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import effective_count, wilson_share
 from sasgeo_bench.scoring.protection import ProtectionLevels
-from sasgeo_bench.scoring.rejection import answers_of, mixtures_of
+from sasgeo_bench.scoring.rejection_rows import answers_of, mixtures_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_apart, is_unranked
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, primary_rows
 

@@ -34,11 +34,12 @@ from sasgeo_bench.leaderboard.board_plots import (
     those_there,
 )
 from sasgeo_bench.leaderboard.plot_tables import BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
-from sasgeo_bench.scoring.contrasts import Contrast, Finding, PlaceDifference
+from sasgeo_bench.scoring.contrasts import Contrast, PlaceDifference
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import ProtectionLevels
-from sasgeo_bench.scoring.rejection import AS_DRAWN
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES
+from sasgeo_bench.scoring.verdicts import Finding
 
 _DODGE: Final = 0.011  # of an axis, between two matchers at one step
 
@@ -120,15 +121,13 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
 
 def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequence[PlaceDifference]) -> None:
     """Draw a contrast place by place, from `contrasts.by_place`, and pooled below."""
-    is_mean = contrast.metric == "primary"
-    what = (
-        PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_mean else "area under risk against coverage"
-    )
-    better = f"right of 0: {contrast.first} is better" if is_mean else f"left of 0: {contrast.first} is better"
-    least = contrast.min_effect * (1.0 if is_mean else abs(finding.second_value))
+    is_primary = contrast.metric == "primary"
+    what = PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_primary else contrast.metric
+    better = f"{'left' if finding.is_lower_better else 'right'} of 0: {contrast.first} is better"
+    least = finding.least
     kinds = f", kinds {', '.join(contrast.kinds)}" if contrast.kinds else ""
     labels = [f"{one.place} (n {one.n}, {counted(one.blocks, 'block')})" for one in places]
-    labels.append(f"all places (n {finding.n}, {counted(finding.blocks, 'block')})")
+    labels.append(f"all places (n {finding.n}, {counted(finding.places, 'place')})")
     about = BoardPage(
         title=f"Contrast {contrast.name}: {contrast.first} less {contrast.second}",
         note=(

@@ -15,23 +15,22 @@ from sasgeo_bench.leaderboard.board_files import read_board, read_scores
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.sandbox import keeps_truth
 from sasgeo_bench.scoring.base import Bools
-from sasgeo_bench.scoring.compare import LEAST_BLOCKS
+from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.intervals import (
     LEVEL,
-    ClusterDraws,
     Interval,
     bootstrap_means,
     difference_interval,
     effective_count,
     percentile_interval,
-    seed_of_text,
     wilson_share,
 )
 from sasgeo_bench.scoring.metrics import FALSE_ABSENT, MeanMetric, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, REPRODUCED, RUN_HERE, name_alone
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
+from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
 from sasgeo_bench.tasks.query import TASK_VERSION

@@ -14,10 +14,10 @@ from sasgeo_bench.leaderboard.private_board import seed_lines
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdict_frame
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT
 from sasgeo_bench.scoring.strata import ALL
+from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.texts import markdown, markdown_item, tex
 
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places

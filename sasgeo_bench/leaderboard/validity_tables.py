@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of what a board can be trusted for: contrasts, falsifiers, controls, public and private seed."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -21,9 +22,9 @@ from sasgeo_bench.leaderboard.tables import (
     tally_text,
     text_cells,
 )
-from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES
+from sasgeo_bench.scoring.verdicts import Finding
 
 _CONTROLS_NOTE: Final = (
     "The right score of these queries is known beforehand. At chance: views of a shuffled map, of a map turned by "
@@ -97,16 +98,22 @@ def contrast_table(findings: Sequence[Finding]) -> Table:
             cells=(
                 Cell(text=item.name),
                 *_sides(item),
+                Cell(text=_ends_text(item)),
+                number_cell(item.attainable),
+                number_cell(item.least),
                 number_cell(item.p_holm),
                 Cell(text=f"{item.first_only} and {item.second_only}"),
                 number_cell(item.detectable),
-                Cell(text=f"{item.n} in {counted(item.blocks, 'block')}", key=float(item.n)),
+                Cell(text=_counts_text(item), key=float(item.n)),
                 Cell(text=item.verdict),
             )
         )
         for item in findings
     )
-    names = ("first", "second", "difference", "p (Holm)", "discordant", "detectable", "n")
+    names = (
+        *("first", "second", "difference", "by blocks", "attainable", "matters"),
+        *("p (Holm)", "discordant", "detectable", "n"),
+    )
     columns = (*words("contrast"), *map(column, names), *words("verdict"))
     return Table(name="contrasts", title="Registered contrasts", columns=columns, rows=rows)
 
@@ -119,7 +126,7 @@ def falsifier_table(found: Sequence[Falsifier]) -> Table:
                 *text_cells(item.contrast, item.suite, item.kind),
                 *_sides(item.finding),
                 Cell(text=f"{item.finding.first_only} and {item.finding.second_only}"),
-                Cell(text=f"{item.finding.n} in {counted(item.finding.blocks, 'block')}", key=float(item.finding.n)),
+                Cell(text=_counts_text(item.finding), key=float(item.finding.n)),
                 Cell(text=item.verdict),
             )
         )
@@ -137,3 +144,14 @@ def _sides(item: Finding) -> tuple[Cell, ...]:
         Cell(text=f"{item.second}: {number_text(item.second_value)}", key=sort_key(item.second_value)),
         Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference)),
     )
+
+
+def _ends_text(item: Finding) -> str:
+    """Return the interval by blocks."""
+    if math.isnan(item.lo_blocks):
+        return "-"
+    return f"[{number_text(item.lo_blocks)}, {number_text(item.hi_blocks)}]"
+
+
+def _counts_text(item: Finding) -> str:
+    return f"{item.n} in {counted(item.blocks, 'block')}, {counted(item.places, 'place')}"

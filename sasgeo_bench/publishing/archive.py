@@ -30,8 +30,8 @@ from sasgeo_bench.publishing.archive_file import (
 )
 from sasgeo_bench.publishing.archive_folder import check_results, is_pack, read_settings
 from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
-from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import read_ids
 from sasgeo_bench.texts import one_line
@@ -113,6 +113,7 @@ def _settings_of(request: ScoreRequest) -> dict[str, Any]:
         "contrasts": [asdict(item) for item in request.contrasts],
         "draws": request.draws,
         "by_region": sorted(request.by_region),
+        "by_block": sorted(request.by_block),
         "pipeline": dict(request.pipeline),
     }
 
@@ -126,6 +127,7 @@ class Settings:
     contrasts: Sequence[Contrast] = ()
     draws: int = DRAWS
     by_region: Collection[str] = ()
+    by_block: Collection[str] = ()
     pipeline: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -141,7 +143,7 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
     if not stored:
         return Settings()
     record = read_settings(stored[0])
-    names = ("split", "rejectors", "draws", "by_region", "pipeline")
+    names = ("split", "rejectors", "draws", "by_region", "by_block", "pipeline")
     return Settings(**{name: record[name] for name in names}, contrasts=tuple(map(contrast_of, record["contrasts"])))
 
 
@@ -185,6 +187,7 @@ def request_of(
         board=board,
         draws=settings.draws,
         by_region=settings.by_region,
+        by_block=settings.by_block,
         pipeline=settings.pipeline,
         failed=failed,
     )

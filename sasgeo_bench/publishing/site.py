@@ -27,11 +27,11 @@ from sasgeo_bench.publishing.site_pages import (
     suites_of,
 )
 from sasgeo_bench.publishing.site_source import Case, SiteSource
-from sasgeo_bench.scoring.contrasts import LESS_THAN_MATTERS, Contrast, chosen_rows
+from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.texts import plain
 
-OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided")  # in the order of the page
+OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
 _LEAST_P: Final = 5e-4  # less would read as nought
 
 
@@ -39,7 +39,7 @@ _LEAST_P: Final = 5e-4  # less would read as nought
 class ContrastSummary:
     """A registered contrast in plain words.
 
-    `outcome` is one of `OUTCOMES`; the cause of a gain is open where the falsifiers of the contrast gain, too.
+    `outcome` is one of `OUTCOMES`.
     `unstressed` compares both where they should not differ, empty if nothing was measured there; `bar` spans from
     -`reach` to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
     """
@@ -69,11 +69,11 @@ def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
 def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
     verdict, name = str(row["verdict"]), str(row["name"])
     falsifier = _falsifier_of(source.falsifiers, name)
-    outcome = _outcome(row, falsifier)
+    outcome = str(row["outcome"])
     contrast = next((item for item in source.registered if item.name == name), None)
     figure = next((item.file for item in source.figures if item.file == f"{file_stem('contrast', name)}.svg"), "")
     known = [float(row[end]) for end in ("lo", "hi", "difference")]
-    least = float(row["min_effect"]) * (1.0 if row["metric"] == "primary" else abs(float(row["second_value"])))
+    least = float(row["least"])
     bar = None
     if all(map(math.isfinite, known)):
         lo, hi, at = (round(50 + 50 * value / reach, 1) for value in known)
@@ -95,7 +95,7 @@ def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
 
 def _headline(row: Record, verdict: str, outcome: str) -> str:
     first, second = row["first"], row["second"]
-    if outcome not in {"null", "not decided"}:
+    if outcome not in {"null", "not decided", "not tested"}:
         better, worse = (first, second) if verdict.startswith(f"{first} is better") else (second, first)
         return f"{better} is better than {worse}" + verdict.partition(" is better")[2]
     return f"{first} against {second}: {verdict.partition(': ')[2] or verdict}"
@@ -107,26 +107,18 @@ def _sentence(row: Record, least: float) -> str:
         return "No query of this board counts for it."
     difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
     values = f"{number_text(float(row['first_value']))} against {number_text(float(row['second_value']))}"
-    what = "share of queries that are right" if row["metric"] == "primary" else "area under risk (lower is better)"
-    return f"Difference {difference} in the {what}: {values}. A difference from {number_text(least)} on was to matter."
+    what = "share of queries that are right" if row["metric"] == "primary" else str(row["metric"])
+    most = number_text(float(row["attainable"]))
+    return (
+        f"Difference {difference} in the {what}: {values}. At most {most} could be gained; a difference of "
+        f"{number_text(least)} or more was to matter."
+    )
 
 
 def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
     """Return how both sides fare without the stress, all suites together: the first row of a contrast."""
     own = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
     return None if own.empty else {str(name): value for name, value in own.iloc[0].items()}
-
-
-def _outcome(row: Record, falsifier: Record | None) -> str:
-    verdict = str(row["verdict"])
-    if verdict.startswith(("not decided", "not tested")):
-        return "not decided"
-    if verdict.startswith("null"):
-        return "null"
-    if verdict.endswith(LESS_THAN_MATTERS):
-        return "decided, small"
-    is_gained = falsifier is not None and falsifier["lo"] > 0 and verdict.startswith(f"{row['first']} is better")
-    return "cause open" if is_gained else "decided"
 
 
 def _unstressed(row: Record) -> str:
@@ -145,9 +137,7 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
         yield f"adjusted p {shown} (Holm, {counted(len(source.contrasts), 'contrast')})"
     yield f"n = {counted(int(row['n']), 'query', 'queries')}"
     yield counted(int(row["blocks"]), "block")
-    places = 0 if contrast is None else places_of(contrast, source.scores, int(row["n"]))
-    if places:
-        yield counted(places, "place")
+    yield counted(int(row["places"]), "place")
     if row["metric"] == "primary":
         yield f"right by the first alone {row['first_only']}, by the second alone {row['second_only']}"
     detectable = float(row["detectable"])
@@ -155,16 +145,6 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
         yield f"least difference these queries would show {number_text(detectable)}"
     if contrast is not None:
         yield f"suites {', '.join(contrast.suites)}"
-
-
-def places_of(contrast: Contrast, scores: pd.DataFrame, n: int) -> int:
-    """Count the places of a contrast's queries; 0 if the scored rows are not those that were tested."""
-    if not len(scores) or "matcher" not in scores:
-        return 0
-    whose = [side.partition(" x ")[0] for side in (contrast.first, contrast.second)]
-    rows = [chosen_rows(contrast, scores[scores["matcher"] == name]) for name in whose]
-    shared = rows[0][rows[0]["query_id"].isin(rows[1]["query_id"])]
-    return int(shared["place"].nunique()) if len(shared) == n else 0
 
 
 ASSETS: Final = ("site.css", "site.js")

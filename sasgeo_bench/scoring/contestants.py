@@ -232,12 +232,14 @@ def score_entries(
     *,
     split: Split | None,
     by_region: Collection[str],
+    by_block: Collection[str] = (),
     failures: Failures,
 ) -> Contest:
     """Score the answers of all entries; `failures` records entries that cannot be scored, and they are left out.
 
-    `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block. Raise the first
-    fault, a StoreError or ConfigError, if no entry is left.
+    `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block; in suites of
+    `by_block`, whose blocks are drawn independently, each is a place. Raise the first fault, a StoreError or
+    ConfigError, if no entry is left.
     """
     folders = [task.folder for task in tasks]
     scores: dict[str, pd.DataFrame] = {}
@@ -245,7 +247,7 @@ def score_entries(
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
-            scored = _scored(item, tasks, split, by_region)
+            scored = _scored(item, tasks, split, by_region, by_block)
             hold_controls({item.entry.name: scored})  # so that an error names the entry
             scores[item.entry.name] = scored
     if not scores and failures.first is not None:
@@ -298,7 +300,11 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
 
 
 def _scored(
-    answers: EntryAnswers, tasks: Sequence[ScoredTask], split: Split | None, by_region: Collection[str]
+    answers: EntryAnswers,
+    tasks: Sequence[ScoredTask],
+    split: Split | None,
+    by_region: Collection[str],
+    by_block: Collection[str],
 ) -> pd.DataFrame:
     """Return one row per query of all tasks that an entry was asked."""
     place_of = {} if split is None else split.place_of
@@ -309,5 +315,7 @@ def _scored(
         names = [head.query_id for head in task.heads]
         mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
         frame = score_task(task.heads, task.truths, mine, place_of=place_of)
-        frames.append(frame.assign(block=frame["region"]) if task.about["suite"] in by_region else frame)
+        suite = task.about["suite"]
+        frame = frame.assign(block=frame["region"]) if suite in by_region else frame
+        frames.append(frame.assign(place=frame["block"]) if suite in by_block else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -20,7 +20,8 @@ from sasgeo_bench.leaderboard.pooled_tables import (
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS
-from sasgeo_bench.scoring.rejection import integrity_rows, own_confidence
+from sasgeo_bench.scoring.rejection import own_confidence
+from sasgeo_bench.scoring.rejection_rows import integrity_rows
 from sasgeo_bench.scoring.rows import to_frame
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks.query import Truth

@@ -184,11 +184,11 @@ def test_the_board_is_what_its_tables_say_read_by_meaning(pages):
     assert index.said("h1") == ["mine"]
     assert index.said("h2")[:3] == ["Which differences are real", "Whether to trust the board", "The board"]
     outcomes = [text for text in index.said("h3") if text.startswith(("decided", "null", "not decided"))]
-    assert outcomes[0] == "decided real: graph is better than weak"
-    assert outcomes[1].startswith("null close: graph against raster: ")
+    assert outcomes[0] == "decided real: graph is better than weak, by as much as matters"
+    assert outcomes[1].startswith("not decided close: graph against raster: ")
     first = " ".join(index.said("li"))
     assert re.search(r"Difference 0\.\d{3} \[0\.\d{3}, 0\.\d{3}\] in the share of queries that are right", first)
-    assert re.search(r"adjusted p below 0\.001 \(Holm, 2 contrasts\); n = 120 queries; 20 blocks; 2 places;", first)
+    assert re.search(r"adjusted p below 0\.001 \(Holm, 2 contrasts\); n = 120 queries; 20 blocks; 10 places;", first)
     assert "Controls: all 1 held." in index.said("p")
     heads = [text for text in index.said("h3") if text.startswith(("real-age", "occlusion"))]
     assert heads == [

@@ -13,13 +13,14 @@ from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
-from sasgeo_bench.publishing.site import contrasts_of, places_of
+from sasgeo_bench.publishing.site import contrasts_of
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import SiteSource, Spot
-from sasgeo_bench.scoring.contrasts import Contrast, Finding, contrast_frame
+from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
-from tests.handmade import HOSTILE, MARKUP, about_of, asked, card_of, entry_of, many_rows
+from sasgeo_bench.scoring.verdicts import Finding
+from tests.handmade import HOSTILE, MARKUP, about_of, card_of, entry_of, many_rows
 
 FINDING = Finding(
     name="age",
@@ -28,6 +29,8 @@ FINDING = Finding(
     metric="primary",
     n=120,
     blocks=40,
+    places=18,
+    best=1.0,
     first_value=0.7,
     second_value=0.6,
     difference=0.1,
@@ -39,8 +42,7 @@ FINDING = Finding(
     p_clustered=0.01,
     p_holm=0.02,
     detectable=0.05,
-    min_effect=0.03,
-    verdict="graph is better",
+    least=0.03,
 )
 KEY = ("real-age", "localization", "r500-weak-s3")
 
@@ -136,29 +138,28 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
 @pytest.mark.parametrize(
     ("changes", "outcome", "headline"),
     [
-        ({}, "decided", "graph is better than raster"),
+        ({}, "decided", "graph is better than raster, by as much as matters"),
         (
-            {"verdict": "raster is better, by less than would matter"},
-            "decided, small",
-            "raster is better than graph, by less than would matter",
+            {"gains_without_stress": True},
+            "cause open",
+            "graph is better than raster, by as much as matters; cause open: it gains without the stress, too",
         ),
+        ({"least": 0.2}, "decided, small", "graph is better than raster, by less than would matter"),
         (
-            {"verdict": "null: any difference is smaller than would matter"},
+            {"least": 0.2, "p_holm": 1.0},
             "null",
             "graph against raster: any difference is smaller than would matter",
         ),
-        (
-            {"verdict": "not decided: 2 blocks, at least 6 are needed"},
-            "not decided",
-            "graph against raster: 2 blocks, at least 6 are needed",
-        ),
-        ({"verdict": "not tested: no query", "n": 0}, "not decided", "graph against raster: no query"),
+        ({"places": 2}, "not decided", "graph against raster: 2 places, at least 6 are needed"),
+        ({"n": 0}, "not tested", "graph against raster: no query"),
     ],
 )
 def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, outcome, headline):
     (told,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
     assert (told.outcome, told.headline) == (outcome, headline)
-    if "n" not in changes:
+    if told.outcome == "null":
+        assert told.facts[0] == "adjusted p 1.000 (Holm, 1 contrast)"
+    elif "n" not in changes:
         assert told.sentence.startswith("Difference 0.100 [0.040, 0.160] in the share of queries that are right")
         assert told.facts[:3] == ("adjusted p 0.020 (Holm, 1 contrast)", "n = 120 queries", "40 blocks")
     else:
@@ -166,22 +167,9 @@ def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, 
 
 
 def test_what_is_decided_stands_first():
-    verdicts = (
-        "not decided: 2 blocks, at least 6 are needed",
-        "null: no difference shown",
-        "graph is better, by less than would matter",
-        "graph is better",
-    )
-    findings = [replace(FINDING, name=f"c{at}", verdict=verdict) for at, verdict in enumerate(verdicts)]
+    changes = ({"places": 2}, {"lo": -0.01, "hi": 0.02, "p_holm": 1.0}, {"least": 0.2}, {})
+    findings = [replace(FINDING, name=f"c{at}", **each) for at, each in enumerate(changes)]
     assert [told.name for told in contrasts_of(source(findings=findings))] == ["c3", "c2", "c1", "c0"]
-
-
-def test_places_of_a_contrast_are_counted_where_the_scored_rows_are_those_that_were_tested():
-    contrast = Contrast(name="real", first="graph", second="raster", suites=("real-age",))
-    scored = pd.concat([asked(0.5).assign(matcher=name) for name in ("graph", "raster")], ignore_index=True)
-    assert places_of(contrast, scored, 80) == 2  # every other query is a control, so every other place
-    assert places_of(contrast, scored, 79) == 0
-    assert places_of(contrast, pd.DataFrame(), 80) == 0
 
 
 def test_places_lie_in_the_middle_of_their_regions_and_unknown_ones_nowhere():
@@ -226,7 +214,8 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
         Falsifier(contrast=FINDING.name, suite="all", kind="all", finding=replace(FINDING, n=80, blocks=9)),
         Falsifier(contrast="other", suite="all", kind="all", finding=FINDING),
     ]
-    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame(rows)))
+    gained = replace(FINDING, gains_without_stress=True)
+    (told,) = contrasts_of(source(findings=[gained], falsifiers=falsifier_frame(rows)))
     assert told.unstressed.startswith("Without the stress, where they should not differ: ")
     assert "(n = 80, 9 blocks). What it gains there is not owed" in told.unstressed
     assert told.outcome == "cause open"

@@ -27,8 +27,8 @@ from sasgeo_bench.experiments.paper.tiles import CANDIDATES
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.text import markdown_table
-from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.rows import is_unranked
+from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import Truth

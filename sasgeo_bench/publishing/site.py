@@ -141,8 +141,10 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
     if row["metric"] == "primary":
         yield f"right by the first alone {row['first_only']}, by the second alone {row['second_only']}"
     detectable = float(row["detectable"])
-    if not math.isnan(detectable):
-        yield f"least difference these queries would show {number_text(detectable)}"
+    if math.isinf(detectable):
+        yield "so few places would show no difference, however large"
+    elif not math.isnan(detectable):
+        yield f"least difference so many places would show {number_text(detectable)}"
     if contrast is not None:
         yield f"suites {', '.join(contrast.suites)}"
 

@@ -15,7 +15,7 @@ from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.lookalike import SIDE_M, find_lookalike, sheet_of
 from sasgeo_bench.leaderboard.lookalike_plot import draw_lookalike
-from sasgeo_bench.matching.learned_file import read_learned
+from sasgeo_bench.matching.learned_file import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import MANIFEST, read_region
@@ -118,12 +118,12 @@ def read_model(path: Path | None) -> ScorerModel | None:
         return None
     text = read_learned(path)
     if text is None:
-        message = f"there is no file {path}: name a .json of out/runs/<matcher>/<hash>/learned/"
+        message = f"there is no file {path}: {WHERE}"
         raise ConfigError(message)
     try:
         return check_classes(ScorerModel.from_text(text))
     except ConfigError as error:
-        message = f"{path} holds no model of a sasgeo matcher: {error}"
+        message = f"{path} is no learned text of a sasgeo matcher, {WHERE}: {error}"
         raise ConfigError(message) from error
 
 

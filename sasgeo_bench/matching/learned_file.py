@@ -12,6 +12,7 @@ from sasgeo_bench.matching.matcher import check_learned
 from sasgeo_bench.texts import one_line
 
 FOLDER: Final = "learned"  # next to the suites of a run
+WHERE: Final = f"name a .json of out/runs/<matcher>/<hash>/{FOLDER}/"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,13 +59,22 @@ def learned_path(run: Path, training_sha256: str) -> Path:
 
 
 def read_learned(path: Path) -> str | None:
-    """Read the learned text; None if there is none, `StoreError` if the file is damaged."""
+    """Read the learned text; None if there is none, `StoreError` if it is no such file, or is damaged.
+
+    Only a file of a run is said to be damaged: advice to remove it must not reach any other file or folder.
+    """
+    if path.is_dir():
+        message = f"{path} is a folder, not a learned text: {WHERE}"
+        raise StoreError(message)
     try:
         return check_learned(path.read_bytes().decode())
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError, MatchError) as error:
-        message = f"{path} is damaged ({one_line(str(error))}): remove it and run again, which trains anew"
+        fault = one_line(str(getattr(error, "strerror", None) or error))
+        is_of_run = path.absolute().parent.name == FOLDER
+        advice = f"is damaged ({fault}): remove this file and run again, which trains anew"
+        message = f"{path} {advice if is_of_run else f'is no learned text ({fault}): {WHERE}'}"
         raise StoreError(message) from error
 
 

@@ -71,7 +71,19 @@ def test_an_unknown_region_gets_the_nearest_name(mistake, own_out):
 def test_a_file_that_is_not_what_was_learnt_gets_one_line(mistake, tmp_path, text):
     path = tmp_path / "foreign.json"
     path.write_text(text)
-    assert str(path) in mistake("weights", "--learned", path)
+    assert f"{path} is no learned text of a sasgeo matcher, name a .json of" in mistake("weights", "--learned", path)
+
+
+def test_only_a_file_of_a_run_is_advised_to_be_removed(mistake, tmp_path):
+    own = tmp_path / "out/runs/mine/abcd/learned/1.json"
+    own.parent.mkdir(parents=True)
+    own.write_bytes(b"\xff")
+    (tmp_path / "layers.tif").write_bytes(b"\xff")
+    told = {path: mistake("weights", "--learned", path) for path in ("out", "layers.tif", own)}
+    assert "out is a folder, not a learned text: name a .json of out/runs/<matcher>/<hash>/learned/" in told["out"]
+    assert "layers.tif is no learned text (" in told["layers.tif"]
+    assert told[own].endswith("remove this file and run again, which trains anew")
+    assert not any("remove" in told[path] for path in ("out", "layers.tif"))
 
 
 def test_a_missing_file_and_foreign_classes_get_one_line(mistake, tmp_path, learnt_file):

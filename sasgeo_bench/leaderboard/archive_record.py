@@ -155,13 +155,15 @@ class _Task(_Record):
 
 
 class BoardRecord(_Record):
-    """The fields of `board.json` that pages use.
+    """The fields of `board.json` that pages use; every board has those without a default.
 
-    >>> BoardRecord.model_validate({"remarks": ["one"]}).remarks
-    ['one']
+    >>> BoardRecord.model_validate({"scorer_version": 4, "entries": [], "tasks": []}).remarks
+    []
     """
 
-    scorer_version: int | None = None
+    scorer_version: int
+    entries: list[_Entry]
+    tasks: list[_Task]
     task_version: int | None = None
     data_version: int | None = None
     made_by: str | None = None
@@ -178,8 +180,6 @@ class BoardRecord(_Record):
     rejectors: list[dict[str, str | bool | None]] = []
     remarks: list[str] = []
     failed: dict[str, str] = {}
-    entries: list[_Entry] = []
-    tasks: list[_Task] = []
 
 
 class _Picture(_Record):
@@ -214,10 +214,10 @@ def parse_record(data: bytes | str, model: type[Model]) -> Model:
 
     Raise ValueError naming the first fault in a line: no JSON, nested without end, or a value of another type.
 
-    >>> parse_record('{"remarks": 5}', BoardRecord)
+    >>> parse_record('{"scorer_version": 4, "entries": 5}', BoardRecord)
     Traceback (most recent call last):
         ...
-    ValueError: remarks is 5: Input should be a valid list
+    ValueError: entries is 5: Input should be a valid list
     """
     try:
         return model.model_validate(parse_json(data))

@@ -34,7 +34,7 @@ def put(folder, value, *, extras=(), version=1):
         folder,
         tables={"leaderboard": table, "scores": table},
         texts={"leaderboard.md": f"{value}\n"},
-        about={"scorer_version": version},
+        about={"scorer_version": version, "entries": [], "tasks": []},
         extras=extras,
     )
 

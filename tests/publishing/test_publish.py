@@ -385,15 +385,17 @@ def test_a_folder_without_a_board_is_one_line(mistake, tmp_path):
     assert "holds no board (board.json): name the folder of one" in mistake("publish", "--board", tmp_path / "none")
 
 
+def about(**changes):
+    return json.dumps({"scorer_version": 4, "entries": [], "tasks": []} | changes)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "fault"),
     [
         ("board.json", "{", "holds a damaged board"),
-        (
-            "board.json",
-            '{"entries": [1]}',
-            "holds a damaged board (entries.0 is 1: Input should be an object)",
-        ),
+        ("board.json", "{}", "holds a damaged board (scorer_version: Field required): score it again"),
+        ("board.json", '{"scorer_version": 4, "tasks": []}', "holds a damaged board (entries: Field required)"),
+        ("board.json", about(entries=[1]), "holds a damaged board (entries.0 is 1: Input should be an object)"),
         ("leaderboard.parquet", "half", "leaderboard.parquet cannot be read ("),
         ("scores.parquet", "half", "scores.parquet cannot be read ("),
         ("figures/age.svg.gz", "half", "holds a damaged board"),
@@ -404,15 +406,15 @@ def test_a_folder_without_a_board_is_one_line(mistake, tmp_path):
         ("pictures/pictures.json", "[" * 200_000, "pictures.json is damaged"),
         ("pictures/pictures.json", '{"cases": [{"file": "a.png", "said": 5}]}', "cases.0.said is 5"),
         ("board.json", "[" * 200_000, "holds a damaged board (it is nested too deep"),
-        ("board.json", '{"pipeline": 5}', "pipeline is 5"),
-        ("board.json", '{"libraries": []}', "libraries is []"),
-        ("board.json", '{"rejectors": [1]}', "rejectors.0 is 1"),
-        ("board.json", '{"remarks": "one"}', "remarks is 'one'"),
-        ("board.json", '{"entries": [{"name": null}]}', "entries.0.name is None"),
-        ("board.json", '{"entries": [{"name": "a", "card": []}]}', "entries.0.card is []"),
-        ("board.json", '{"entries": [{"name": "a", "learned": [{}]}]}', "entries.0.learned.0.file"),
-        ("board.json", '{"tasks": [{"region": 1}]}', "tasks.0.region is 1"),
-        ("board.json", '{"contrasts": [{}]}', "contrasts.0.name"),
+        ("board.json", about(pipeline=5), "pipeline is 5"),
+        ("board.json", about(libraries=[]), "libraries is []"),
+        ("board.json", about(rejectors=[1]), "rejectors.0 is 1"),
+        ("board.json", about(remarks="one"), "remarks is 'one'"),
+        ("board.json", about(entries=[{"name": None}]), "entries.0.name is None"),
+        ("board.json", about(entries=[{"name": "a", "card": []}]), "entries.0.card is []"),
+        ("board.json", about(entries=[{"name": "a", "learned": [{}]}]), "entries.0.learned.0.file"),
+        ("board.json", about(tasks=[{"region": 1}]), "tasks.0.region is 1"),
+        ("board.json", about(contrasts=[{}]), "contrasts.0.name"),
     ],
 )
 def test_damaged_files_of_a_board_are_one_line_and_nothing_is_written(own, mistake, name, text, fault):

@@ -27,6 +27,7 @@ from sasgeo_bench.publishing.site_files import (
     draw_text,
     held,
     read_board_files,
+    site_lock,
     write_site,
 )
 from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
@@ -74,13 +75,14 @@ def publish(
                 check_shape(name, table)
             source = _source(files, tell)
             pages = site_pages(source)
-        written = write_site(
-            target,
-            files,
-            pages=pages,
-            figures=filter(None, (*source.figures, source.rates_figure, source.map_figure)),
-            about={"board": source.name, "made_by": files.about.get("made_by")},
-        )
+        with site_lock(board, target, tell=tell):
+            written = write_site(
+                target,
+                files,
+                pages=pages,
+                figures=filter(None, (*source.figures, source.rates_figure, source.map_figure)),
+                about={"board": source.name, "made_by": files.about.get("made_by")},
+            )
     if written.site_bytes > MOST_BYTES:
         tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB without pictures: slow to open from afar")
     return written

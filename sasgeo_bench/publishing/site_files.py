@@ -5,7 +5,7 @@ import gzip
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -260,7 +260,7 @@ class Written:
 
 @contextmanager
 def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
-    """Lock a board and its site against other writers.
+    """Lock a board against other writers while its site is made.
 
     Raise `StoreError` if there is no board, or the target holds something that is no site.
     """
@@ -268,12 +268,16 @@ def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator
         message = f"{folder} holds no board ({BOARD}): name the folder of one, as out/boards/demo"
         raise StoreError(message)
     check_target(target)
-    if target.parent.resolve() == folder.resolve():
-        with locked(folder, tell=tell):  # a lock next to the site would be a foreign file in the board's folder
-            yield
-        return
-    with locked(folder, tell=tell), locked(target, tell=tell):
+    with locked(folder, tell=tell):
         yield
+
+
+def site_lock(folder: Path, target: Path, *, tell: Callable[[str], None]) -> AbstractContextManager[None]:
+    """Return the lock of a site, to be held while it is written: a board that is refused leaves no lock behind.
+
+    A site in the board's own folder has none: its file would be foreign there, and the lock of the board suffices.
+    """
+    return nullcontext() if target.parent.resolve() == folder.resolve() else locked(target, tell=tell)
 
 
 def check_target(target: Path) -> None:

@@ -423,6 +423,12 @@ def test_damaged_files_of_a_board_are_one_line_and_nothing_is_written(own, mista
     assert not (own / "site").exists()
 
 
+def test_a_refused_board_leaves_nothing_where_its_site_was_to_go(own, mistake, tmp_path):
+    (own / "board.json").write_text("{}", encoding="utf-8")
+    mistake("publish", "--board", own, "--into", tmp_path / "new" / "site")
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize(
     ("name", "column", "value"),
     [

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
 from sasgeo_bench.cli.options import Out, RegionFolders
+from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
@@ -20,12 +21,10 @@ from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.build import check_task, has_truths
 from sasgeo_bench.tasks.duplicates import constellations, search_split
 from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.sheet import write_sheet
-from sasgeo_bench.tasks.split import find_split_file, list_split_files, make_split, read_split_file
+from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.split_map import write_split_map
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.task_files import TASK, read_task
+from sasgeo_bench.tasks.task_files import read_task
 
 TOP_DROPS: Final = 12
 SOME_CASES: Final = 3
@@ -49,9 +48,9 @@ def inspect_command(
     out: Out = Path("out"),
 ) -> None:
     """Print the content of a region, task, split or run; draw a task's sheet, a split's map, a query and its answer."""
-    folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
-    if (folder / TASK).is_file():
-        _inspect_task(folder, out, query=query, rows=rows)
+    task_folder, region_folder = find_task(target, out), find_built(target, out)
+    if task_folder is not None:
+        _inspect_task(task_folder, out, query=query, rows=rows)
         return
     if Path(target).is_dir() and is_run(Path(target)):
         grids = {
@@ -62,34 +61,21 @@ def inspect_command(
         cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=rejector or (), tell=tell)
         _inspect_run(cases, out, query)
         return
-    _check_target(target, out)
+    if region_folder is None and not is_split(target):
+        raise no_target(target, out, region_folders or [])
     if query is not None:
         message = (
             f"--query draws a query of a task or a run, and {target} is neither: leave it out, or name one of these"
         )
         raise ConfigError(message)
-    if target.endswith(".toml") or target in list_split_files():
+    if region_folder is None:
         _inspect_split(target, out, region_folders or [])
         return
-    folder = Path(target) if Path(target).is_dir() else out / "regions" / target
-    manifest = read_manifest(folder)
-    print_table(_summary(manifest, folder))
+    manifest = read_manifest(region_folder)
+    print_table(_summary(manifest, region_folder))
     print_table(_class_table(manifest))
     if (reasons := _reasons(manifest)).row_count:
         print_table(reasons)
-
-
-def _check_target(target: str, out: Path) -> None:
-    """Refuse a task that is not there by naming those that are."""
-    suite, _, region = target.partition("/")
-    if suite not in EVERY_SUITE or (region and Path(target).is_dir()):
-        return
-    made = sorted(path.parent.name for path in (out / "tasks" / suite).glob(f"*/{TASK}"))
-    near = [name for name in made if base_of(name) == base_of(region)] or made
-    there = ", ".join(f"{suite}/{name}" for name in near[:8])
-    hint = f"there is {there}" if there else f"draw it with make-queries --suite {suite}"
-    message = f"{out / 'tasks'} holds no task {target}: {hint}"
-    raise ConfigError(message)
 
 
 def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
@@ -186,15 +172,16 @@ def verify_command(
     out: Out = Path("out"),
 ) -> None:
     """Check a region or a task against its hashes; search the parts of a split for ground they share."""
-    task_folder = Path(target) if Path(target).is_dir() else out / "tasks" / target
-    if (task_folder / TASK).is_file():
+    task_folder, region_folder = find_task(target, out), find_built(target, out)
+    if task_folder is not None:
         with_truths = "every query has its truth" if has_truths(task_folder, out=out) else "its truths are not here"
         faults, good = check_task(task_folder, out=out), f"all files are as task.json says, and {with_truths}"
-    elif target.endswith(".toml") or target in list_split_files():
+    elif region_folder is not None:
+        faults, good = differing_files(region_folder), "all files are as the manifest says"
+    elif is_split(target):
         faults, good = _shared_ground(target, out, region_folders or [])
     else:
-        folder = Path(target) if Path(target).is_dir() else out / "regions" / target
-        faults, good = differing_files(folder), "all files are as the manifest says"
+        raise no_target(target, out, region_folders or [])
     for line in faults:
         say(line)
     if faults:

@@ -121,8 +121,7 @@ def test_lists_and_findings_go_to_stdout(program):
         (("build-region", "town-grid", "--date", "2014-13-01"), "must be a date"),
         (("build-region", "town-grid", "--date", "2013-01-01"), "2014-01-01, 2019-01-01, 2025-01-01"),
         (("build-region", "town-grid", "--regions", "nowhere"), "no folder nowhere"),
-        (("inspect", "vaduz"), "build the region first"),
-        (("verify", "nowhere"), "holds no region.json"),
+        (("inspect", "vaduz"), "out/regions holds no region 'vaduz': build-region vaduz first"),
     ],
 )
 def test_a_mistake_gets_one_line_and_exit_2(mistake, words, told):

@@ -270,11 +270,35 @@ def test_a_damaged_task_json_gets_one_line(command, text, told, mistake, tmp_pat
 @pytest.mark.parametrize(
     ("target", "words"),
     [
-        ("nothing", "holds no region.json"),
+        ("nothing", "there is no region, task, split or run 'nothing': build-region and make-queries put some into"),
+        ("out/regions/vadus", "there is no region, task, split or run 'vadus', did you mean 'vaduz'?"),
+        ("vaduz@2013-08-03", "out/regions holds no region 'vaduz@2013-08-03': build-region vaduz --date 2013-08-03"),
         ("clean/nowhere", "holds no task clean/nowhere: draw it with make-queries --suite clean"),
+        ("claen/town-grid", "there is no suite 'claen', did you mean 'clean/town-grid'?"),
+        (".", ". is no region, task or run: build-region"),
     ],
 )
-def test_a_target_that_is_nothing_gets_one_line(target, words, mistake):
+@pytest.mark.parametrize("command", ["inspect", "verify"])
+def test_a_target_that_is_nothing_gets_one_line(command, target, words, mistake):
+    assert words in mistake(command, target)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("nothing", f"name one of those in out, 2 regions (town-grid, {RIVERSIDE}), 1 task ({CLEAN})"),
+        ("out", f"out is no region, task or run: name one of those in out, 2 regions (town-grid, {RIVERSIDE})"),
+        ("out/tasks", f"out/tasks is no region, task or run, but holds some: name one, as out/tasks/{CLEAN}"),
+        ("out/boards/mine", "out/boards/mine is a board: publish --board out/boards/mine makes a site of it"),
+        (f"out/tasks/{CLEAN}/task.json", f"is a file, not a region, task or run: name its folder out/tasks/{CLEAN}"),
+        ("clean/town-riversied", f"holds no task clean/town-riversied: there is {CLEAN}"),
+    ],
+)
+def test_a_target_that_is_something_else_is_told_what_it_is_and_what_there_is(target, words, mistake, tmp_path):
+    files = [f"regions/{RIVERSIDE}/region.json", "regions/town-grid/region.json", f"tasks/{CLEAN}/task.json"]
+    for path in (tmp_path / "out" / file for file in (*files, "boards/mine/board.json")):
+        path.parent.mkdir(parents=True)
+        path.touch()
     assert words in mistake("inspect", target)
 
 

@@ -76,23 +76,30 @@ def inspect_command(
     print_table(_class_table(manifest))
     if (reasons := _reasons(manifest)).row_count:
         print_table(reasons)
+    for line in differing_files(region_folder):
+        tell(f"warning: {line}")
 
 
 def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
     """Print what a task is and draw its contact sheet."""
     about = read_task(folder)
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for name, value in about.items():
-        table.add_row(
-            name, ", ".join(f"{key} {item}" for key, item in value.items()) if isinstance(value, dict) else str(value)
-        )
-    print_table(table)
     truth_folder = out / "truth" / about["suite"] / about["region"]
     chosen = panels(folder, truth_folder, out=out, count=rows, query_id=query)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in about.items():
+        table.add_row(name, _text_of(value))
+    print_table(table)
     path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
     say(f"contact sheet: {path}")
+
+
+def _text_of(value: object) -> str:
+    """Return a value of `task.json` as text without the signs of a programming language."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text_of(item)}" for key, item in value.items())
+    return ", ".join(map(_text_of, value)) if isinstance(value, list) else str(value)
 
 
 def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:

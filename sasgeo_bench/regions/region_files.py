@@ -158,17 +158,20 @@ def _read_geometry(path: Path) -> "gpd.GeoDataFrame":
 
 
 def differing_files(folder: Path) -> list[str]:
-    """Compare every file of a region with its manifest; return a line for each that is missing, changed or unknown."""
+    """Compare every file of a region with its manifest; return a line for each that is missing, changed or unknown.
+
+    Each line begins with the path of the file and ends with what to do about it.
+    """
     manifest = read_manifest(folder)
     found = []
     for name, record in manifest.files.items():
         path = folder / name
         if not path.is_file():
-            found.append(f"{name}: missing")
+            found.append(f"{path}: missing: {_MEND}")
         elif path.stat().st_size != record.bytes:
-            found.append(f"{name}: {path.stat().st_size} bytes, the manifest says {record.bytes}")
+            found.append(f"{path}: {path.stat().st_size} bytes, the manifest says {record.bytes}: {_MEND}")
         elif sha256_of(path) != record.sha256:
-            found.append(f"{name}: SHA-256 is {sha256_of(path)}, the manifest says {record.sha256}")
+            found.append(f"{path}: SHA-256 is {sha256_of(path)}, the manifest says {record.sha256}: {_MEND}")
     known = {MANIFEST, *manifest.files}
-    found += [f"{path.name}: not in the manifest" for path in sorted(folder.iterdir()) if path.name not in known]
-    return found
+    others = [path for path in sorted(folder.iterdir()) if path.name not in known]
+    return found + [f"{path}: not in the manifest: move it away" for path in others]

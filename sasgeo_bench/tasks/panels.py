@@ -4,10 +4,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence
@@ -17,6 +18,8 @@ from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, Query, Truth
 from sasgeo_bench.tasks.sheet import TWIN, Panel
 from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State, changed_share
 from sasgeo_bench.tasks.suites.mining import describe, mine
+
+SOME_IDS: Final = 3  # that the refusal of an unknown id names
 
 
 def panels(
@@ -51,7 +54,11 @@ def panels(
     if query_id is not None:
         chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
         if not chosen:
-            message = f"{task_folder} holds no query {query_id!r}"
+            some = ", ".join(sorted(truths)[:SOME_IDS])
+            message = (
+                f"{task_folder} holds no query {query_id!r}: it has {counted(len(truths), 'query', 'queries')}, "
+                f"as {some}; the column query_id of {task_files.QUERIES} lists all"
+            )
             raise ConfigError(message)
     ids = {truth.query_id for truth in chosen}
     queries = {}

@@ -213,6 +213,8 @@ def check_ours(folder: Path, names: Sequence[str]) -> None:
 def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     """Check a task against its `task.json` and its truths, if there are any; return a line for each fault.
 
+    Each line begins with the path of the file and ends with what to do about it.
+
     Raises
     ------
     StoreError
@@ -222,25 +224,31 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     faults = []
     path, recorded = task_folder / QUERIES, about["files"][QUERIES]
     if not path.is_file():
-        return [f"{QUERIES}: missing"]
+        return [f"{path}: missing: {_MEND}"]
     known = {task_folder / TASK, path}
-    faults += [f"{other.name}: not part of a task" for other in sorted(task_folder.rglob("*")) if other not in known]
+    others = [other for other in sorted(task_folder.rglob("*")) if other not in known]
+    faults += [f"{other}: not part of a task: move it away" for other in others]
     found = file_record(path)
     if found.model_dump() != recorded:  # its contents need no check
         was = f"{recorded['bytes']} bytes, {recorded['sha256']}"
-        return [f"{QUERIES}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}", *faults]
+        return [f"{path}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}: {_MEND}", *faults]
     asked = [(query.query_id, query.track) for query in read_queries(task_folder)]
     names, counts = [name for name, _ in asked], dict(Counter(track for _, track in asked))
     if counts != about["counts"]:
-        faults.append(f"{QUERIES}: holds {counts}, {TASK} says {about['counts']}")
+        faults.append(f"{path}: holds {_counts_text(counts)}, {TASK} says {_counts_text(about['counts'])}: {_MEND}")
     if (truth_folder / TRUTH).is_file():
         belongs = _belongs_to(truth_folder)
         if belongs != found.sha256:
-            faults.append(f"{TRUTH_OF}: the truths are of other queries, SHA-256 {belongs}: make the queries again")
+            faults.append(f"{truth_folder / TRUTH_OF}: the truths are of other queries, SHA-256 {belongs}: {_MEND}")
         answered = [truth.query_id for truth in read_truths(truth_folder)]
         if answered != names:
-            faults.append(f"{TRUTH}: {len(answered)} truths that are not those of the {len(names)} queries, in order")
+            not_those = f"{len(answered)} truths that are not those of the {len(names)} queries, in order"
+            faults.append(f"{truth_folder / TRUTH}: {not_those}: {_MEND}")
     return faults
+
+
+def _counts_text(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} of {track}" for track, count in sorted(counts.items()))
 
 
 def _belongs_to(truth_folder: Path) -> str:

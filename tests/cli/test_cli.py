@@ -80,7 +80,8 @@ def test_a_region_is_built_inspected_and_verified(program, tmp_path):
     (tmp_path / "out/regions/own/preview.png").write_bytes(b"?")
     code, out, _ = program("verify", "out/regions/own")
     assert code == 2
-    assert "preview.png" in out
+    assert out.startswith("out/regions/own/preview.png: 1 bytes, the manifest says ")
+    assert program("inspect", "own")[2] == f"warning: {out}"
 
 
 def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):

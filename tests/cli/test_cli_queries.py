@@ -194,6 +194,7 @@ def test_a_task_is_shown_with_a_sheet_of_the_right_size(program, out):
     localization = 2 * len(SUITES["clean"].variants)
     for word in ("Rotation, scale and crop", "ODbL", "map_fingerprint", f"localization {localization}"):
         assert word in told
+    assert not set("{}[]'") & set(told)
     three = cv2.imread(str(sheet)).shape[0]
     heights = []
     for rows in ("1", "2"):
@@ -231,7 +232,10 @@ def refused(program, *words):
 def test_what_is_wrong_with_a_task_is_told_on_one_line(program, out):
     show = ("inspect", CLEAN, "--out", out)
     task, truth, region = out / "tasks" / CLEAN, out / "truth" / CLEAN / TRUTH, out / "regions" / RIVERSIDE
-    assert "holds no query 'zzz'" in refused(program, *show, "--query", "zzz")
+    known = sorted(query.query_id for query in read_queries(task))
+    code, told, err = program(*show, "--query", "zzz")
+    assert (code, told) == (2, "")
+    assert f"holds no query 'zzz': it has {len(known)} queries, as {', '.join(known[:3])}; the column query_id" in err
     whole = truth.read_bytes()
     truth.unlink()
     assert "truth.parquet cannot be read" in refused(program, *show)

@@ -296,7 +296,7 @@ def test_any_flipped_byte_is_a_fault_and_nothing_else_goes_wrong(written):
     for at in range(0, len(content), 97):
         path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
         (fault,) = task_faults(*written)
-        assert fault.startswith("queries.parquet: ")
+        assert fault.startswith(f"{path}: ")
         assert "SHA-256" in fault
 
 
@@ -324,7 +324,7 @@ def test_a_missing_truth_a_foreign_file_and_a_wrong_count_are_faults(written):
     told = "\n".join(task_faults(*written))
     assert "truth.parquet: 2 truths that are not those of the 3 queries" in told
     assert "note.txt: not part of a task" in told
-    assert "holds {'retrieval': 3}, task.json says {'retrieval': 4}" in told
+    assert "holds 3 of retrieval, task.json says 4 of retrieval: make the queries again" in told
 
 
 def test_truths_say_which_queries_they_are_of_and_what_is_hidden_stays_with_them(folders):
@@ -345,7 +345,7 @@ def test_truths_of_other_queries_are_a_fault_though_their_ids_are_the_same(writt
     write_task(*others, ((one_query(query_id=name, season="x"), one_truth(query_id=name)) for name in names), ABOUT)
     (fault,) = task_faults(written[0], others[1])
     other = read_task(others[0])["files"][QUERIES]["sha256"]
-    assert fault == f"truth.json: the truths are of other queries, SHA-256 {other}: make the queries again"
+    assert fault == f"{others[1]}/truth.json: the truths are of other queries, SHA-256 {other}: make the queries again"
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]", "3", "{}", '{"queries_sha256": null}'])
@@ -354,7 +354,7 @@ def test_truths_that_do_not_say_which_queries_they_are_of_are_a_fault(text, writ
     if text is not None:
         (written[1] / TRUTH_OF).write_text(text)
     (fault,) = task_faults(*written)
-    assert fault.startswith("truth.json: the truths are of other queries, SHA-256 ")
+    assert fault.startswith(f"{written[1]}/truth.json: the truths are of other queries, SHA-256 ")
 
 
 def test_truths_in_another_order_are_a_fault(written):
@@ -365,7 +365,7 @@ def test_truths_in_another_order_are_a_fault(written):
 
 def test_a_task_without_its_queries_has_that_one_fault(written):
     (written[0] / QUERIES).unlink()
-    assert task_faults(*written) == ["queries.parquet: missing"]
+    assert task_faults(*written) == [f"{written[0]}/queries.parquet: missing: make the queries again"]
 
 
 @pytest.mark.parametrize(

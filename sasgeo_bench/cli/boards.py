@@ -22,9 +22,11 @@ from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import control_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
+from sasgeo_bench.publishing.archive_folder import is_pack
 from sasgeo_bench.publishing.submissions import submissions_for
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.tasks.private_seed import seed_record
+from sasgeo_bench.tasks.task_files import TRUTH
 
 CONTROL_FAILED: Final = 3  # exit status
 
@@ -126,6 +128,8 @@ def score(options: ScoreOptions) -> Board:
     >>> board.table[["matcher", "track", "recall_1"]]  # doctest: +SKIP
     """
     _check_names(options.name, options.truth)
+    if options.truth is not None and not any(map(is_pack, options.predictions)):  # stored results hold their truths
+        _check_truths(options.truth)
     submissions = options.submissions
     submitted = submissions_for(board_of(options.predictions), submissions, tell=options.tell) if submissions else ()
     usual = request_of(
@@ -168,6 +172,15 @@ def _check_names(name: str, truth: Path | None) -> None:
         raise ConfigError(message)
     if truth is not None and not truth.is_dir():
         message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
+        raise ConfigError(message)
+
+
+def _check_truths(truth: Path) -> None:
+    if next(truth.glob(f"*/*/{TRUTH}"), None) is None:
+        message = (
+            f"--truth names {truth}, which holds no truths (SUITE/REGION/{TRUTH}): "
+            "name the folder that make-queries put them into, as out/truth"
+        )
         raise ConfigError(message)
 
 

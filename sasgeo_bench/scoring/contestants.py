@@ -137,7 +137,7 @@ def read_entry_answers(
     if not answers and failures.first is not None:
         raise failures.first
     refused = next((source for source in stale if source in named), None)
-    if refused is not None or (stale and not answers):
+    if tasks and (refused is not None or (stale and not answers)):
         holder = "these tasks do" if folders else "its task does"
         first = refused or stale[0]
         message = f"{first} holds answers to other queries than {holder} now: {_HOW_TO_MEND}"

@@ -492,9 +492,8 @@ def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
     ):
         told = mistake(*words)
         assert "File name too long; check the path, your rights and the free space: xxx" in told
-    assert "--truth names nowhere, where there is no folder" in mistake(
-        "score", "--predictions", path, "--truth", "nowhere"
-    )
+    for truth, fault in (("nowhere", "where there is no folder"), ("out/tasks", "which holds no truths")):
+        assert f"--truth names {truth}, {fault}" in mistake("score", "--predictions", path, "--truth", truth)
     assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
 
 

@@ -12,7 +12,8 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.submission import example_card
 from sasgeo_bench.publishing.archive import laid_tasks
 from sasgeo_bench.publishing.submissions import SubmitRequest, hold_submission, make_submission
-from sasgeo_bench.scoring.submission_files import is_submission
+from sasgeo_bench.running.prediction_files import parts_of
+from sasgeo_bench.scoring.submission_files import SUBMISSION, is_submission
 from sasgeo_bench.scoring.validate import Violation, set_aside, validate
 
 MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
@@ -63,6 +64,17 @@ def validate_command(
     if is_submission(predictions):
         _validate_submission(predictions, tasks or [])
         return
+    if not predictions.exists():
+        message = (
+            f"there is no file or folder {predictions}: name a predictions file, the folder of a run, or a submission"
+        )
+        raise ConfigError(message)
+    if not parts_of(predictions):
+        message = (
+            f"{predictions} holds neither a run (part-*.parquet) nor a submission ({SUBMISSION}): name the folder of "
+            "one, a predictions file, or make a submission by 'submit'"
+        )
+        raise ConfigError(message)
     if not tasks:
         message = "validate needs --tasks: name task folders, or the stored results of a board"
         raise ConfigError(message)

@@ -220,8 +220,10 @@ def check_learned(learned: object) -> str:
     return learned
 
 
-def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
+def check_match(match: object, query: Query | Head | None, *, top_k: int) -> Match:
     """Check an answer to a query of at most `top_k` poses, and return it with floats for numbers.
+
+    Without a query, the poses of a retrieval answer are not compared with its candidates.
 
     Raises
     ------
@@ -250,7 +252,7 @@ def check_match(match: object, query: Query | Head, *, top_k: int) -> Match:
         )
         raise MatchError(message)
     confidence = None if match.confidence is None else _number(match.confidence, "confidence")
-    if query.track == "retrieval":
+    if query is not None and query.track == "retrieval":
         _check_candidates(poses, query.candidates)
     diagnostics = _diagnostics(match.diagnostics)
     return Match(poses=poses, scores=scores, confidence=confidence, diagnostics=diagnostics)

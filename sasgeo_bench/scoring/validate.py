@@ -229,14 +229,16 @@ def _row_faults(
     seen: dict[str, str],
     wrong: Sequence[Violation],
 ) -> Iterator[Violation]:
+    """Yield all faults of a row; of one with an unknown id, all that show without the query."""
     name = item["query_id"]
-    if name not in queries:
+    query = queries.get(name)
+    if query is None:
         yield Violation(file, row, "query_id", repr(name), "the id of a query of the tasks")
-        return
-    if name in seen:
+        wrong = [fault for fault in wrong if fault.column != "query_id"]
+    elif name in seen:
         yield Violation(file, row, "query_id", f"{name} again ({seen[name]})", "each query once")
-        return
-    seen[name] = f"{file}, row {row}"
+    else:
+        seen[name] = f"{file}, row {row}"
     if wrong:
         yield from wrong
         return
@@ -245,11 +247,11 @@ def _row_faults(
             count = len(item["candidates"])
             yield Violation(file, row, "candidates", counted(count, "pose"), f"none with {item['status']}")
         return
-    yield from _answer_faults(file, row, item, queries[name])
+    yield from _answer_faults(file, row, item, query)
 
 
-def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) -> Iterator[Violation]:
-    """Yield the faults of the answer itself."""
+def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked | None) -> Iterator[Violation]:
+    """Yield the faults of the answer itself; without its query, its place and candidates are not checked."""
     try:
         prediction = prediction_of(item)
         match = Match(
@@ -258,8 +260,9 @@ def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked) 
             confidence=prediction.confidence,
             diagnostics=prediction.diagnostics,
         )
-        check_match(match, query.head, top_k=MOST_CANDIDATES)
-        _check_inside(match.poses, query)
+        check_match(match, None if query is None else query.head, top_k=MOST_CANDIDATES)
+        if query is not None:
+            _check_inside(match.poses, query)
     except MatchError as error:
         found, _, expected = str(error).partition(", expected ")
         yield Violation(file, row, "candidates", found, expected or "an answer")

@@ -509,8 +509,10 @@ def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:
     path = mine()
     words = ("validate", "--predictions")
     assert "nowhere holds no task.json: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
-    assert "nowhere holds no predictions" in mistake(*words, "nowhere", "--tasks", TASK)
-    assert "holds no predictions" in mistake(*words, TASK, "--tasks", TASK)
+    for more in ((), ("--tasks", TASK)):  # what is wrong with the answers is told first
+        assert "there is no file or folder nowhere: name a predictions file" in mistake(*words, "nowhere", *more)
+        told = mistake(*words, TASK, *more)
+        assert f"{TASK} holds neither a run (part-*.parquet) nor a submission (submission.json)" in told
     path.write_bytes(path.read_bytes()[:-100])
     assert "mine.parquet cannot be read (" in mistake(*words, path, "--tasks", TASK)
     path.write_text("query_id,candidates\n")

@@ -71,6 +71,21 @@ def test_a_fault_is_named_by_its_row_and_column(tmp_path, task, answers, change,
     assert listed[0][3]
 
 
+@pytest.mark.parametrize(
+    ("change", "column"),
+    [
+        ({"latency_s": -1.0}, "latency_s"),
+        ({"status": "crash"}, "candidates"),
+        ({"candidates": ((POSE, 1.0), (POSE, 2.0))}, "candidates"),
+    ],
+)
+def test_a_row_with_an_unknown_or_a_repeated_id_has_all_faults_listed(tmp_path, task, answers, change, column):
+    for name in ("f" * 24, answers[0].query_id):
+        broken = [*answers[:2], replace(answers[2], query_id=name, **change), *answers[3:]]
+        found = [one[1] for one in faults(tmp_path, task, broken) if one[0] == 2]
+        assert found == ["query_id", column]
+
+
 @pytest.mark.parametrize("moved", [{"easting_m": 301_400.0}, {"northing_m": 5_457_365.0}, {"easting_m": 11.65}])
 def test_a_pose_outside_of_the_region_is_named(tmp_path, task, answers, moved):
     # The map is 1024 m wide; a disc of 500 m that holds a place of it ends 1000 m beyond its rim.

@@ -133,11 +133,27 @@ def _warn(
     tell(f"sasgeo-bench: warning: {one_line(str(message))}")
 
 
+# Base of a wrong word on the command line: of click, or of the copy of it that newer versions of typer bring along.
+_UsageError: Any = typer.BadParameter.__base__
+
+
+def _tell_usage(error: Any) -> None:  # noqa: ANN401 - see _UsageError
+    """Print a wrong word on the command line as one line; without any words the help is printed already."""
+    if len(sys.argv) == 1:
+        return
+    text = error.format_message().strip().removesuffix(".")
+    command = error.ctx.command_path if error.ctx is not None else "sasgeo-bench"
+    tell(f"sasgeo-bench: {one_line(f'{text[:1].lower()}{text[1:]}')} (see '{command} --help')")
+
+
 def main() -> None:
     """Run the program: 0 done, 2 the user's mistake or the disk's refusal on one line, 1 our bug with a traceback."""
     warnings.showwarning = _warn
     try:
-        app()
+        sys.exit(app(prog_name="sasgeo-bench", standalone_mode=False))
+    except _UsageError as error:
+        _tell_usage(error)
+        sys.exit(EXIT_USER)
     except SasgeoError as error:
         tell(f"sasgeo-bench: {error}")
         sys.exit(EXIT_USER)

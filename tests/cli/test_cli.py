@@ -130,6 +130,21 @@ def test_a_mistake_gets_one_line_and_exit_2(mistake, words, told):
 
 
 @pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("inspect", "out", "--rows", "0"), "invalid value for '--rows': "),
+        (("inspect", "out", "--row", "1"), "no such option: --row"),
+        (("inspect",), "missing argument"),
+        (("inspct",), "no such command 'inspct'"),
+    ],
+)
+def test_a_wrong_word_on_the_command_line_gets_one_line_that_leads_to_the_help(mistake, words, told):
+    line = mistake(*words)
+    assert line.startswith(f"sasgeo-bench: {told}")
+    assert line.endswith("(see 'sasgeo-bench inspect --help')" if words[0] == "inspect" else "'sasgeo-bench --help')")
+
+
+@pytest.mark.parametrize(
     ("old", "new", "told"),
     [
         ("cell_size_m = 1.0", "cell_size_m = 0.0", "cell_size_m must lie between"),

@@ -4,7 +4,7 @@
 import difflib
 import json
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
@@ -16,6 +16,7 @@ from sasgeo_bench.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
+_FEW: Final = 8  # known names that an error lists in full
 _LONGEST: Final = 300
 
 
@@ -181,13 +182,27 @@ def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[]
     if id_or_path.endswith(".toml"):
         path = Path(id_or_path)
         if not path.is_file():
-            message = f"there is no {noun} file {id_or_path}"
+            known = {name: name for name in list_known()} | {
+                other.stem: str(other) for other in sorted(path.parent.glob("*.toml"))
+            }
+            message = f"there is no {noun} file {id_or_path}{_hint(path.stem, known)} ({mend})"
             raise ConfigError(message)
         return path
-    known = list_known()
-    if id_or_path not in known:
-        near = difflib.get_close_matches(id_or_path, known, n=1, cutoff=0.6)
-        hint = f", did you mean {near[0]!r}?" if near else ""
-        message = f"there is no {noun} {id_or_path!r}{hint} ({mend})"
+    files = list_known()
+    if id_or_path not in files:
+        message = f"there is no {noun} {id_or_path!r}{_hint(id_or_path, dict(zip(files, files, strict=True)))} ({mend})"
         raise ConfigError(message)
-    return known[id_or_path]
+    return files[id_or_path]
+
+
+def _hint(name: str, known: Mapping[str, str]) -> str:
+    """Suggest the value of the name that is most like one, or else list all values if they are few.
+
+    >>> shipped = {"crossfit": "crossfit", "holdout": "holdout"}
+    >>> _hint("crosfit", shipped), _hint("mine", shipped)
+    (", did you mean 'crossfit'?", ': there are crossfit, holdout')
+    """
+    near = difflib.get_close_matches(name, known, n=1)
+    if near:
+        return f", did you mean {known[near[0]]!r}?"
+    return f": there are {', '.join(sorted(known.values()))}" if 0 < len(known) <= _FEW else ""

@@ -67,7 +67,7 @@ def publish(
     if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
         message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         raise StoreError(message)
-    with held(board, target, tell=tell), _with_figures(board, root, jobs, tell, progress) as folder:
+    with held(board, target, root=root, tell=tell), _with_figures(board, root, jobs, tell, progress) as folder:
         files = read_board_files(folder)
         check_public(files.about.get(PRIVATE), str(board))
         with _sound(board):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board's folder read for its site, and the folder of the site; written whole or not at all."""
 
+import difflib
 import gzip
 import re
 import zlib
@@ -26,6 +27,7 @@ from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import json_text, one_line
 
+_NAMED: Final = 5  # boards that an error lists
 _TAGS: Final = frozenset(  # of SVG: what shapes and texts are made of
     {
         *("svg", "g", "defs", "title", "desc", "metadata", "style", "path", "use", "rect", "circle", "ellipse", "line"),
@@ -259,13 +261,18 @@ class Written:
 
 
 @contextmanager
-def held(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
+def held(folder: Path, target: Path, *, root: Path, tell: Callable[[str], None]) -> Iterator[None]:
     """Lock a board against other writers while its site is made.
 
-    Raise `StoreError` if there is no board, or the target holds something that is no site.
+    Raise `StoreError` if there is no board, naming those in boards/ below `root`, or the target holds something that is
+    no site.
     """
     if not (folder / BOARD).is_file():
-        message = f"{folder} holds no board ({BOARD}): name the folder of one, as out/boards/demo"
+        boards = {path.parent.name: path.parent for path in sorted((root / "boards").glob(f"*/{BOARD}"))}
+        near = difflib.get_close_matches(folder.name, boards, n=1)
+        some = ", ".join(map(str, list(boards.values())[:_NAMED])) or "out/boards/demo"
+        hint = f"did you mean {boards[near[0]]}?" if near else f"name the folder of one, as {some}"
+        message = f"{folder} holds no board ({BOARD}): {hint}"
         raise StoreError(message)
     check_target(target)
     with locked(folder, tell=tell):

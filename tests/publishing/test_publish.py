@@ -383,6 +383,11 @@ def test_what_is_no_site_is_not_replaced(own, tmp_path):
 
 def test_a_folder_without_a_board_is_one_line(mistake, tmp_path):
     assert "holds no board (board.json): name the folder of one" in mistake("publish", "--board", tmp_path / "none")
+    there = tmp_path / "out" / "boards" / "demo" / "board.json"
+    there.parent.mkdir(parents=True)
+    there.touch()
+    for name, hint in (("demo", "did you mean out/boards/demo?"), ("none", "name the folder of one, as out/boards/d")):
+        assert f"{name} holds no board (board.json): {hint}" in mistake("publish", "--board", name)
 
 
 def about(**changes):

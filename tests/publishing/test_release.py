@@ -18,17 +18,21 @@ import jsonschema
 import mlcroissant
 import numpy as np
 import pyarrow.parquet as pq
+import pyproj
 import pystac
 import pytest
 import rasterio
+import shapely
 from PIL import Image
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rio_cogeo.cogeo import cog_validate
 
 from sasgeo_bench.files.folders import file_record
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.release_files import Release, open_release
+from sasgeo_bench.publishing.release_metadata import footprint
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import ATTRIBUTION
@@ -159,6 +163,20 @@ def test_the_lines_of_the_card_run_and_show_what_our_own_code_sees(written: Path
     first = next(task_files.read_queries((written / table).parent))
     assert told.splitlines()[-1] == first.query_id
     np.testing.assert_array_equal(np.load(tmp_path / "cells.npy"), first.evidence.cells)
+
+
+def test_a_footprint_keeps_to_the_sides_of_its_grid_between_its_points_too() -> None:
+    # 20 km at 61 degrees north: a side drawn between its corners alone would bulge by 14 m.
+    grid = Grid(epsg=32632, west_m=600_000.0, north_m=6_780_000.0, cell_size_m=100.0, rows=200, cols=200)
+    outline = footprint(grid)
+    assert outline.is_valid
+    assert 10 < outline.centroid.x < 12
+    assert 60 < outline.centroid.y < 62
+    fine = shapely.get_coordinates(shapely.segmentize(outline, 0.001))
+    back = pyproj.Transformer.from_crs(4326, grid.epsg, always_xy=True).transform(*fine.T)
+    box = shapely.box(*grid.bounds_m)
+    assert shapely.distance(box.exterior, shapely.points(*back)).max() < 0.5
+    assert shapely.Polygon(np.column_stack(back)).area == pytest.approx(box.area, rel=1e-4)
 
 
 def test_a_release_is_a_root_that_the_program_itself_runs_and_scores_on(written: Path, source: Path) -> None:

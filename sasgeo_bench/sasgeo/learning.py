@@ -101,7 +101,10 @@ def _fit_blend(lists: Sequence[_ScoredModes], scaling: NDArray[np.float64]) -> B
 
 
 def _pose(truth: Truth) -> Pose:
-    assert truth.pose is not None, "a training view has a place"  # noqa: S101
+    """Return the place of a training view, or raise ConfigError."""
+    if truth.pose is None:
+        message = f"the training view {truth.query_id} has no place: give views of present places to the fit"
+        raise ConfigError(message)
     return truth.pose
 
 

@@ -12,6 +12,7 @@ from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_matc
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.conformal import PROTECTION
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
+from sasgeo_bench.sasgeo.learning import _pose
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.variants import (
     Sasgeo,
@@ -200,6 +201,8 @@ def test_nothing_to_learn_from_is_said(training):
     absent = [(query, replace(truth, is_present=False)) for query, truth in training.pairs]
     with pytest.raises(ConfigError, match="no view of the training part"):
         Sasgeo().learn(replace(training, pairs=absent))
+    with pytest.raises(ConfigError, match="has no place: give views of present places"):
+        _pose(replace(training.pairs[0][1], pose=None))
 
 
 def test_match_before_prepare_says_so(tiny):

@@ -119,7 +119,7 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
         table.add_row(name, str(count), ", ".join(query_id[:SHOWN_LETTERS] for query_id in listed))
     stressed, total = int((cases.scores["role"] == STRESS).sum()), len(cases.scores)
     only = f", {stressed} of them under stress: boards count these first, and controls separately" if stressed else ""
-    say(f"{cases.entry.name}: {len(found)} failures in {counted(total, 'query', 'queries')}{only}")
+    say(f"{cases.entry.name}: {counted(len(found), 'failure')} in {counted(total, 'query', 'queries')}{only}")
     print_table(table)
 
 
@@ -203,7 +203,7 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
     built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]
     missing = [region for region in split.spec.region_ids if region not in built]
     if missing:
-        tell(f"{len(missing)} regions are not built and not searched: {', '.join(missing)}")
+        tell(f"not searched, for not built: {', '.join(missing)}")
     if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:  # noqa: PLR2004
         message = (
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
@@ -214,4 +214,4 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
         f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
         for item in search_split(split, maps)
     ]
-    return faults, f"no two parts share ground, {len(built)} regions searched"
+    return faults, f"no two parts share ground, {counted(len(built), 'region')} searched"

@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
+from sasgeo_bench.errors import counted
 from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
 from sasgeo_bench.running.testing import check_matcher
 
@@ -50,5 +51,5 @@ def check_matcher_command(
         table.add_row(check.name, check.outcome, check.found)
     print_table(table)
     if failed:
-        tell(f"{matcher}: {failed} checks failed")
+        tell(f"{matcher}: {counted(failed, 'check')} failed")
         raise typer.Exit(EXIT_USER)

@@ -110,8 +110,8 @@ def _sentence(row: Record, least: float) -> str:
     what = "share of queries that are right" if row["metric"] == "primary" else str(row["metric"])
     most = number_text(float(row["attainable"]))
     return (
-        f"Difference {difference} in the {what}: {values}. At most {most} could be gained; a difference of "
-        f"{number_text(least)} or more was to matter."
+        f"Difference {difference} in the {what}: {values}. At most {most} could be gained. "
+        f"The least difference registered as one that matters is {number_text(least)}."
     )
 
 

@@ -73,7 +73,8 @@ def read_manifest(folder: Path) -> Manifest:
     content = read_json(path, mend=_MEND)
     found = content.get("schema_version") if isinstance(content, dict) else None
     if found != SCHEMA_VERSION:
-        message = f"{path} has schema version {found!r}, this version reads {SCHEMA_VERSION}: {_MEND}"
+        stated = "states no schema version" if found is None else f"has schema version {found!r}"
+        message = f"{path} {stated}, this version reads {SCHEMA_VERSION}: {_MEND}"
         raise StoreError(message)
     try:
         manifest = check_document(content, Manifest, source=MANIFEST)

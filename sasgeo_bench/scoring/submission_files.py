@@ -183,7 +183,8 @@ def _read_document(path: Path) -> Submission:
     content = read_json(path, mend="submit again", most_bytes=_MOST_SUBMISSION_BYTES)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
-        message = f"{path} has schema version {version!r}, this version reads {SCHEMA_VERSION}: submit again"
+        stated = "states no schema version" if version is None else f"has schema version {version!r}"
+        message = f"{path} {stated}, this version reads {SCHEMA_VERSION}: submit again"
         raise StoreError(message)
     return check_document(content, Submission, source=str(path))
 

@@ -54,7 +54,7 @@ def test_each_task_gets_one_line_on_stderr_and_stdout_stays_empty(program, own_o
     code, told, err = program("make-queries", *words, "--out", own_out)
     assert (code, told) == (0, "")
     assert [line.split(":")[0] for line in err.splitlines()] == [f"absent on {RIVERSIDE}", f"no-priors on {RIVERSIDE}"]
-    assert f"5 queries at 1 sites in {own_out}/tasks/absent/{RIVERSIDE}" in err.splitlines()[0]
+    assert f"5 queries at 1 site in {own_out}/tasks/absent/{RIVERSIDE}" in err.splitlines()[0]
 
 
 def test_regions_are_built_on_the_way_and_two_at_once_give_what_one_after_the_other_does(program, tasks, tmp_path):
@@ -359,7 +359,7 @@ def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_p
     for kind in ("holdout", "crossfit"):
         split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
         code, told, err = program("verify", split, "--regions", path.parent, "--out", own_out)
-        assert (code, err) == (2, "1 regions are not built and not searched: town-suburb\n")
+        assert (code, err) == (2, "not searched, for not built: town-suburb\n")
         (line,) = told.splitlines()
         assert f"{RIVERSIDE}/0-0 and elsewhere/0-0 of different parts hold the same ground: " in line
         assert int(line.split("ground: ")[1].split()[0]) > 50

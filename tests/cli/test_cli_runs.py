@@ -152,7 +152,7 @@ def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, 
     code, told, err = check(spec)
     assert code == 2
     assert [line for line in told.splitlines() if " fail " in line and words in line]
-    assert err == f"{spec}: 1 checks failed\n"
+    assert err == f"{spec}: 1 check failed\n"
 
 
 # --- run ------------------------------------------------------------------------------------------------------------

@@ -396,7 +396,7 @@ def rename_folder(folder):
         (lambda at: (at / "predictions" / "mine.parquet").unlink(), "mine.parquet is missing"),
         (lambda at: os.truncate(at / "predictions" / "mine.parquet", 30_000_000), "has 30.0 MB, 20 MB at most"),
         (lambda at: (at / "submission.json").write_text("[" * 100_000, encoding="utf-8"), "is nested too deep"),
-        (lambda at: (at / "submission.json").write_text("[1]", encoding="utf-8"), "has schema version None"),
+        (lambda at: (at / "submission.json").write_text("[1]", encoding="utf-8"), "states no schema version"),
         (lambda at: os.truncate(at / "submission.json", 6_000_000), "has more than 5000000 bytes"),
         (lambda at: change_said(at, lambda said: said.update(schema_version=2)), "has schema version 2"),
         (lambda at: change_said(at, lambda said: said.pop("card")), "'card' is missing"),

@@ -192,6 +192,9 @@ def test_a_manifest_of_another_schema_is_refused_and_built_again(tmp_path):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"schema_version": 0}))
     with pytest.raises(StoreError, match="schema version 0"):
         read_manifest(plan.folder)
+    path.write_text("{}")
+    with pytest.raises(StoreError, match=r"region\.json states no schema version, this version reads 1: build"):
+        read_manifest(plan.folder)
     _, manifest = built(tmp_path, small())
     assert manifest.schema_version == 1
 

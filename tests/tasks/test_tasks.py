@@ -377,7 +377,7 @@ def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
         run.start()
     for run in runs:
         run.join()
-    assert sum("5 queries at 1 sites" in line for line in told) == 2
+    assert sum("5 queries at 1 site in" in line for line in told) == 2
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
     assert leftovers(own_out) == []
 

@@ -150,7 +150,7 @@ def main() -> None:
     """Run the program: 0 done, 2 the user's mistake or the disk's refusal on one line, 1 our bug with a traceback."""
     warnings.showwarning = _warn
     try:
-        sys.exit(app(prog_name="sasgeo-bench", standalone_mode=False))
+        sys.exit(app(prog_name="sasgeo-bench", standalone_mode=False) or 0)
     except _UsageError as error:
         _tell_usage(error)
         sys.exit(EXIT_USER)

@@ -300,9 +300,8 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
         made = put_task(map(drawer.draw, own), about, hidden, out=request.out, tell=tell)
-        tell(
-            f"{name} on {region}: {counted(made.queries, 'query', 'queries')} at {counted(len(sites), 'site')} in {made.folder}"
-        )
+        drawn = f"{counted(made.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
+        tell(f"{name} on {region}: {drawn} in {made.folder}")
         yield made
 
 

@@ -247,7 +247,7 @@ def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
     return faults
 
 
-def _counts_text(counts: Mapping[str, int]) -> str:
+def _counts_text(counts: Mapping[Any, int]) -> str:
     return ", ".join(f"{count} of {track}" for track, count in sorted(counts.items()))
 
 

@@ -54,12 +54,7 @@ def panels(
     if query_id is not None:
         chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
         if not chosen:
-            some = ", ".join(sorted(truths)[:SOME_IDS])
-            message = (
-                f"{task_folder} holds no query {query_id!r}: it has {counted(len(truths), 'query', 'queries')}, "
-                f"as {some}; the column query_id of {task_files.QUERIES} lists all"
-            )
-            raise ConfigError(message)
+            raise _no_query(task_folder, query_id, sorted(truths))
     ids = {truth.query_id for truth in chosen}
     queries = {}
     rivals: dict[Pose, tuple[Pose, ...]] = {}
@@ -75,6 +70,15 @@ def panels(
     if ids != set(queries):
         raise strangers
     return tuple(_panel(queries[truth.query_id], truth, state, rivals) for truth in chosen)
+
+
+def _no_query(task_folder: Path, query_id: str, known: Sequence[str]) -> ConfigError:
+    """Return the error for an id that no query of a task has, with the first of those they have."""
+    message = (
+        f"{task_folder} holds no query {query_id!r}: it has {counted(len(known), 'query', 'queries')}, "
+        f"as {', '.join(known[:SOME_IDS])}; the column query_id of {task_files.QUERIES} lists all"
+    )
+    return ConfigError(message)
 
 
 def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, PipelineFile
+from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.plugins import YARDSTICK, check_names
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import contrast_of, pack_board
@@ -142,19 +143,19 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
     if paper is None:
         return _Stage(name="", made=(), lacking=())
     made = partial(made_paper_task, trials=paper.trials, out=plan.out, private=plan.private)
-    found = {seed: made(seed=seed) for seed in paper.seeds}
-    tasks = plan.out / "tasks" / PAPER_SUITE
-    there = {seed: (tasks / region_name(seed)).is_dir() for seed in paper.seeds}
+    asked = list(product(paper.crops.items(), paper.seeds))
+    found = {(suite, seed): made(seed=seed, crop=crop) for (suite, crop), seed in asked}
+    there = {(suite, seed): (plan.out / "tasks" / suite / region_name(seed)).is_dir() for (suite, _), seed in asked}
     return _Stage(
         name=f"the paper's experiment, {counted(paper.trials, 'trial')} of each seed",
         made=tuple((made,) for made in found.values() if made is not None),
         lacking=tuple(
             _Lacking(
-                suite=PAPER_SUITE,
+                suite=suite,
                 region=region_name(seed),
-                why="drawn otherwise or damaged" if there[seed] else "not there yet",
+                why="drawn otherwise or damaged" if there[suite, seed] else "not there yet",
             )
-            for seed, made in found.items()
+            for (suite, seed), made in found.items()
             if made is None
         ),
     )
@@ -309,8 +310,8 @@ def run_pipeline(
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
-        by_region=(PAPER_SUITE,) if plan.spec.paper is not None and len(plan.spec.paper.seeds) > 1 else (),
-        by_block=(PAPER_SUITE,),
+        by_region=() if plan.spec.paper is None or len(plan.spec.paper.seeds) == 1 else tuple(plan.spec.paper.crops),
+        by_block=() if plan.spec.paper is None else tuple(plan.spec.paper.crops),
         jobs=plan.jobs,
         private=private,
         failed=failures.found,
@@ -445,7 +446,8 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
 
 def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
     """Return whether a matcher is asked on a suite: controls on all, all on the controls, else by the file."""
-    return suite in {CONTROLS, PAPER_SUITE} or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
+    to_all = {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}
+    return suite in to_all or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
 
 
 def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
@@ -474,10 +476,11 @@ def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
 
 
 def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
-    """Draw every seed of the paper's experiment, unless it is up to date, and return the task folders."""
+    """Draw every seed and reading of the paper's experiment, unless up to date, and return the task folders."""
     paper = plan.spec.paper
     if paper is None:
         return []
     asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
     made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
-    return [made(seed=seed) or draw(seed=seed) for seed in paper.seeds]
+    each = [{"seed": seed, "crop": crop} for crop, seed in product(paper.crops.values(), paper.seeds)]
+    return [made(**one) or draw(**one) for one in each]

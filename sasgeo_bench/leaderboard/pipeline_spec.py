@@ -22,6 +22,7 @@ from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
+Crop = Literal["unknown", "absent", "smaller"]
 CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
@@ -82,12 +83,32 @@ class TaskSpec(Document):
 class PaperSpec(Document):
     """The paper's own experiment: regions and trials of each of these seeds, drawn with no split and no other setting.
 
+    Cells that a crop cuts away are unknown. `crop_readings` draws the same trials again, each reading as a suite of its
+    own: as "absent" these cells are absent, as "smaller" the view ends where the crop does.
+
     >>> PaperSpec().seeds, PaperSpec().trials
     ([42], 220)
+    >>> PaperSpec(crop_readings=["absent"]).crops
+    {'paper-poc': 'unknown', 'paper-poc-crop-absent': 'absent'}
     """
 
     seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = [42]
     trials: Annotated[int, Field(ge=1, le=10_000)] = 220
+    crop_readings: list[Literal["absent", "smaller"]] = []
+
+    @property
+    def crops(self) -> dict[str, Crop]:
+        """Return the reading of the crop by suite."""
+        return {paper_suite(crop): crop for crop in ("unknown", *self.crop_readings)}
+
+
+def paper_suite(crop: Crop) -> str:
+    """Return the suite of a reading of the crop.
+
+    >>> paper_suite("unknown"), paper_suite("smaller")
+    ('paper-poc', 'paper-poc-crop-smaller')
+    """
+    return PAPER_SUITE if crop == "unknown" else f"{PAPER_SUITE}-crop-{crop}"
 
 
 class LearningSpec(Document):
@@ -139,6 +160,8 @@ class PipelineFile(NamedDocument):
             for name in CHOICE:
                 if not task[name]:
                     del task[name]
+        if self.paper is not None and not self.paper.crop_readings:
+            del fields["paper"]["crop_readings"]
         return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @property
@@ -165,7 +188,7 @@ class PipelineFile(NamedDocument):
     @model_validator(mode="after")
     def _names_once(self) -> Self:
         suites = [name for task in self.task for name in task.suites]
-        suites += [] if self.paper is None else [PAPER_SUITE]
+        suites += [] if self.paper is None else [PAPER_SUITE, *map(paper_suite, self.paper.crop_readings)]
         for what, listed in (
             ("suite", suites),
             ("matcher", self.matchers),
@@ -192,7 +215,8 @@ class PipelineFile(NamedDocument):
             if lost is not None:
                 message = f"contrast {item.name!r} names the suite {lost!r}, which is not drawn"
                 raise ValueError(message)
-            if item.suites == [PAPER_SUITE] and item.track != "retrieval":
+            of_paper = set() if self.paper is None else set(self.paper.crops)
+            if set(item.suites) <= of_paper and item.track != "retrieval":
                 message = f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"'
                 raise ValueError(message)
             _check_methods(item, self.matchers, self.rejectors)

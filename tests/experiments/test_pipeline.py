@@ -281,6 +281,32 @@ def test_the_paper_needs_no_split_no_region_and_no_task_and_has_its_own_defaults
     assert (paper.seeds, paper.trials) == ([42], 220)
 
 
+@pytest.mark.parametrize(
+    ("name", "sha256"),
+    [
+        ("paper-poc", "20b81e5725ddcb63b77f4355c80bfe64e3e14945317641430912198b2b39d7be"),
+        ("paper-poc-20", "a69a4ef59c144f26211d695895827e5c57dd9af64d64c1e9a356ed4990ab6b77"),
+    ],
+)
+def test_a_file_of_the_paper_keeps_the_hash_that_it_had_before_there_were_readings(name, sha256):
+    spec = read_pipeline_file(find_pipeline_file(name))
+    assert spec.sha256 == sha256
+    read = spec.model_copy(update={"paper": spec.paper.model_copy(update={"crop_readings": ["absent"]})})
+    assert read.sha256 != sha256
+
+
+def test_a_reading_of_the_crop_is_a_suite_that_all_matchers_are_asked_on_and_contrasts_name(tmp_path):
+    text = PAPER.replace("trials = 3", 'trials = 3\ncrop_readings = ["absent"]')
+    spec = parse_toml(text.replace('["paper-poc"]', '["paper-poc-crop-absent"]'), PipelineFile, source="few.toml")
+    said = plan_pipeline(spec, out=tmp_path, tell=lambda _: None).to_text()
+    assert "3 trials of each seed: 0 of 4 tasks up to date" in said
+    for suite in ("paper-poc", "paper-poc-crop-absent"):
+        assert f"to be drawn: {suite} on paper-poc-43" in said
+    wrong = text.replace('["paper-poc"]', '["paper-poc-crop-absent"]').replace('track = "retrieval"', "")
+    with pytest.raises(ConfigError, match="the paper's trials are retrieval"):
+        parse_toml(wrong, PipelineFile, source="few.toml")
+
+
 def test_the_paper_and_suites_may_stand_in_one_file():
     text = TEXT.replace("[[task]]", "[paper]\n\n[[task]]").replace('["clean"]\n', '["clean", "paper-poc"]\n')
     text = text.replace('suites = ["clean", "paper-poc"]\nsites', 'suites = ["clean"]\nsites')
@@ -295,6 +321,8 @@ def test_the_paper_and_suites_may_stand_in_one_file():
         ("[42, 43]", "[-1]", "greater than or equal to 0"),
         ("[42, 43]", "[]", "at least 1 item"),
         ("trials = 3", "trials = 0", "greater than or equal to 1"),
+        ("trials = 3", 'crop_readings = ["gone"]', "crop_readings"),
+        ("trials = 3", 'crop_readings = ["absent", "absent"]', "suite 'paper-poc-crop-absent' is listed twice"),
         ("trials = 3", "trails = 3", "unknown key 'paper.trails', did you mean 'trials'"),
         ('["paper-poc"]', '["paper-pock"]', "names the suite 'paper-pock', which is not drawn"),
         ('track = "retrieval"', "", "the paper's trials are retrieval"),

@@ -276,7 +276,7 @@ class Windows:
         >>> Windows(points_m=row, tile=np.zeros(4, dtype=np.int64), counts=counts).alike(0, 3).tolist()
         [0, 3, 2]
         """
-        # Squares of whole numbers: no rounding decides which of two windows is nearer.
+        # Squares of whole numbers: no rounding decides which of two windows is nearer. (Other descriptors may round.)
         squared = ((self.counts - self.counts[anchor]) ** 2).sum(axis=1)
         squared[anchor] = -1  # before a window that is quite alike
         found: list[int] = []

@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, hide
 from sasgeo_bench.tasks.perturbations.occlusion import CentralCrop
 from sasgeo_bench.tasks.suites.base import Seeds, State
+
+Around = Literal["anchor", "truth"]
 
 ROTATIONS_DEG: Final = (0.0, 30.0, 60.0, 90.0)
 SCALES: Final = (0.85, 1.0, 1.15)
@@ -79,14 +81,16 @@ class Crops:
     true: int
 
 
-def draw_crops(windows: Windows, rng: np.random.Generator) -> Crops:
-    """Draw ten similar windows, and one of them as the true one.
+def draw_crops(windows: Windows, rng: np.random.Generator, *, around: Around = "anchor") -> Crops:
+    """Draw ten similar windows, those nearest to a random one, and one of them as the true one.
 
-    Were the others the nearest to the true one, it would lie in their middle: ranking candidates by distance from the
-    mean of all ten would find it in a third of the trials without using the query.
+    Were the others the nearest to the true one, as with `around` "truth", it would lie in their middle: ranking
+    candidates by distance from the mean of all ten would find it in a third of the trials without using the query.
     """
     alike = windows.alike(int(rng.integers(len(windows.tile))))
     shown = rng.permutation(alike)
+    if around == "truth":
+        return Crops(windows=shown, true=int(np.flatnonzero(shown == alike[0])[0]))
     return Crops(windows=shown, true=int(rng.integers(len(shown))))
 
 

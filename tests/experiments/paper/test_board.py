@@ -24,6 +24,7 @@ draws = 200
 [paper]
 seeds = [42, 43]
 trials = 3
+crop_readings = ["smaller"]
 
 [[contrast]]
 name = "description"
@@ -55,8 +56,8 @@ def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
 
 def test_trials_are_drawn_once_and_asked_once(made):
     plan, _, one, lines, before = made
-    assert "3 trials of each seed: 0 of 2 tasks up to date, 2 to be drawn" in before
-    assert "3 trials of each seed: 2 of 2 tasks up to date" in plan.to_text()
+    assert "3 trials of each seed: 0 of 4 tasks up to date, 4 to be drawn" in before
+    assert "3 trials of each seed: 4 of 4 tasks up to date" in plan.to_text()
     assert "to be drawn" not in plan.to_text() + one.to_text()
     asked = [line.split(",")[0] for line in lines if "to ask" in line]
     assert asked == [f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")]
@@ -85,6 +86,8 @@ def test_the_board_holds_table_trials_and_figures(made):
     assert "no OSM data" in text
     assert "| Global descriptor | 0.586 [0.520, 0.649] |" in text
     assert "oracle_pose" in text
+    assert list(summary["crop"].unique()) == ["unknown", "smaller"]
+    assert "| not in the view, which is smaller | Global descriptor |" in text
     drawn = {path.name for path in (folder / "figures").iterdir()}  # beside those that every board has
     assert {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} <= drawn
 
@@ -96,7 +99,7 @@ def test_several_seeds_are_resampled_by_seed_one_by_its_tiles(made):
         assert set(summary["cluster"]) == {cluster}
         assert summary["clusters"].max() <= blocks
         said = json.loads((board_folder(name) / "board.json").read_text(encoding="utf-8"))
-        assert said["by_region"] == (["paper-poc"] if cluster == "seed" else [])
+        assert said["by_region"] == (["paper-poc", "paper-poc-crop-smaller"] if cluster == "seed" else [])
     assert set(board.scores["random"]["block"]) == {"paper-poc-42", "paper-poc-43"}
     rows = board.table[(board.table["stratum"] == "all") & (board.table["suite"] == "paper-poc")]
     assert set(rows["blocks"]) == {2}

@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.experiments.paper.board import difference_lines, paper_markdown
+from sasgeo_bench.experiments.paper.readings import with_gaps
 from sasgeo_bench.experiments.paper.tables import (
     PUBLISHED,
     example_of,
@@ -122,6 +123,29 @@ def test_of_one_seed_the_paper_is_held_against_wilsons_interval_over_trials(tria
     assert ours["hi"] < 0.955
     assert np.isnan(table.loc[("random", "recall_1"), "paper"])
     assert table.loc[("full_unknown", "mrr"), "value"] == (6 + 2 * 0.5) / 8
+
+
+def test_a_reading_is_held_against_the_experiment_on_the_same_trials():
+    before = {"full_unknown": scored(TRUTHS, HITS)}
+    after = {"full_unknown": scored(TRUTHS[::-1], [1, 1, 1, 1, 1, 1, 1, 0]).assign(suite="paper-poc-crop-absent")}
+    after["full_unknown"]["query_id"] += "-absent"
+    answers = {"full_unknown": predicted(TRUTHS, MARGINS)}
+    table = trials_frame(before, answers, {truth.query_id: truth for truth in TRUTHS})
+    own = summary_frame(table, board_of(before))
+    whole = pd.concat(
+        [with_gaps(own, "unknown", before, before), with_gaps(own, "absent", after, before, draws=200)],
+        ignore_index=True,
+    )
+    gaps = whole.set_index(["crop", "metric"])
+    row = gaps.loc[("absent", "recall_1")]
+    assert (row["gap"], row["won"], row["lost"]) == (1 / 8, 2, 1)  # the third and sixth are won, the first is lost
+    assert row["gap_lo"] < 1 / 8 < row["gap_hi"]
+    assert gaps["gap"].notna().sum() == 1
+    text = paper_markdown(whole, [], ABOUT, {})
+    assert "| absent | Full + unknown handling | 0.955 [0.918, 0.975] |" in text
+    assert f"| {row['gap']:+.3f} [{row['gap_lo']:+.3f}, {row['gap_hi']:+.3f}] | 2 and 1 |" in text
+    assert "- cropped cells absent: 2 of the paper's 3 figures lie inside our intervals; outside: Full" in text
+    assert "## Readings of the crop" not in paper_markdown(whole[whole["crop"] == "unknown"], [], ABOUT, {})
 
 
 def test_of_several_seeds_it_is_held_against_an_interval_over_seeds():

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's experiment: its protocol measured on what was made, the same bytes again, and nothing that tells."""
 
+import hashlib
+import json
 import os
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -12,16 +15,7 @@ import shapely
 
 from sasgeo_bench.errors import ConfigError, PerturbError
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task, task
-from sasgeo_bench.experiments.paper.task import (
-    CHANGE_FACTORS,
-    VERSION,
-    Transformation,
-    draw_crops,
-    draw_view,
-    map_change,
-    rectangle,
-    region_name,
-)
+from sasgeo_bench.experiments.paper.task import VERSION, region_name
 from sasgeo_bench.experiments.paper.tiles import (
     CANDIDATES,
     CLASSES,
@@ -37,13 +31,23 @@ from sasgeo_bench.experiments.paper.tiles import (
     mosaic_grid,
     tile_centre_m,
 )
+from sasgeo_bench.experiments.paper.trials import (
+    CHANGE_FACTORS,
+    Transformation,
+    draw_crops,
+    draw_view,
+    map_change,
+    rectangle,
+)
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.regions.layers import OUTSIDE
+from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION
 from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup
 from sasgeo_bench.tasks.suites.base import Seeds, State
 
 FEW = 4
@@ -60,10 +64,10 @@ def content(out, *kinds):
     return {str(path.relative_to(out)): path.read_bytes() for path in found if path.suffix != ".lock"}
 
 
-def pairs_of(out, seed=42):
+def pairs_of(out, seed=42, suite="paper-poc"):
     name = region_name(seed)
-    queries = task_files.read_queries(out / "tasks" / "paper-poc" / name)
-    truths = task_files.read_truths(out / "truth" / "paper-poc" / name)
+    queries = task_files.read_queries(out / "tasks" / suite / name)
+    truths = task_files.read_truths(out / "truth" / suite / name)
     return list(zip(queries, truths, strict=True))
 
 
@@ -241,6 +245,70 @@ def test_decoys_are_far_more_alike_than_windows_are_at_large_and_come_from_all_t
     at_large = np.linalg.norm(shares[::7, None] - shares[None, ::11], axis=2).mean()
     assert np.mean(near) < 0.4 * at_large
     assert tiles == set(range(TILES))
+
+
+# --- readings of the crop -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=["absent", "smaller"])
+def reading(request, out):
+    """The first trials under another reading of the crop, each with the same trial of the experiment."""
+    make_paper_task(seed=42, out=out, trials=12, crop=request.param, tell=lambda _: None)
+    first = {truth.pair_id: (query, truth) for query, truth in pairs_of(out)}
+    found = pairs_of(out, suite=f"paper-poc-crop-{request.param}")
+    return request.param, [(*pair, *first[pair[1].pair_id]) for pair in found]
+
+
+def test_another_reading_asks_the_same_trials_and_changes_cropped_cells_alone(reading):
+    crop, trials = reading
+    assert len(trials) == 12
+    assert {truth.measured["crop_fraction"] for _, truth, _, _ in trials} == {0.70, 0.85, 1.0}
+    for query, truth, before, truth_before in trials:
+        assert query.query_id != before.query_id
+        assert (query.candidates, query.prior, truth.pose) == (before.candidates, before.prior, truth_before.pose)
+        assert {**truth.measured, "unknown_share": 0} == {**truth_before.measured, "unknown_share": 0}
+        assert truth.changed_share == truth_before.changed_share
+        ring = round(WINDOW_CELLS * (1 - np.sqrt(truth.measured["retained_share"])) / 2)
+        inner = slice(ring, WINDOW_CELLS - ring)
+        kept, seen = before.evidence.cells[:, inner, inner], query.evidence.cells
+        if crop == "smaller":
+            np.testing.assert_array_equal(seen, kept)
+            continue
+        np.testing.assert_array_equal(seen[:, inner, inner], kept)
+        outside = np.ones(seen.shape, dtype=bool)
+        outside[:, inner, inner] = False
+        assert not (seen[outside] == PRESENT).any()
+        assert ring == 0 or (seen[outside] == ABSENT).mean() > 0.5
+        assert query.evidence.unknown_share <= truth.measured["occlusion_share"] + 1e-9  # the crop hides nothing
+
+
+def test_another_reading_is_up_to_date_by_itself(out, reading):
+    crop, _ = reading
+    found = made_paper_task(seed=42, out=out, trials=12, crop=crop)
+    assert found == out / "tasks" / f"paper-poc-crop-{crop}" / "paper-poc-42"
+    assert check_task(found, out=out) == []
+    assert made_paper_task(seed=42, out=out) is not None  # whose region was made again, the same to the byte
+    truth = out / "truth" / found.parent.name / found.name
+    assert len(panels(found, truth, out=out, count=2)) == 2
+
+
+def test_the_request_of_the_experiment_has_the_hash_that_it_had_before_there_were_readings(out):
+    record = {
+        "suite": ["paper-poc", 1, TASK_VERSION],
+        "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().model_dump(mode="json")],
+        "seed": 42,
+        "trials": 220,
+        "made_by": version("sasgeo-bench"),
+    }
+    hidden = task_files.read_hidden(out / "truth" / "paper-poc" / "paper-poc-42")
+    assert hidden["request_sha256"] == hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def test_query_ids_of_the_experiment_are_those_of_its_first_release(pairs):
+    ids = "".join(query.query_id for query, _ in pairs)
+    assert (
+        hashlib.sha256(ids.encode()).hexdigest() == "36a0d1d2b0e316c9f9298815066ffe7a68cde0ad5763a9f210772f7efc0dcca6"
+    )
 
 
 # --- what is up to date ---------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's first variant under every reading of decoys and descriptor: no speed, and no figure of any board.
 
-Draws the region if it is not there, and writes OUT/paper-decoys.csv and OUT/paper-decoys.md. Some minutes.
+Draws the region if it is not there, and writes OUT/paper-decoys.parquet and OUT/paper-decoys.md. Takes a minute.
 """
 
 import argparse
@@ -25,7 +25,7 @@ def main() -> None:
     region = read_region(words.out / "regions" / region_name(words.seed))
     table = decoys_frame(region, seed=words.seed, trials=words.trials, readings=list(every_reading()))
     text = decoys_markdown(table)
-    table.round(4).to_csv(words.out / "paper-decoys.csv", index=False, lineterminator="\n")
+    table.to_parquet(words.out / "paper-decoys.parquet", index=False)
     (words.out / "paper-decoys.md").write_text(text, encoding="utf-8")
     print(text)
 

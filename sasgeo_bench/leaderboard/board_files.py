@@ -127,7 +127,8 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
     if other is not None:
         message = f"{other} is no part of a board and would be lost: move it away, or name another board"
         raise StoreError(message)
-    check_known(folder, BOARD_FILES, "a board", patterns=(*FIGURE_FILES, *PICTURE_FILES), without=SITE_FOLDERS)
+    drawn = (*FIGURE_FILES, f"{FIGURES}/*.png", *PICTURE_FILES)  # figures of the paper's experiment are PNG, too
+    check_known(folder, BOARD_FILES, "a board", patterns=drawn, without=SITE_FOLDERS)
     check_site(folder / SITE)
     # A file that is gone by now went with the board that another writer has just replaced.
     versions = ((path, _version(path)) for path in sorted(folder.glob("*.parquet")))

@@ -25,8 +25,8 @@ from sasgeo_bench.scoring.intervals import (
     DRAWS,
     ClusterDraws,
     bootstrap_means,
+    percentile_interval,
     seed_of_text,
-    share_interval,
     wilson_mean,
 )
 from sasgeo_bench.scoring.pose import Ranks, hits, reciprocal_ranks
@@ -226,11 +226,12 @@ def _figures(drawn: DecoyTrials, ranked: Ranked) -> dict[str, Any]:
     inside = inside_wilson = 0
     for at, name in enumerate(_FIGURES):
         wilson = wilson_mean(values[:, at])
-        found, _ = share_interval(wilson.value, means[:, at], len(values))
+        by_tiles = percentile_interval(wilson.value, means[:, at])
+        lo, hi = min(by_tiles.lo, wilson.lo), max(by_tiles.hi, wilson.hi)
         paper = getattr(PUBLISHED[0], name)
-        row |= {name: found.value, f"{name}_lo": found.lo, f"{name}_hi": found.hi}
+        row |= {name: wilson.value, f"{name}_lo": lo, f"{name}_hi": hi}
         row |= {f"{name}_wilson_lo": wilson.lo, f"{name}_wilson_hi": wilson.hi}
-        inside += found.lo <= paper <= found.hi
+        inside += lo <= paper <= hi
         inside_wilson += wilson.lo <= paper <= wilson.hi
     return row | {"inside": inside, "inside_wilson": inside_wilson}
 

@@ -9,7 +9,9 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.leaderboard.board_files import check_board
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
+from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded
 
@@ -90,6 +92,11 @@ def test_the_board_holds_table_trials_and_figures(made):
     assert "| not in the view, which is smaller | Global descriptor |" in text
     drawn = {path.name for path in (folder / "figures").iterdir()}  # beside those that every board has
     assert {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} <= drawn
+
+
+def test_a_board_can_be_scored_again_where_it_lies(made):
+    plan, *_ = made
+    check_board(board_folder(plan), scorer_version=SCORER_VERSION)
 
 
 def test_several_seeds_are_resampled_by_seed_one_by_its_tiles(made):

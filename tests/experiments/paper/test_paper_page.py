@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/concepts/paper.md says what its stored tables hold: every row, every figure, and every count of readings."""
+
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from sasgeo_bench.experiments.paper.board import paper_markdown
+from sasgeo_bench.experiments.paper.decoys import decoys_markdown
+from sasgeo_bench.experiments.paper.tables import PUBLISHED
+
+PAGE = Path(__file__).parents[3] / "docs" / "concepts" / "paper.md"
+ABOUT = {"trials": "220 trials", "made_by": "a test", "data": "made up"}
+CROPS = ("unknown", "absent", "smaller")
+DECOYS = ["chosen_by", "nearest_to", "windows", "ranked_by"]
+
+
+@pytest.fixture(scope="module")
+def readings():
+    """The board of pipelines/paper-readings.toml."""
+    return pd.read_parquet(PAGE.parent / "paper" / "readings.parquet")
+
+
+@pytest.fixture(scope="module")
+def decoys():
+    """The table of benchmarks/paper_decoys.py."""
+    return pd.read_parquet(PAGE.parent / "paper" / "decoys.parquet")
+
+
+def part(title: str) -> str:
+    """The text under a heading of the page, its line ends as spaces in prose."""
+    return PAGE.read_text(encoding="utf-8").split(f"### {title}\n")[1].split("\n##")[0]
+
+
+def rows(text: str) -> list[str]:
+    return re.findall(r"^\| (?!Method|Recall@1|Chosen).* \|$", text, flags=re.MULTILINE)
+
+
+def prose(text: str) -> str:
+    return " ".join(line.strip() for line in text.splitlines() if not line.startswith("|"))
+
+
+def test_every_row_of_seed_42_is_that_of_the_board(readings):
+    told = paper_markdown(readings, [], ABOUT, {})
+    found = rows(part("Seed 42"))
+    assert len(found) == len(PUBLISHED)
+    for row in found:
+        assert f"\n{row} 220 |" in told
+
+
+def test_every_row_of_the_crop_is_that_of_the_board(readings):
+    table = readings.set_index(["title", "metric", "crop"])
+    expected = []
+    for item in PUBLISHED:
+        cells = [table.loc[(item.title, "recall_1", crop)] for crop in CROPS]
+        told = [f"{cell['value']:.3f} [{cell['lo']:.3f}, {cell['hi']:.3f}]" for cell in cells]
+        expected.append(f"| {item.title} | {item.recall_1:.3f} | {' | '.join(told)} |")
+    inside = readings[readings["paper"].notna()].groupby("crop")["is_within"].sum()
+    expected.append(f"| of 15 figures inside | | {' | '.join(str(inside[crop]) for crop in CROPS)} |")
+    assert rows(part("Cropped cells")) == expected
+
+
+def test_what_is_said_of_the_crop_follows_from_the_board(readings):
+    text = prose(part("Cropped cells"))
+    spatial = readings[(readings["title"] != "Global descriptor") & readings["paper"].notna()]
+    absent, smaller = (spatial[spatial["crop"] == crop] for crop in ("absent", "smaller"))
+    assert absent["is_within"].all()
+    assert len(absent) == 12
+    full = absent[(absent["matcher"] == "full_unknown") & (absent["metric"] == "recall_1")].iloc[0]
+    assert f"loses {full['lost']} trials and wins {full['won']}: {full['gap']:+.3f}" in text
+    assert f"[{full['gap_lo']:+.3f}, {full['gap_hi']:+.3f}]" in text
+    others = absent[(absent["matcher"] != "full_unknown") & (absent["metric"] == "recall_1")]
+    assert not others[["won", "lost"]].to_numpy().any()
+    by_matcher = smaller[smaller["metric"] == "recall_1"].set_index("matcher")
+    assert not by_matcher.loc["full_unknown", ["won", "lost"]].any()
+    for name in ("raster_graph", "raster_graph_stability"):
+        assert f"rise to {by_matcher.loc[name, 'value']:.3f}, above" in text
+        assert by_matcher.loc[name, "lo"] > by_matcher.loc[name, "paper"]
+
+
+def test_every_row_of_the_decoys_is_that_of_the_table(decoys):
+    told = decoys_markdown(decoys)
+    found = rows(part("Decoys and descriptors"))
+    assert len(found) > 5
+    for row in found:
+        assert f"\n{row.removesuffix(' |')} of 3 |" in told
+
+
+def test_what_is_said_of_the_decoys_follows_from_the_table(decoys):
+    text = prose(part("Decoys and descriptors"))
+    held = decoys[decoys["inside"] == 3]
+    by = {name: int((held["ranked_by"] == name).sum()) for name in ("counts", "shares", "unit", "rings")}
+    counts = f"of those ranked by counts {by['counts']}, by shares {by['shares']}, by unit {by['unit']}, by rings"
+    assert f"{len(held)} of {len(decoys)} readings hold all three: {counts} {by['rings']}." in text
+    assert f"By Wilson's, {(decoys['inside_wilson'] == 3).sum()} do." in text
+    plain = decoys[(decoys["chosen_by"] == "counts") & (decoys["ranked_by"] == "shares")]
+    assert f"{(plain['inside'] == 3).sum()} of {len(plain)} readings holds all three, and around an anchor none" in text
+    anchored = plain[plain["nearest_to"] == "anchor"]
+    fits = anchored[(anchored["recall_1_lo"] <= 0.586) & (anchored["recall_1_hi"] >= 0.586)]
+    assert len(fits) > 0
+    assert (fits["recall_5_lo"] > 0.886).all()
+    by_reading = decoys.set_index(DECOYS)["inside"]
+    assert by_reading[("rings", "truth", 1470, "rings")] == 3  # the literal reading
+    assert by_reading[("counts", "anchor", 1470, "shares")] == 0  # the experiment
+    assert all(len(set(held[name])) > 1 for name in DECOYS)  # "differ in every part"
+
+
+def test_the_experiment_is_the_same_in_both_tables(readings, decoys):
+    board = readings[(readings["matcher"] == "global_descriptor") & (readings["crop"] == "unknown")]
+    row = decoys.set_index(DECOYS).loc[("counts", "anchor", 1470, "shares")]
+    for name, value in board.set_index("metric")["value"].items():
+        assert row[name] == pytest.approx(value)

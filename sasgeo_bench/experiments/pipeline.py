@@ -482,5 +482,5 @@ def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
         return []
     asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
     made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
-    each = [{"seed": seed, "crop": crop} for crop, seed in product(paper.crops.values(), paper.seeds)]
-    return [made(**one) or draw(**one) for one in each]
+    each = product(paper.crops.values(), paper.seeds)
+    return [made(seed=seed, crop=crop) or draw(seed=seed, crop=crop) for crop, seed in each]

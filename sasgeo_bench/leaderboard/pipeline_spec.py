@@ -99,7 +99,8 @@ class PaperSpec(Document):
     @property
     def crops(self) -> dict[str, Crop]:
         """Return the reading of the crop by suite."""
-        return {paper_suite(crop): crop for crop in ("unknown", *self.crop_readings)}
+        crops: list[Crop] = ["unknown", *self.crop_readings]
+        return {paper_suite(crop): crop for crop in crops}
 
 
 def paper_suite(crop: Crop) -> str:

@@ -121,7 +121,7 @@ def _readings(every: pd.DataFrame, known: Sequence[str]) -> pd.DataFrame:
     for crop, summary in every.groupby("crop", sort=False):
         gaps = summary[summary["metric"] == "recall_1"].set_index("matcher").loc[list(known)]
         table = _beside(summary, known)
-        table.insert(0, "cropped cells", TITLES[crop])
+        table.insert(0, "cropped cells", TITLES[str(crop)])
         table["against unknown"] = [
             "-" if math.isnan(row["gap"]) else f"{row['gap']:+.3f} [{row['gap_lo']:+.3f}, {row['gap_hi']:+.3f}]"
             for row in gaps.to_dict("records")

@@ -131,7 +131,7 @@ def unit(vectors: Floats) -> Floats:
     [[0.6, 0.8], [0.0, 0.0]]
     """
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
 
 
 def describe_view(view: Evidence) -> dict[Ranked, Floats]:
@@ -192,7 +192,7 @@ def draw_trials(drawer: PaperDrawer, described: Described, decoys: Decoys, trial
         center_m = described.windows.points_m[shown[crops.true]]
         done = draw_transformation(seeds.rng("transformation"))
         seen = describe_view(draw_view(drawer.state, (float(center_m[0]), float(center_m[1])), done, seeds).evidence)
-        mapped = {**described.by, "shares": described.by["counts"]}
+        mapped: dict[Ranked, Floats] = {name: described.by["counts" if name == "shares" else name] for name in RANKED}
         ranks = [rank_of(seen[name], mapped[name][shown], crops.true) for name in RANKED]
         rows.append((*zip(*ranks, strict=True), described.windows.tile[shown[crops.true]]))
     above, tied, tile = zip(*rows, strict=True)

@@ -13,7 +13,7 @@ from sasgeo_bench.scoring.contrasts import Contrast, mean_finding
 from sasgeo_bench.scoring.intervals import DRAWS
 
 CROPS: Final[dict[str, Crop]] = {paper_suite(crop): crop for crop in get_args(Crop)}
-TITLES: Final[dict[Crop, str]] = {
+TITLES: Final[dict[str, str]] = {
     "unknown": "unknown",
     "absent": "absent",
     "smaller": "not in the view, which is smaller",
@@ -69,4 +69,4 @@ def held_lines(summary: pd.DataFrame) -> Iterator[str]:
             for row in outside.to_dict("records")
         )
         held = f"{len(rows) - len(outside)} of the paper's {len(rows)} figures lie inside our intervals"
-        yield f"cropped cells {TITLES[crop]}: {held}" + (f"; outside: {named}." if named else ".")
+        yield f"cropped cells {TITLES[str(crop)]}: {held}" + (f"; outside: {named}." if named else ".")

@@ -248,11 +248,12 @@ class Windows:
 
     `points_m` is the middle of each, easting and northing, shape (N, 2), `tile` the number of its tile, and `counts`,
     shape (N, 5), its global semantic descriptor: the number of its cells in which each of `CLASSES` is present.
+    Another descriptor may take its place.
     """
 
     points_m: NDArray[np.float64]
     tile: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    counts: NDArray[np.int64] | NDArray[np.float64]
 
     @classmethod
     def of(cls, region: Region) -> Self:
@@ -276,7 +277,7 @@ class Windows:
         >>> Windows(points_m=row, tile=np.zeros(4, dtype=np.int64), counts=counts).alike(0, 3).tolist()
         [0, 3, 2]
         """
-        # Squares of whole numbers: no rounding decides which of two windows is nearer. (Other descriptors may round.)
+        # Squares of whole numbers: no rounding decides which of two windows is nearer.
         squared = ((self.counts - self.counts[anchor]) ** 2).sum(axis=1)
         squared[anchor] = -1  # before a window that is quite alike
         found: list[int] = []

@@ -145,8 +145,9 @@ def _request_sha256(request: Request) -> str:
 
 def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     suite = find_suite(request.suite)
-    if request.group is not None and suite.card.has_own_priors:
-        message = f"suite {suite.card.name!r} is about what is known before: leave --prior out"
+    refusal = None if request.group is None else suite.refusal(request.group)
+    if refusal is not None:
+        message = f"suite {suite.card.name!r} {refusal}"
         raise ConfigError(message)
     scene, base = read_scene(request, suite, tell)
     reason = suite.lack(scene)

@@ -38,6 +38,7 @@ from sasgeo_bench.tasks.suites.mining import (
     mine,
     shuffled_poses,
 )
+from sasgeo_bench.tasks.suites.rivals import RivalCheck, kind_of
 
 CANDIDATES: Final = (10, 50, 200)  # per query; sites take turns
 LEAST_DRAWN: Final = 0.01  # of a view's cells: with fewer drawn cells on the map the truth cannot be found
@@ -47,6 +48,7 @@ _SAMPLES: Final = 256
 _GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # golden angle: spreads points evenly
 _TURNS: Final = 72
 _JITTER_M: Final = STRIDE_M / 2
+_HOLDING: Final = 1024  # points drawn for a centre, of which one at least should fit
 _ROUNDED_M: Final = 0.1  # resolution of a disc's centre
 
 
@@ -64,7 +66,7 @@ class Job:
 class Drawer:
     """Draw the queries of one suite on one region.
 
-    `windows` and `mined` cache what depends only on the map and the size of a view.
+    `windows` and `mined` cache what depends only on the map and the size of a view, `rivals` searches of equal views.
     """
 
     suite: Suite
@@ -75,6 +77,7 @@ class Drawer:
     choice: Choice = EVERYTHING
     windows: dict[tuple[str, float], Windows] = field(default_factory=dict)
     mined: dict[tuple[str, float, int], Decoys] = field(default_factory=dict)
+    rivals: RivalCheck = field(default_factory=RivalCheck)
 
     def jobs(self, sites: Sequence[Site]) -> list[Job]:
         """Return all queries in the order of their ids, so that neighbours in the table have nothing in common."""
@@ -120,7 +123,11 @@ class Drawer:
             group = replace(group, radius_m=None)
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))
         pose = draft.pose or site.pose
-        prior = make_prior(pose, group, rng=seeds.rng("prior", group.name))
+        rivals_m = self._rivals_m(job, draft)
+        prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)
+        if rivals_m:
+            listed = self.rivals.measure(state, draft.evidence, prior, truth_m=site.en_m, rivals_m=rivals_m)
+            draft = replace(draft, measured=draft.measured | listed)
         if draft.away_m:
             rng = seeds.rng("away", group.name, job.variant.name)
             prior = away(prior, pose, away_m=draft.away_m, share_of=self._share_of_disc(state), rng=rng)
@@ -171,7 +178,7 @@ class Drawer:
             candidate=right,
             pair_id=self._site_seeds(site).digest("pair", job.track).hex()[:16],
             role=variant.role,
-            kind=variant.kind,
+            kind=kind_of(variant.role, variant.kind, draft.measured),
             strength=variant.strength,
             strength_unit=self.suite.card.strength_unit,
             unknown_share=draft.evidence.unknown_share,
@@ -185,10 +192,19 @@ class Drawer:
             | _unanswerable(draft, state, draft.pose or site.pose, variant),
         )
 
+    def _rivals_m(self, job: Job, draft: Draft) -> tuple[tuple[float, float], ...]:
+        """Return the twins that the disc of a query must hold: none for retrieval, whose candidates hold them."""
+        return self._twins_m(job.site, draft) if job.track == "localization" else ()
+
+    def _twins_m(self, site: Site, draft: Draft) -> tuple[tuple[float, float], ...]:
+        """Return the twins of a site (easting, northing) if a draft shows the site and has twins."""
+        is_of_site = draft.has_twins and draft.has_pose and draft.pose is None
+        return self.scene.twins.get(site.index, ()) if is_of_site else ()
+
     def _twin(self, site: Site, draft: Draft) -> dict[str, float]:
         """Return the offset east and north of the site's first twin, if there is one, for contact sheets."""
-        twins = self.scene.twins.get(site.index, ())
-        if not (twins and draft.has_twins and draft.has_pose) or draft.pose is not None:
+        twins = self._twins_m(site, draft)
+        if not twins:
             return {}
         return {
             TWIN_EAST: round(twins[0][0] - site.pose.easting_m, 2),
@@ -261,13 +277,23 @@ def _clusters(
     return poses, int(np.flatnonzero(order == at)[0])
 
 
-def make_prior(pose: Pose, group: PriorGroup, *, rng: np.random.Generator) -> Prior:
-    """Draw a prior: a disc that holds the truth anywhere, and a heading and a scale off by their sigmas."""
+def make_prior(
+    pose: Pose, group: PriorGroup, *, rng: np.random.Generator, rivals_m: Sequence[tuple[float, float]] = ()
+) -> Prior:
+    """Draw a prior: a disc that holds the truth anywhere, and a heading and a scale off by their sigmas.
+
+    With rivals the disc holds them too: its centre is uniform over the places that allow it, which are the same
+    whichever of them is the truth.
+    """
     turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
     center_m = None
     if group.radius_m is not None:
         # Slightly less than the radius, so that rounding the centre does not put the truth outside.
-        center_m = _around(pose, (group.radius_m - _ROUNDED_M) * radius_share, turn)
+        reach_m = group.radius_m - _ROUNDED_M
+        center_m = _around(pose, reach_m * radius_share, turn)
+        if rivals_m:
+            places_m = np.array([(pose.easting_m, pose.northing_m), *rivals_m])
+            center_m = _holding(places_m, reach_m, rng=rng)
     sigma_deg = YAW_SIGMA_DEG[group.yaw]
     yaw_deg = None if sigma_deg is None else round(round(float(pose.yaw_deg + sigma_deg * yaw_noise), 1) % 360, 1)
     return Prior(
@@ -277,6 +303,25 @@ def make_prior(pose: Pose, group: PriorGroup, *, rng: np.random.Generator) -> Pr
         yaw_sigma_deg=sigma_deg,
         scale_sigma=group.scale_sigma,
     )
+
+
+def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Generator) -> tuple[float, float]:
+    """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre.
+
+    Raises
+    ------
+    ConfigError
+        If no point, or hardly any, is.
+    """
+    low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
+    # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
+    points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (_HOLDING, 2))
+    off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
+    fit = points[(off_m <= reach_m).all(axis=1)]
+    if len(fit) == 0:
+        message = f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior"
+        raise ConfigError(message)
+    return (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))
 
 
 def away(

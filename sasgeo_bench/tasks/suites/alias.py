@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `alias`: other places look like the true one, and the matcher should report that it cannot decide."""
 
+import math
 from typing import Final
 
 import numpy as np
@@ -53,5 +54,6 @@ SUITE: Final = AliasSuite(
         Variant(role="stress", kind="R4 identical blocks", strength=1.0),
     ),
     copies=COPIES,
+    within_m=math.inf,  # all of them are candidates, wherever they lie
     is_swapped=False,
 )

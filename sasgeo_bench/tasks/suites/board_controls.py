@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `controls`: views whose right score is known beforehand; a board on which they fail is not to be trusted."""
 
+import math
 from dataclasses import replace
 from typing import Final
 
@@ -102,5 +103,6 @@ SUITE: Final = ControlSuite(
             for number in range(1, _TWIN_DRAWS + 1)
         ),
     ),
+    within_m=math.inf,  # twins are candidates, and lie outside the disc of all others
     is_swapped=False,
 )

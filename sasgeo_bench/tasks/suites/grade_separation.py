@@ -38,7 +38,7 @@ def without(evidence: Evidence, class_name: str) -> Evidence:
 SUITE: Final = GradeSeparation(
     card=SuiteCard(
         name="grade-separation",
-        version=1,
+        version=2,
         title="Grade separation (G4)",
         what="A twin in which bridges lie on the ground, so that roads which pass over each other meet.",
         separates="Crossings without connection in the perceived vectors from rasters, in which both look alike.",

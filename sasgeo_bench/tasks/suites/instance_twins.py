@@ -40,7 +40,7 @@ class InstanceTwins(TwinSuite):
 SUITE: Final = InstanceTwins(
     card=SuiteCard(
         name="instance-twins",
-        version=1,
+        version=2,
         title="Instance twins (G3)",
         what="A twin in which every hall is a row of houses of seven metres; the two masks are the same cell by cell.",
         separates="Instances of the perceived vectors from masks, which tie.",

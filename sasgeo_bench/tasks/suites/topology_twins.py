@@ -67,7 +67,7 @@ def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence
 SUITE: Final = TopologyTwins(
     card=SuiteCard(
         name="topology-twins",
-        version=1,
+        version=2,
         title="Topology twins (G2)",
         what="A twin of the place in which one road at each junction stops two metres short of the other, or in which "
         "every X-junction is two T-junctions five metres apart; at every second site the other way round.",

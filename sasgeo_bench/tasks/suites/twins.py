@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base of the twin suites: copies of a site elsewhere on the map, with or without a change."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.query import RADII_M, PriorGroup
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.vectors import site_vectors
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 LATTICE_M: Final = 16.0
 OFF_M: Final = 24.0  # largest offset of a copied disc from its site, so that its rim does not show where the site is
 
-TWIN_GROUP: Final = PriorGroup(radius_m=2000.0, yaw="weak", scale_sigma=0.03)  # wide enough to hold the twins
+TWIN_GROUP: Final = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
+RIVAL_M: Final = 800.0  # largest distance of a twin from its site: a disc of `TWIN_GROUP` holds both
 
 Places = tuple[tuple[float, float], ...]
 ChangeOf = Callable[[Scene, Site, np.random.Generator], Change]
@@ -36,7 +38,8 @@ class TwinSuite(Suite):
 
     At every second site (if `is_swapped`) the true place has the change and the twin does not, so that "take the
     plainer one" does not help. The true place is drawn by lot from the original and its copies, so that "take the one
-    whose roads continue" does not help either. A view shows the true place; the twins are among its candidates.
+    whose roads continue" does not help either. A view shows the true place; the twins are among its candidates, or in
+    the disc of its prior, from which they lie at most `within_m`.
 
     `change_of` returns the change of a site's copy. `find` returns the places that sites are near, shape (N, 2), and
     `needs` names what a region without any lacks. The falsifier's vectors are those of the changed place if
@@ -47,6 +50,7 @@ class TwinSuite(Suite):
     find: Callable[[Scene], NDArray[np.float64]] | None = None
     needs: str = ""
     copies: int = 1
+    within_m: float = RIVAL_M
     is_swapped: bool = True
     falsifier_sees_change: bool = False
 
@@ -54,6 +58,16 @@ class TwinSuite(Suite):
         """Refuse a region without places of the right kind."""
         places = self.anchors(scene)
         return None if places is None or len(places) else self.needs
+
+    def refusal(self, group: PriorGroup) -> str | None:
+        """Refuse a disc that cannot hold a site and a twin at the largest distance."""
+        if group.radius_m is None or 2 * group.radius_m > self.within_m or math.isinf(self.within_m):
+            return super().refusal(group)
+        least = min(radius_m for radius_m in RADII_M if radius_m and 2 * radius_m > self.within_m)
+        return (
+            f"needs a disc that holds two places up to {self.within_m:g} m apart, and {group.name} has too small a one: "
+            f"use r{least:g} or more, or leave --prior out"
+        )
 
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:
         """Return the places that `find` finds."""
@@ -75,7 +89,8 @@ class TwinSuite(Suite):
         """Find places for the twins, plan the copies, and draw the true place of each site."""
         clear_m = self.clear_m(scene)
         spacing_m = max(min_distance_m(self.main_side_m / 2), 2 * clear_m)
-        targets = find_targets(scene.map, sites, clear_m=clear_m, spacing_m=spacing_m, copies=self.copies, seeds=seeds)
+        room = Room(clear_m=clear_m, spacing_m=spacing_m, within_m=self.within_m)
+        targets = find_targets(scene.map, sites, room, copies=self.copies, seeds=seeds)
         pastes: list[Paste] = []
         moved: list[Site] = []
         twins: dict[int, Places] = {}
@@ -145,10 +160,17 @@ def _by_lot(scene: Scene, site: Site, targets: Places, seeds: Seeds) -> tuple[Si
     return replace(site, pose=pose, block=blocks[true].id, is_copy=True), (site.en_m, *others)
 
 
-def find_targets(
-    state: State, sites: Sequence[Site], *, clear_m: float, spacing_m: float, copies: int, seeds: Seeds
-) -> dict[int, Places]:
-    """Find free places for the copies of every site: mapped, clear of every site and copy, well away from their own.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Room:
+    """What the copies of a site need: mapped ground around each, and least and largest distance from their site."""
+
+    clear_m: float
+    spacing_m: float
+    within_m: float = math.inf
+
+
+def find_targets(state: State, sites: Sequence[Site], room: Room, *, copies: int, seeds: Seeds) -> dict[int, Places]:
+    """Find free places for the copies of every site: mapped, clear of every site and copy, neither near nor far.
 
     Sites take turns; one without room for all its copies is dropped. The offset of a copy is a whole number of cells:
     at a fraction of a cell its mask would differ at every edge, which would give it away.
@@ -156,10 +178,10 @@ def find_targets(
     cell_m = state.grid.cell_size_m
     step = max(1, round(LATTICE_M / cell_m))
     inside = np.pad(state.known[::step, ::step], 1)
-    deep = scipy.ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > clear_m / LATTICE_M + 1
+    deep = scipy.ndimage.distance_transform_edt(inside)[1:-1, 1:-1] > room.clear_m / LATTICE_M + 1
     free = state.grid.to_centres_m(np.argwhere(deep) * step)
     for site in sites:
-        free = free[np.hypot(*(free - site.en_m).T) > 2 * clear_m + cell_m]
+        free = free[np.hypot(*(free - site.en_m).T) > 2 * room.clear_m + cell_m]
     found: dict[int, Places] = {}
     for site in sites:
         rng = seeds.rng("target", *_key(site))
@@ -167,12 +189,13 @@ def find_targets(
         taken: list[NDArray[np.float64]] = []
         left = free
         while len(taken) < copies:
-            far = left[np.hypot(*(left - own).T) > spacing_m + cell_m]
-            if len(far) == 0:
+            off_m = np.hypot(*(left - own).T)
+            fit = left[(off_m > room.spacing_m + cell_m) & (off_m < room.within_m - cell_m)]
+            if len(fit) == 0:
                 break
-            picked = own + np.rint((far[rng.integers(len(far))] - own) / cell_m) * cell_m
+            picked = own + np.rint((fit[rng.integers(len(fit))] - own) / cell_m) * cell_m
             taken.append(picked)
-            left = left[np.hypot(*(left - picked).T) > spacing_m + 2 * cell_m]
+            left = left[np.hypot(*(left - picked).T) > room.spacing_m + 2 * cell_m]
         if len(taken) == copies:
             free = left
             found[site.index] = tuple(_place(point) for point in taken)

@@ -51,7 +51,7 @@ class VolatileLure(TwinSuite):
 SUITE: Final = VolatileLure(
     card=SuiteCard(
         name="volatile-lure",
-        version=1,
+        version=2,
         title="Volatile lure (S2)",
         what="At the true place fields, parking, green and buildings have changed; a lure agrees on them and on no "
         "road or water.",

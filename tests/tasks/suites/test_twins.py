@@ -13,7 +13,7 @@ from sasgeo_bench.tasks.suites.base import Seeds, Shot, changed_share
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.topology_twins import either
-from sasgeo_bench.tasks.suites.twins import OFF_M, find_targets
+from sasgeo_bench.tasks.suites.twins import OFF_M, Room, find_targets
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.tasks.suites.volatile_lure import STABLE, VOLATILE
 from sasgeo_bench.tasks.twin import around, paste
@@ -400,7 +400,7 @@ def test_sites_without_room_for_their_copies_are_left_out(scene, carried):
     seeds = Seeds(root=1, names=())
     sites = choose_sites(town, suite, count=99, seeds=seeds, group=suite.card.group, may_be_fewer=True)
     clear_m, apart_m = suite.clear_m(town), min_distance_m(96.0)
-    found = find_targets(town.map, sites, clear_m=clear_m, spacing_m=apart_m, copies=1, seeds=seeds)
+    found = find_targets(town.map, sites, Room(clear_m=clear_m, spacing_m=apart_m), copies=1, seeds=seeds)
     assert len(found) < len(sites)
     assert {len(targets) for targets in found.values()} <= {1}
     edit = replace(suite, copies=1).edit(town, sites, seeds)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Twins: parts of a map copied to another place of it, with or without a change, so that two places look alike."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import lazy_loader  # type: ignore[import-untyped, unused-ignore]
@@ -113,9 +115,21 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
     return found
 
 
-def mirror(features: "gpd.GeoDataFrame", classes: Sequence[str], center_m: tuple[float, float]) -> "gpd.GeoDataFrame":
-    """Mirror the features of some classes from east to west about a place, which keeps their kind and amount."""
+def mirror(
+    features: "gpd.GeoDataFrame", classes: Sequence[str], center_m: tuple[float, float], *, within_m: float = math.inf
+) -> "gpd.GeoDataFrame":
+    """Mirror the features of some classes from east to west about a place, which keeps their kind and amount.
+
+    What crosses the circle `within_m` around the place is cut there, and its outer part stays.
+    """
     is_one = features["class"].isin(list(classes)).to_numpy()
+    if math.isfinite(within_m):
+        if not is_one.any():
+            return features
+        whole = partial(mirror, classes=classes, center_m=center_m)
+        middle = Paste(source_m=center_m, target_m=center_m, radius_m=within_m, change=whole)
+        table = pd.concat([features[~is_one], paste(features[is_one], [middle])], ignore_index=True)
+        return table.set_geometry("geometry", crs=features.crs)
     shapes = features.geometry.to_numpy().copy()
     flip, shift = np.array([-1.0, 1.0]), np.array([2 * center_m[0], 0.0])
     shapes[is_one] = shapely.transform(shapes[is_one], lambda at: (at * flip + shift).round(_DECIMALS))

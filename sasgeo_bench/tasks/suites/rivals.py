@@ -63,7 +63,7 @@ class RivalCheck:
         truth_m, rivals_m : tuple of float, sequence of tuple of float
             Easting and northing of the true place and of its rivals.
         """
-        key = (state.region, prior, hashlib.sha256(seen.cells).digest())
+        key = (state.region, prior, hashlib.sha256(seen.cells.tobytes()).digest())
         if key not in self.found:
             self.found[key] = plain_modes(state, seen, prior)
         modes = self.found[key]

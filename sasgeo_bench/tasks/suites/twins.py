@@ -65,7 +65,7 @@ class TwinSuite(Suite):
             return super().refusal(group)
         least = min(radius_m for radius_m in RADII_M if radius_m and 2 * radius_m > self.within_m)
         return (
-            f"needs a disc that holds two places up to {self.within_m:g} m apart, and {group.name} has too small a one: "
+            f"needs a disc that holds two places up to {self.within_m:g} m apart, and {group.name} has none: "
             f"use r{least:g} or more, or leave --prior out"
         )
 

@@ -6,19 +6,36 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite
 from sasgeo_bench.tasks.twin import mirror
 
 VOLATILE: Final = ("farmland", "parking", "field_boundary", "building", "green")
 STABLE: Final = ("road_major", "road_minor", "path_track", "railway", "water", "waterway", "coastline", "bridge")
+CHANGED_M: Final = 60.0  # radius of what differs: a third of a view; the rest is the same at both places
+_NEAR_M: Final = 40.0
+
+
+def _mixed(scene: Scene) -> NDArray[np.float64]:
+    """Return centres of buildings near something stable: a lure needs both."""
+    features = scene.map.features[scene.map.features["is_visible"].to_numpy()]
+    shapes = features.geometry.to_numpy()
+    centres = shapely.centroid(shapes[(features["class"] == "building").to_numpy()])
+    stable = shapely.STRtree(shapes[features["class"].isin(STABLE).to_numpy()])
+    near = np.unique(stable.query(centres, predicate="dwithin", distance=_NEAR_M)[0])
+    return np.asarray(shapely.get_coordinates(centres[near])).reshape(-1, 2)
 
 
 class VolatileLure(TwinSuite):
     """The world is the map with its volatile classes mirrored at each site; in a lure all classes are mirrored.
 
     So the view agrees with the true place on all stable classes and no volatile one, and with the lure the other way
-    round; amounts are the same at both.
+    round; amounts are the same at both. Only the middle of each place is mirrored: without anything in common with the
+    view, neither place would be in the list of a search, and there would be nothing to decide.
     """
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: Seeds) -> Edit:
@@ -28,15 +45,16 @@ class VolatileLure(TwinSuite):
         everything else as at the original.
         """
         plain = super().edit(scene, sites, seeds)
+        middle = partial(mirror, within_m=CHANGED_M)
         lures = [
-            replace(item, change=partial(mirror, classes=(*VOLATILE, *STABLE), center_m=item.source_m))
+            replace(item, change=partial(middle, classes=(*VOLATILE, *STABLE), center_m=item.source_m))
             for item in plain.map_pastes
         ]
         world = []
         for site, item in zip(plain.sites, plain.map_pastes, strict=True):
             changed = STABLE if site.is_copy else VOLATILE
             target_m = item.target_m if site.is_copy else item.source_m
-            change = partial(mirror, classes=changed, center_m=item.source_m)
+            change = partial(middle, classes=changed, center_m=item.source_m)
             world.append(replace(item, target_m=target_m, change=change))
         return replace(plain, map_pastes=tuple(lures), world_pastes=tuple(world))
 
@@ -53,15 +71,17 @@ SUITE: Final = VolatileLure(
         name="volatile-lure",
         version=2,
         title="Volatile lure (S2)",
-        what="At the true place fields, parking, green and buildings have changed; a lure agrees on them and on no "
-        "road or water.",
+        what="In the middle of the true place, 60 m around, fields, parking, green and buildings have changed; a lure "
+        "at most 800 m away agrees on them and on no road or water there. Around the middle both agree with the view.",
         separates="Stability weights from uniform ones, which count a field like a road.",
-        falsifier="The same places without the change: the lure agrees on nothing.",
+        falsifier="The same places without the change: in its middle the lure agrees on nothing.",
         strength_unit="1 where all that is volatile has changed",
         tracks=("retrieval", "localization"),
         group=TWIN_GROUP,
-        min_density=0.04,
+        min_density=0.18,
     ),
     variants=pair("unchanged", "S2", "unchanged again"),
+    find=_mixed,
+    needs="no building near a road, a railway or water",
     is_swapped=False,
 )

@@ -57,7 +57,7 @@ SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
 _MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # hashes of the searched map in `task.json`
-_READ: Final = " and ".join(map(str, TASK_VERSIONS))  # readable versions of tasks
+_READ: Final = ", ".join(map(str, TASK_VERSIONS))  # readable versions of tasks
 
 
 class TaskFile(Document):
@@ -176,7 +176,7 @@ def read_task(folder: str | Path) -> dict[str, Any]:
     about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):
         if name in about and about[name] not in known:
-            noun, versions = name.replace("_", " "), " and ".join(map(str, known))
+            noun, versions = name.replace("_", " "), ", ".join(map(str, known))
             message = f"{path} has {noun} {about[name]!r}, this version reads {versions}: {_MEND}"
             raise StoreError(message)
     try:

@@ -4,6 +4,7 @@
 import datetime as dt
 import json
 from dataclasses import fields
+from pathlib import Path
 
 import geopandas as gpd
 import numpy as np
@@ -18,7 +19,7 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth
+from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Query, Truth
 from sasgeo_bench.tasks.task_files import (
     QUERIES,
     TASK,
@@ -33,6 +34,7 @@ from sasgeo_bench.tasks.task_files import (
 )
 from sasgeo_bench.tasks.task_rows import ASKED, QUERY_SCHEMA, asked_sha256, query_of, query_row, truth_of, truth_row
 
+ROOT = Path(__file__).parents[2]
 ABOUT = {"suite": "clean", "title": "Clean", "region": "here", "map_fingerprint": "0"}
 SAID = ABOUT | {"schema_version": 1, "task_version": TASK_VERSION, "counts": {}, "files": {}}
 
@@ -393,6 +395,16 @@ def test_a_damaged_or_foreign_task_json_is_named_with_its_mend(text, told, writt
     assert told in str(caught.value)
     assert str(caught.value).endswith("make the queries again")
     assert "\n" not in str(caught.value)
+
+
+def test_tasks_and_stored_boards_of_earlier_versions_stay_what_they_were(written):
+    told = json.loads((written[0] / TASK).read_text())
+    for version in TASK_VERSIONS:
+        (written[0] / TASK).write_text(json.dumps(told | {"task_version": version}))
+        assert read_task(written[0])["task_version"] == version
+    boards = [json.loads(path.read_text()) for path in (ROOT / "docs" / "results").glob("*/board.json")]
+    assert boards
+    assert {board["task_version"] for board in boards} <= set(TASK_VERSIONS)
 
 
 def test_bytes_that_are_no_text_are_a_damaged_task_json(written):

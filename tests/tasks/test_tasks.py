@@ -23,6 +23,7 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.tasks.build import check_task, has_truths, is_of_region, make_tasks
 from sasgeo_bench.tasks.panels import panels
+from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.task_files import (
     QUERIES,
     TASK,
@@ -305,6 +306,16 @@ def test_a_count_that_a_region_does_not_hold_is_refused_and_fewer_may_be_taken(o
 def test_a_region_that_cannot_carry_a_suite_is_told_what_it_lacks(own_out):
     with pytest.raises(ConfigError, match="cannot carry suite 'grade-separation': no bridge"):
         make(own_out, "grade-separation")
+    assert content(own_out) == {}
+
+
+def test_a_disc_too_small_for_twins_is_refused_in_one_line_before_anything_is_read(own_out):
+    with pytest.raises(ConfigError) as caught:
+        make(own_out, "topology-twins", group=PriorGroup.parse("r250-weak-s3"))
+    assert str(caught.value) == (
+        "suite 'topology-twins' needs a disc that holds two places up to 800 m apart, and r250-weak-s3 has none: "
+        "use r500 or more, or leave --prior out"
+    )
     assert content(own_out) == {}
 
 

@@ -37,7 +37,7 @@ TOWN_OF = {
     "topology-twins": "town-grid large",
     "instance-twins": "town-old-town large",
     "grade-separation": "town-industrial large",
-    "volatile-lure": "town-agricultural large",
+    "volatile-lure": "town-old-town large",
     "alias": "town-agricultural huge",
     "controls": "town-suburb large",
 }

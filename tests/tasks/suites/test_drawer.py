@@ -204,6 +204,29 @@ def test_a_truth_says_where_the_twin_of_its_place_lies(drawn):
         np.testing.assert_allclose(told, (east_m, north_m), atol=0.01)
 
 
+@pytest.mark.parametrize("name", ["topology-twins", "volatile-lure"])
+def test_the_disc_of_a_query_holds_the_twin_and_its_truth_says_whether_a_search_lists_both(drawn, name):
+    made, _, drafts = drawn(name)
+    for query, truth in drafts:
+        if query.track == "retrieval":  # the twin is a candidate there
+            assert "rivals" not in truth.measured
+            continue
+        site = next(site for site in made.sites if site.pose == truth.pose)
+        for place in (site.en_m, *made.scene.twins[site.index]):
+            assert np.hypot(*np.subtract(place, query.prior.center_m)) <= query.prior.radius_m
+        told = truth.measured
+        assert (told["rivals"], told["rivals_in_disc"]) == (1, 1)
+        if truth.role == "stress":
+            is_listed = (told["rivals_listed"], told["truth_listed"]) == (1, 1)
+            assert truth.kind.startswith("unrivalled ") != is_listed
+
+
+def test_a_control_of_a_board_has_a_twin_outside_its_disc_and_no_rival(drawn):
+    _, _, drafts = drawn("controls")
+    assert any(query.track == "localization" for query, _ in drafts)
+    assert not any("rivals" in truth.measured for _, truth in drafts)
+
+
 def test_ids_say_nothing_and_do_not_depend_on_how_many_sites_there_are(drawn):
     made, drawer, drafts = drawn("growth")
     ids = [query.query_id for query, _ in drafts]

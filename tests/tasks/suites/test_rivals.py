@@ -99,10 +99,11 @@ def test_twins_lie_within_reach_of_one_disc(carried, name):
 # The list
 
 
-def town(*, rival=True, side=400, patch=60):
-    """A map of random blocks of 2 m, on which a square repeats elsewhere, or is blank there."""
-    cells = np.kron(rng(0).random((2, side // 2, side // 2)) < 0.3, np.ones((1, 2, 2))).astype(np.uint8)
-    cells[:, 280 : 280 + patch, 260 : 260 + patch] = cells[:, 80 : 80 + patch, 100 : 100 + patch] if rival else 0
+def town(*, rival=True, side=600, patch=112):
+    """A map of random blocks of 8 m, on which a square repeats elsewhere, or is full there."""
+    cells = np.kron(rng(0).random((2, side // 8, side // 8)) < 0.3, np.ones((1, 8, 8))).astype(np.uint8)
+    copy = cells[:, 80 : 80 + patch, 96 : 96 + patch] if rival else 1
+    cells[:, 400 : 400 + patch, 400 : 400 + patch] = copy
     nothing = gpd.GeoDataFrame({"class": []}, geometry=gpd.GeoSeries([], crs="EPSG:32632"))
     return State(
         region="here",
@@ -115,17 +116,17 @@ def town(*, rival=True, side=400, patch=60):
     )
 
 
-TRUTH = Pose(easting_m=130.0, northing_m=290.0, yaw_deg=0.0)
-RIVAL = (290.0, 90.0)
-PRIOR = Prior(center_m=(210.0, 190.0), radius_m=150.0, yaw_deg=2.0, yaw_sigma_deg=4.0, scale_sigma=0.01)
+TRUTH = Pose(easting_m=152.0, northing_m=464.0, yaw_deg=0.0)
+PLACE, RIVAL = (152.0, 464.0), (456.0, 144.0)
+PRIOR = Prior(center_m=(304.0, 304.0), radius_m=250.0, yaw_deg=2.0, yaw_sigma_deg=4.0, scale_sigma=0.01)
 
 
 def seen(state):
-    return state.view(TRUTH, size_cells=48, cell_size_m=1.0)
+    return state.view(TRUTH, size_cells=96, cell_size_m=1.0)
 
 
 def measure(state, prior=PRIOR):
-    return RivalCheck().measure(state, seen(state), prior, truth_m=(130.0, 290.0), rivals_m=[RIVAL])
+    return RivalCheck().measure(state, seen(state), prior, truth_m=PLACE, rivals_m=[RIVAL])
 
 
 def test_a_search_lists_a_place_and_its_copy_with_about_one_score():
@@ -145,14 +146,16 @@ def test_a_rival_that_no_search_would_list_makes_a_stress_another_kind():
 
 def test_a_place_that_no_search_would_list_makes_a_stress_another_kind_too():
     state = town()
-    blank = replace(state, bits=LayerBits(bits=np.where(np.arange(400)[:, None] < 200, 0, state.bits.bits), count=2))
-    told = RivalCheck().measure(blank, seen(state), PRIOR, truth_m=(130.0, 290.0), rivals_m=[RIVAL])
+    full = replace(
+        state, bits=LayerBits(bits=np.where(np.arange(600)[:, None] < 220, np.uint32(3), state.bits.bits), count=2)
+    )
+    told = RivalCheck().measure(full, seen(state), PRIOR, truth_m=PLACE, rivals_m=[RIVAL])
     assert (told["rivals_listed"], told["truth_listed"]) == (1, 0)
     assert kind_of("stress", "S2", told) == "unrivalled S2"
 
 
 def test_a_rival_outside_the_disc_is_counted_as_such():
-    told = measure(town(), replace(PRIOR, center_m=(130.0, 270.0), radius_m=60.0))
+    told = measure(town(), replace(PRIOR, center_m=(152.0, 444.0), radius_m=60.0))
     assert (told["rivals_in_disc"], told["rivals_listed"], told["truth_listed"]) == (0, 0, 1)
 
 
@@ -160,31 +163,32 @@ def test_a_kind_without_rivals_keeps_its_name():
     assert kind_of("stress", "U2 wedge", {"unknown_added": 0.3}) == "U2 wedge"
 
 
-def test_the_score_of_a_view_without_error_is_one_at_its_place_and_that_of_its_opposite_minus_one():
+def test_the_score_of_a_view_without_error_is_one_at_its_place_and_that_of_its_opposite_negative():
     state = town()
     exact = replace(PRIOR, yaw_deg=0.0, yaw_sigma_deg=1.0, scale_sigma=0.0)
     best = plain_modes(state, seen(state), exact)[0]
     assert best.score == pytest.approx(1, abs=0.03)
     opposite = seen(state).replace(1 - seen(state).cells)
-    near = replace(exact, center_m=(130.0, 290.0), radius_m=1.0)
-    assert plain_modes(state, opposite, near)[0].score < -0.9
+    near = replace(exact, center_m=PLACE, radius_m=1.0)
+    assert plain_modes(state, opposite, near)[0].score < -0.5
 
 
 def test_unknown_cells_count_neither_way():
     state = town()
     cells = seen(state).cells.copy()
-    cells[:, :24] = 2
+    cells[:, :40] = 2
     assert plain_modes(state, seen(state).replace(cells), PRIOR)[0].score == pytest.approx(1, abs=0.05)
 
 
 def test_the_map_around_a_disc_is_that_of_the_whole_map_and_unknown_beyond_it():
     state = town()
     whole = field_of(state, state.classes, replace(PRIOR, center_m=None, radius_m=None), reach_m=50.0)
-    part = field_of(state, state.classes, PRIOR, reach_m=50.0)
+    part = field_of(state, state.classes, replace(PRIOR, center_m=(340.0, 260.0)), reach_m=50.0)
     assert part.grid.cell_size_m == whole.grid.cell_size_m == 2.0
     row, col = whole.grid.to_cells(part.grid.to_centres_m(np.array([[0, 0]])))[0]
-    assert (row, col) == (5, 5)
-    np.testing.assert_array_equal(part.layers, whole.layers[:, 5:-5, 5:-5])
+    high, wide = 300 - row, 300 - col
+    np.testing.assert_array_equal(part.layers[:, :high, :wide], whole.layers[:, row:, col:])
+    assert not part.known[high:].any()
     corner = field_of(state, state.classes, replace(PRIOR, center_m=(0.0, 0.0)), reach_m=50.0)
     half = corner.known.shape[0] // 2
     assert (corner.known[:half, half:] == 255).all()
@@ -196,6 +200,6 @@ def test_views_that_show_the_same_are_searched_once(monkeypatch):
     asked = []
     monkeypatch.setattr("sasgeo_bench.tasks.suites.rivals.plain_modes", lambda *words: asked.append(words) or ())
     check, state = RivalCheck(), town()
-    for prior in (PRIOR, PRIOR, replace(PRIOR, radius_m=140.0)):
-        check.measure(state, seen(state), prior, truth_m=(130.0, 290.0), rivals_m=[RIVAL])
+    for prior in (PRIOR, PRIOR, replace(PRIOR, radius_m=240.0)):
+        check.measure(state, seen(state), prior, truth_m=PLACE, rivals_m=[RIVAL])
     assert len(asked) == 2

@@ -40,7 +40,8 @@ SUITE: Final = GradeSeparation(
         name="grade-separation",
         version=2,
         title="Grade separation (G4)",
-        what="A twin in which bridges lie on the ground, so that roads which pass over each other meet.",
+        what="A twin, at most 800 m away, in which bridges lie on the ground, so that roads which pass over each other "
+        "meet.",
         separates="Crossings without connection in the perceived vectors from rasters, in which both look alike.",
         falsifier="Bridges withheld: the vectors of both places show a level junction, and nothing separates them.",
         strength_unit="1 with perceived vectors",

@@ -42,8 +42,8 @@ SUITE: Final = InstanceTwins(
         name="instance-twins",
         version=2,
         title="Instance twins (G3)",
-        what="A twin, at most 800 m away, in which every hall is a row of houses of seven metres; the two masks are the "
-        "same cell by cell.",
+        what="A twin, at most 800 m away, in which every hall is a row of houses of seven metres; the two masks are "
+        "the same cell by cell.",
         separates="Instances of the perceived vectors from masks, which tie.",
         falsifier="Instances derived from the mask, which is the same at both places, must gain nothing.",
         strength_unit="1 with perceived instances",

@@ -69,9 +69,9 @@ SUITE: Final = TopologyTwins(
         name="topology-twins",
         version=2,
         title="Topology twins (G2)",
-        what="A twin of the place, at most 800 m away, in which one road at each junction stops two metres short of the "
-        "other, or in which every X-junction is two T-junctions five metres apart; at every second site the other way "
-        "round.",
+        what="A twin of the place, at most 800 m away, in which one road at each junction stops two metres short of "
+        "the other, or in which every X-junction is two T-junctions five metres apart; at every second site the other "
+        "way round.",
         separates="Connectivity of perceived vectors from rasters, in which each junction looks one way or the other.",
         falsifier="Vectors whose detector closes such gaps show both places alike: no gain over the control.",
         strength_unit="1 with perceived vectors",

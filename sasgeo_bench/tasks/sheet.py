@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contact sheets: the views of queries, the map at the true place, the difference, and the map at a twin or decoy."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,8 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.preview import PAINT_ORDER
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, Query, Truth
+from sasgeo_bench.tasks.suites.rivals import IN_DISC, LEAD, LISTED, RIVALS, TRUTH_LISTED
 
 GROUND: Final = "#fbfaf5"
 HIDDEN: Final = "#9e9e9e"
@@ -29,6 +31,7 @@ ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
 TWIN: Final = "map at the twin"
 DECOY: Final = "map at the hardest decoy"
+_OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # told in words
 _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
@@ -164,11 +167,32 @@ def strength_text(truth: Truth) -> str:
     return f"map {age_years:.1f} years old (step {truth.strength:g})"
 
 
+def rival_text(truth: Truth) -> str:
+    """Return how far the twin of a place is and what a plain search lists; empty without a twin.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> told = {"twin_east_m": 300.0, "twin_north_m": -400.0, "rivals": 1, "rivals_listed": 1, "truth_listed": 0}
+    >>> rival_text(SimpleNamespace(measured=told))
+    'twin 500 m away; a plain search lists the twin alone'
+    """
+    told = truth.measured
+    if TWIN_EAST not in told:
+        return ""
+    away = f"twin {math.hypot(told[TWIN_EAST], told[TWIN_NORTH]):.0f} m away"
+    if RIVALS not in told:
+        return away
+    is_rival, is_truth = told[LISTED] == told[RIVALS], told[TRUTH_LISTED] == 1
+    both = {(True, True): "both", (True, False): "the twin alone", (False, True): "the place alone"}
+    return f"{away}; a plain search lists {both.get((is_rival, is_truth), 'neither')}"
+
+
 def _text(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
     alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
-    measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items())
+    measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items() if name not in _OF_TWIN)
     return (
         f"{truth.role}: {truth.kind}",
         strength_text(truth),
@@ -177,6 +201,7 @@ def _text(panel: Panel) -> tuple[str, ...]:
         + (f", {len(query.vectors)} vectors" if query.vectors is not None else ""),
         "present" if truth.is_present else "ABSENT",
         f"unknown {truth.unknown_share:.2f}, changed {truth.changed_share:.2f}{alias}",
+        rival_text(truth),
         f"measured: {measured}" if measured else "",
         f"{truth.block}, {query.query_id[:8]}",
     )

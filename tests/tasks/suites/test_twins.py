@@ -389,7 +389,8 @@ def test_a_lure_has_as_much_of_everything_as_its_place(carried):
                 for what in ("area", "length")
             )
             assert areas[0] == pytest.approx(areas[1], rel=0.01, abs=1.0)
-            assert lengths[0] == pytest.approx(lengths[1], rel=0.01, abs=1.0)
+            if not areas[0]:  # where a circle cuts an area its outline grows
+                assert lengths[0] == pytest.approx(lengths[1], rel=0.01, abs=1.0)
 
 
 # Where copies find no room

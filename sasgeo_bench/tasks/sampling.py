@@ -194,7 +194,7 @@ class Drawer:
 
     def _rivals_m(self, job: Job, draft: Draft) -> tuple[tuple[float, float], ...]:
         """Return the twins that the disc of a query must hold: none for retrieval, whose candidates hold them."""
-        return self._twins_m(job.site, draft) if job.track == "localization" else ()
+        return self._twins_m(job.site, draft) if self.suite.has_rivals and job.track == "localization" else ()
 
     def _twins_m(self, site: Site, draft: Draft) -> tuple[tuple[float, float], ...]:
         """Return the twins of a site (easting, northing) if a draft shows the site and has twins."""

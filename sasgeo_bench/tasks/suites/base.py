@@ -277,6 +277,11 @@ class Suite(ABC):
         """Return what the region lacks for this suite, or None."""
         return None if scene.map.drawn.any() else "no road, building or other thing to hold on to"
 
+    @property
+    def has_rivals(self) -> bool:
+        """Return whether the disc of a localization query must hold the twins of its site."""
+        return False
+
     def refusal(self, group: PriorGroup) -> str | None:  # noqa: ARG002
         """Return why a prior group of the user does not fit this suite, or None."""
         return "is about what is known before: leave --prior out" if self.card.has_own_priors else None

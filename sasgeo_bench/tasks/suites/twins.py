@@ -59,9 +59,14 @@ class TwinSuite(Suite):
         places = self.anchors(scene)
         return None if places is None or len(places) else self.needs
 
+    @property
+    def has_rivals(self) -> bool:
+        """Return whether twins are near enough for one disc."""
+        return math.isfinite(self.within_m)
+
     def refusal(self, group: PriorGroup) -> str | None:
         """Refuse a disc that cannot hold a site and a twin at the largest distance."""
-        if group.radius_m is None or 2 * group.radius_m > self.within_m or math.isinf(self.within_m):
+        if group.radius_m is None or not self.has_rivals or 2 * group.radius_m > self.within_m:
             return super().refusal(group)
         least = min(radius_m for radius_m in RADII_M if radius_m and 2 * radius_m > self.within_m)
         return (

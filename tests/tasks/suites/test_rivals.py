@@ -84,7 +84,8 @@ def test_a_suite_of_twins_refuses_a_disc_too_small_for_any_of_its_pairs(name):
 
 
 def test_suites_whose_disc_need_not_hold_their_twins_refuse_none():
-    for name in ("alias", "controls", "clean"):
+    for name in ("alias", "controls", "clean", "stable-not-distinctive"):
+        assert not EVERY_SUITE[name].has_rivals
         assert EVERY_SUITE[name].refusal(PriorGroup.parse("r100-weak-s3")) is None
 
 

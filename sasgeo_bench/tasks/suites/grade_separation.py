@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `grade-separation`: an overpass against a level junction of the same shape."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -25,7 +26,7 @@ class GradeSeparation(TwinSuite):
     def draw(self, shot: Shot) -> Draft:
         """Hide the bridge layer."""
         draft = super().draw(shot)
-        return Draft(evidence=without(draft.evidence, "bridge"), vectors=draft.vectors)
+        return replace(draft, evidence=without(draft.evidence, "bridge"))
 
 
 def without(evidence: Evidence, class_name: str) -> Evidence:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suite `instance-twins`: one hall against a row of houses with the same mask."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -34,7 +35,7 @@ class InstanceTwins(TwinSuite):
         draft = super().draw(shot)
         if shot.variant.role != "falsifier":
             return draft
-        return Draft(evidence=draft.evidence, vectors=instances_of_mask(draft.evidence))
+        return replace(draft, vectors=instances_of_mask(draft.evidence))
 
 
 SUITE: Final = InstanceTwins(

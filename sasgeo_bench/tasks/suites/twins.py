@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.query import RADII_M, PriorGroup
+from sasgeo_bench.tasks.query import CEILING, RADII_M, PriorGroup
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.vectors import site_vectors
@@ -126,10 +126,10 @@ class TwinSuite(Suite):
     def draw(self, shot: Shot) -> Draft:
         """See the true place; the control has no vectors, the falsifier's do not distinguish the two places."""
         seen, role = self.see(shot), shot.variant.role
-        if role == "control":
-            return Draft(evidence=seen)
-        pose = shot.site.pose if role == "stress" else self._uninformative_pose(shot)
-        return Draft(evidence=seen, vectors=site_vectors(shot, pose))
+        if role == "stress":
+            return Draft(evidence=seen, vectors=site_vectors(shot, shot.site.pose))
+        vectors = None if role == "control" else site_vectors(shot, self._uninformative_pose(shot))
+        return Draft(evidence=seen, vectors=vectors, measured={CEILING: 1.0 / (1 + self.copies)})
 
     def see(self, shot: Shot) -> Evidence:
         """Perceive the layers at the true place."""

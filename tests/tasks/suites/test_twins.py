@@ -9,6 +9,7 @@ import shapely
 
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
+from sasgeo_bench.tasks.query import CEILING
 from sasgeo_bench.tasks.suites.base import Seeds, Shot, changed_share
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
@@ -317,6 +318,15 @@ def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_i
         taken = made.suite._uninformative_pose(shot)
         assert (taken.easting_m, taken.northing_m) == (wanted.easting_m, wanted.northing_m)
         assert taken.yaw_deg == site.pose.yaw_deg
+
+
+@pytest.mark.parametrize("name", [*CHANGED, "volatile-lure"])
+def test_nothing_but_a_guess_is_left_where_no_vector_tells_the_two_places_apart(carried, name):
+    made = carried(name)
+    for variant in made.suite.variants:
+        is_guess = name in CHANGED and variant.role != "stress"
+        ceilings = {made.draw(site, variant).measured.get(CEILING, 1.0) for site in made.sites}
+        assert ceilings == {0.5 if is_guess else 1.0}
 
 
 def test_vectors_of_the_instance_falsifier_follow_from_the_mask(carried):

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw queries: the function and its command."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
@@ -15,8 +16,9 @@ from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.tasks import build
-from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.query import Detector, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
 
@@ -40,6 +42,10 @@ class QueryOptions(Options):
     prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
         None
     )
+    detector: Annotated[
+        list[str] | None,
+        typer.Option(help="published or measured: family of the errors of perception; may be repeated, for pairs"),
+    ] = None
     extracts: ExtractFolders = None
     region_files: OwnRegionFolders = None
     out: Out = Path("out")
@@ -83,6 +89,7 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
         region_folders=tuple(options.region_files or ()),
         out=root_of(options.out, private),
         may_be_fewer=options.up_to,
+        choice=Choice(detectors=_detectors(options.detector)),
     )
     requests = plan_requests(wanted, tell=options.tell)
     if options.dry_run:
@@ -103,9 +110,19 @@ def _folder(request: Request) -> Path:
     return request.out / "tasks" / request.suite / request.region.id
 
 
+def _detectors(names: Sequence[str] | None) -> tuple[Detector, ...]:
+    """Return the detectors of some names, each once; raise a ConfigError if there is no such detector."""
+    known = get_args(Detector)
+    for name in names or ():
+        if name not in known:
+            message = f"--detector {name!r} is unknown: {' or '.join(known)}"
+            raise ConfigError(message)
+    return tuple(name for name in known if name in names) if names else Choice().detectors
+
+
 def _in_words(request: Request) -> str:
     suite = find_suite(request.suite)
-    queries = request.count * len(suite.variants) * len(suite.card.tracks)
+    queries = request.count * len(suite.variants) * len(suite.card.tracks) * len(request.choice.detectors)
     most = f"at most {request.count} sites, {queries} queries"
     return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
 

@@ -233,7 +233,12 @@ def plan_pipeline(
             extract_folders=extract_folders,
             region_folders=region_folders,
             may_be_fewer=True,
-            choice=Choice(views_cells=tuple(task.views_cells), kinds=tuple(task.kinds), tracks=tuple(task.tracks)),
+            choice=Choice(
+                views_cells=tuple(task.views_cells),
+                kinds=tuple(task.kinds),
+                tracks=tuple(task.tracks),
+                detectors=tuple(task.detectors),
+            ),
         )
         try:
             requests += plan_requests(asked, tell=tell if number == 0 else _silent)
@@ -437,6 +442,7 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
             tasks=asked,
             train=train,
             most_trained=learning.most,
+            detector=learning.detector,
             split=plan.requests[0].split,
         )
         if asked:

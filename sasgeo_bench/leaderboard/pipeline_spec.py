@@ -19,11 +19,12 @@ from sasgeo_bench.config import (
     read_document,
 )
 from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric
-from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, Track
+from sasgeo_bench.tasks.query import CONTROLS, PUBLISHED, Detector, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]
 CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
+ONE_DETECTOR: Final = [PUBLISHED]
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
 
@@ -68,7 +69,7 @@ class TaskSpec(Document):
 
     `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
     `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
-    at more sites say more.
+    at more sites say more. Each variant is drawn with each of `detectors`.
     """
 
     suites: Annotated[list[str], Field(min_length=1)]
@@ -78,6 +79,7 @@ class TaskSpec(Document):
     views_cells: list[Annotated[int, Field(gt=0)]] = []
     kinds: list[Short] = []
     tracks: list[Track] = []
+    detectors: Annotated[list[Detector], Field(min_length=1)] = ONE_DETECTOR
 
 
 class PaperSpec(Document):
@@ -116,6 +118,7 @@ class LearningSpec(Document):
     """Queries that matchers with a `learn` are trained on: suites, number, on the other half.
 
     `oracles` learn from the half that they are asked on: yardsticks of what rates known in advance would be worth.
+    Matchers learn from views of one `detector`, so that views of another one show what a shift costs.
 
     >>> LearningSpec(suites=["clean"]).most
     200
@@ -124,6 +127,7 @@ class LearningSpec(Document):
     suites: Annotated[list[str], Field(min_length=1)]
     most: Annotated[int, Field(ge=1, le=2000)] = 200
     oracles: list[str] = []
+    detector: Detector = PUBLISHED
 
 
 class PipelineFile(NamedDocument):
@@ -161,8 +165,12 @@ class PipelineFile(NamedDocument):
             for name in CHOICE:
                 if not task[name]:
                     del task[name]
+            if task["detectors"] == ONE_DETECTOR:
+                del task["detectors"]
         if self.paper is not None and not self.paper.crop_readings:
             del fields["paper"]["crop_readings"]
+        if self.learning is not None and self.learning.detector == PUBLISHED:
+            del fields["learning"]["detector"]
         return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @property
@@ -192,6 +200,7 @@ class PipelineFile(NamedDocument):
         suites += [] if self.paper is None else [PAPER_SUITE, *map(paper_suite, self.paper.crop_readings)]
         for what, listed in (
             ("suite", suites),
+            *(("detector", task.detectors) for task in self.task),
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
             ("contrast", [item.name for item in self.contrast]),

@@ -50,7 +50,7 @@ from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row, predictions_of
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under
+from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under, with_added
 from sasgeo_bench.texts import FOLDER, json_text, one_line
 
 MOST_BYTES: Final = 10_000_000
@@ -212,7 +212,7 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
         truth = read_table(item.truth / task_files.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
-        truths.append(_numbered(truth, number))
+        truths.append(_numbered(with_added(truth), number))
     _write_table(pa.Table.from_pylist(rows, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
     _write_table(pa.concat_tables(truths), folder / "truths.parquet")
@@ -313,7 +313,8 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
 
 def _read_tables(folder: Path) -> dict[str, pa.Table]:
     read_settings(folder)  # checks every file against its hash
-    return {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
+    tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
+    return tables | {"truths": with_added(tables["truths"])}
 
 
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:

@@ -4,7 +4,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -27,7 +27,7 @@ from sasgeo_bench.files.folders import (
 from sasgeo_bench.leaderboard.archive_record import ArchiveRecord, VersionRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 from sasgeo_bench.running.prediction_rows import differing_columns, row_faults
-from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.query import Detector, PriorGroup
 from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, TRUTH_SCHEMA, VIEW_BYTES
 from sasgeo_bench.texts import one_line
 
@@ -218,6 +218,7 @@ def _check_truths(truths: pa.Table, queries: pa.Table) -> None:
     for column in ("strength", "unknown_share", "changed_share", "feature_density"):
         _refuse("truths", column, ~np.isfinite(_numbers(truths[column])))
     _refuse("truths", "role", ~_is_in(truths["role"], _ROLES))
+    _refuse("truths", "detector", ~_is_in(truths["detector"], get_args(Detector)))
     is_present, candidate = _numbers(truths["is_present"]).astype(bool), _numbers(truths["candidate"])
     counts = _numbers(pc.list_value_length(queries["candidates"]))
     is_retrieval = _is_in(queries["track"], ("retrieval",))

@@ -18,6 +18,7 @@ from sasgeo_bench.running.oracle import CARD
 from sasgeo_bench.running.training_tasks import TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import PUBLISHED, Detector
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_rows import asked_under
 
@@ -41,7 +42,7 @@ class RunRequest:
     `is_shut_in`, trusted code runs without isolation, and `run.json` says so.
 
     `train` are tasks with truths, of places that are not asked, for a matcher with a `learn`; `most_trained` bounds
-    their queries, evenly over places, then suites, then sites. `split` defines places and how far apart training and
+    their queries, of one `detector`, evenly over places, then suites, then sites. `split` defines places and how far apart training and
     test places must lie. An oracle (`is_oracle`) may train on what it is asked, and is never ranked. `hidden` are
     files that the matcher must not see besides truths and the like, such as that of a private seed.
     """
@@ -59,6 +60,7 @@ class RunRequest:
     is_shut_in: bool = True
     train: Sequence[Path] = ()
     most_trained: int = 200
+    detector: Detector = PUBLISHED
     split: Split | None = None
     is_oracle: bool = False
     hidden: Sequence[Path] = ()
@@ -185,7 +187,13 @@ def plan_run(request: RunRequest) -> RunPlan:
     training_set = result = None
     if learns and request.train:
         asked = () if request.is_oracle else request.tasks
-        training_set = plan_training(request.train, asked=asked, split=request.split, most=request.most_trained)
+        training_set = plan_training(
+            request.train,
+            asked=asked,
+            split=request.split,
+            most=request.most_trained,
+            detector=request.detector,
+        )
         text = read_learned(learned_path(_run_folder(request, card, found), training_set.sha256))
         result = None if text is None else TrainingResult(text=text)
     key = None if training_set is None else _key(training_set, result)

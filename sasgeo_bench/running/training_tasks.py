@@ -12,7 +12,7 @@ from typing import Any
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import Truth, base_of
+from sasgeo_bench.tasks.query import PUBLISHED, Detector, Truth, base_of
 from sasgeo_bench.tasks.split import Block, Split, nearest_blocks
 from sasgeo_bench.tasks.task_rows import truth_sha256
 
@@ -62,11 +62,18 @@ class _Pair:
     hashes: tuple[str, str]
 
 
-def plan_training(train: Sequence[Path], *, asked: Sequence[Path], split: Split | None, most: int) -> TrainingSet:
+def plan_training(
+    train: Sequence[Path],
+    *,
+    asked: Sequence[Path],
+    split: Split | None,
+    most: int,
+    detector: Detector = PUBLISHED,
+) -> TrainingSet:
     """Choose at most `most` pairs, evenly over places, then suites, then sites, by a hash of their names.
 
     `train` and `asked` are task folders. `split` defines places and how far apart they must lie; without one, regions
-    are places.
+    are places. Only views of one `detector` are used.
 
     Raises
     ------
@@ -83,9 +90,9 @@ def plan_training(train: Sequence[Path], *, asked: Sequence[Path], split: Split 
     check_apart(regions, others, split)
     maps = {folder: map_of(folder, about) for folder, about in abouts.items()}
     _check_names(maps)
-    pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split)]
+    pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, detector)]
     if not pairs:
-        message = f"--train {next(iter(tasks.values()))} holds no queries: there is nothing to learn from"
+        message = f"--train {next(iter(tasks.values()))} holds no queries of detector {detector!r}: there is nothing to learn from"
         raise ConfigError(message)
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
     order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))
@@ -166,8 +173,8 @@ def _check_names(maps: Mapping[Path, Path]) -> None:
             raise ConfigError(message)
 
 
-def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None) -> Iterator[_Pair]:
-    """Yield every query of a task, with what decides whether it is used."""
+def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None, detector: Detector) -> Iterator[_Pair]:
+    """Yield every query of a task that one detector has seen, with what decides whether it is used."""
     truth = truth_of(task, about)
     if not (truth / task_files.TRUTH).is_file():
         message = f"{truth} holds no truths of {task}, which training needs: make the queries here, or leave it out"
@@ -176,6 +183,8 @@ def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None) -> Iter
     task_files.check_truths(task, truth)
     asked, place_of = task_files.read_asked(task), {} if split is None else split.place_of
     for item in task_files.read_truths(truth):
+        if item.detector != detector:
+            continue
         yield _Pair(
             place=place_of.get(item.block, base_of(about["region"])),
             suite=str(about["suite"]),

@@ -37,7 +37,7 @@ class Score:
     place : str
         Unit of the split; the region without a split.
     block, pair_id, role, kind, strength, strength_unit, scene
-        Of the truth; so are unknown_share, changed_share, feature_density and alias_index.
+        Of the truth; so are unknown_share, changed_share, feature_density, alias_index and detector.
     is_present : bool
         The place is on the map.
     status : str
@@ -83,6 +83,7 @@ class Score:
     feature_density: float | None
     alias_index: float | None
     scene: str
+    detector: str
     is_present: bool
     status: str
     ceiling: float

@@ -10,6 +10,7 @@ import pandas as pd
 
 from sasgeo_bench.scoring.base import Bools
 from sasgeo_bench.scoring.metrics import TRACKS, primary_of
+from sasgeo_bench.tasks.query import PUBLISHED
 
 ALL: Final = "all"
 STRESS: Final = "stress"
@@ -27,8 +28,8 @@ _MAPPING: Final = ("real-age",)  # suites whose maps differ mostly in completene
 def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
     """Yield names and masks, shape (N,), of every stratum of one suite that holds a query.
 
-    Roles, then each step of each kind at each view size, then bins of measured properties of the truth. A kind with one
-    step and size has no separate rows for them.
+    Roles, then each step of each kind at each view size, then detectors if there are several, then bins of measured
+    properties of the truth. A kind with one step and size has no separate rows for them.
 
     >>> table = {"role": ["control", "stress"], "kind": ["control", "U1"], "strength": [0.0, 0.3]}
     >>> table |= {"view_cells": [96, 96]}
@@ -54,6 +55,9 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
     if len(sizes) > 1:
         for size in sizes:
             yield control_name(size), (role == CONTROL) & (cells == size)
+    detector = scores["detector"].to_numpy() if "detector" in scores else np.full(len(scores), PUBLISHED)
+    for name in sorted(set(detector)) if len(set(detector)) > 1 else ():
+        yield f"detector {name}", detector == name
     yield from _bins(scores, role != CONTROL)
 
 

@@ -139,7 +139,10 @@ def _request_sha256(request: Request) -> str:
         "made_by": version("sasgeo-bench"),
     }
     if request.choice != EVERYTHING:  # tasks that are older than this field stay valid
-        content["choice"] = asdict(request.choice)
+        choice = asdict(request.choice)
+        if request.choice.detectors == EVERYTHING.detectors:
+            del choice["detectors"]
+        content["choice"] = choice
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

@@ -88,10 +88,11 @@ def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
     order = sorted(
         truths, key=lambda item: (list(first).index(item.pair_id), rank[item.role], item.kind, item.strength)
     )
-    seen: set[tuple[str, float, float]] = set()
+    seen: set[tuple[str, float, float, str]] = set()
     chosen = []
     for truth in order:
-        variant = (truth.kind, truth.strength, round(truth.unknown_share, 0) if truth.role == "falsifier" else 0.0)
+        blank = round(truth.unknown_share, 0) if truth.role == "falsifier" else 0.0
+        variant = (truth.kind, truth.strength, blank, truth.detector)
         if variant not in seen:
             seen.add(variant)
             chosen.append(truth)

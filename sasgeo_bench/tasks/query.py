@@ -22,6 +22,8 @@ TASK_VERSIONS: Final = (1, 2, TASK_VERSION)  # readable versions: their files ar
 Track = Literal["retrieval", "localization"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
+Detector = Literal["published", "measured"]  # families of errors of perception
+PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite
 NOISE_FREE: Final = "noise-free"
@@ -171,6 +173,8 @@ class Truth:
         Evaluation block of the centre, the unit of resampling, and scene tags of the region.
     measured : mapping of str to float
         Manipulation check: measures of the applied change.
+    detector : {"published", "measured"}
+        Family of the errors of perception; the query does not tell it.
     """
 
     query_id: str
@@ -189,3 +193,4 @@ class Truth:
     block: str
     scene: str
     measured: dict[str, float] = field(default_factory=dict)
+    detector: Detector = PUBLISHED

@@ -89,7 +89,8 @@ class Drawer:
                 track=track,
             )
             for site in sites
-            for variant in self.suite.variants
+            for detector in self.choice.detectors
+            for variant in (replace(item, detector=detector) for item in self.suite.variants)
             for track in self.suite.tracks(variant)
             if self.choice.takes(variant, track)
         ]
@@ -190,6 +191,7 @@ class Drawer:
             measured=draft.measured
             | self._twin(site, draft)
             | _unanswerable(draft, state, draft.pose or site.pose, variant),
+            detector=variant.detector,
         )
 
     def _rivals_m(self, job: Job, draft: Draft) -> tuple[tuple[float, float], ...]:

@@ -21,7 +21,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.preview import PAINT_ORDER
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, Query, Truth
+from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, Query, Truth
 from sasgeo_bench.tasks.suites.rivals import IN_DISC, LEAD, LISTED, RIVALS, TRUTH_LISTED
 
 GROUND: Final = "#fbfaf5"
@@ -194,7 +194,7 @@ def _text(panel: Panel) -> tuple[str, ...]:
     alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
     measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items() if name not in _OF_TWIN)
     return (
-        f"{truth.role}: {truth.kind}",
+        f"{truth.role}: {truth.kind}" + (f", {truth.detector}" if truth.detector != PUBLISHED else ""),
         strength_text(truth),
         f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
         f"priors {query.prior_group}; {len(query.candidates)} candidates"

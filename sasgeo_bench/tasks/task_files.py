@@ -24,6 +24,7 @@ from sasgeo_bench.regions.evidence import CELLS_PER_BYTE
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, Query, Truth
 from sasgeo_bench.tasks.task_rows import (
+    ADDED,
     ASKED,
     FILE_SCHEMA,
     HEAD_SCHEMA,
@@ -40,6 +41,7 @@ from sasgeo_bench.tasks.task_rows import (
     stream_of,
     truth_of,
     truth_row,
+    with_added,
 )
 from sasgeo_bench.texts import FOLDER, json_text
 
@@ -384,11 +386,13 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
     Raises
     ------
     StoreError
-        If the file is missing or damaged, or lacks a column.
+        If the file is missing or damaged, or lacks a column; older truths may lack those of `task_rows.ADDED`.
     """
     with open_table(path, mend=_MEND, is_whole=False) as source:
-        _check_columns(path, source.schema_arrow, columns)
-        for batch in source.iter_batches(batch_size=_ROWS, columns=list(columns)):
+        there = [name for name in columns if name in source.schema_arrow.names or name not in ADDED]
+        _check_columns(path, source.schema_arrow, there)
+        for found in source.iter_batches(batch_size=_ROWS, columns=there):
+            batch = found if len(there) == len(columns) else with_added(found).select(list(columns))
             empty = next((name for name in columns if name not in MAY_BE_NULL and batch[name].null_count), None)
             if empty is not None:
                 raise _damaged(path, f"{empty} is null in a row")

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -15,10 +15,12 @@ import shapely
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth
+from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, Query, Truth
 
 if TYPE_CHECKING:
     import geopandas as gpd
+
+Rows = TypeVar("Rows", pa.Table, pa.RecordBatch)
 
 POSE_FIELDS: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
 # Columns that are fields of a query, and of its prior.
@@ -106,9 +108,13 @@ TRUTH_SCHEMA: Final = pa.schema(
         ("block", pa.string()),
         ("scene", pa.string()),
         ("measured", pa.map_(pa.string(), pa.float64())),
+        ("detector", pa.string()),
     ],
     metadata=_META,
 )
+
+# Columns that older files lack, and the value that is meant by it.
+ADDED: Final = {"detector": PUBLISHED}
 
 # Columns of queries and truths that may be null.
 MAY_BE_NULL: Final = frozenset(
@@ -214,6 +220,18 @@ def _plain(value: bytes | dt.date) -> str:
     return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
 
 
+def with_added(truths: Rows) -> Rows:
+    """Return truths with the columns that were added since they were written, last.
+
+    >>> with_added(pa.table({"query_id": ["a"]})).to_pylist()
+    [{'query_id': 'a', 'detector': 'published'}]
+    """
+    lost = [name for name in ADDED if name not in truths.schema.names]
+    columns = [*truths.columns, *(pa.array([ADDED[name]] * truths.num_rows, pa.string()) for name in lost)]
+    schema = pa.schema([*truths.schema, *map(TRUTH_SCHEMA.field, lost)], metadata=truths.schema.metadata)
+    return type(truths).from_arrays(columns, schema=schema)
+
+
 def truth_row(truth: Truth) -> dict[str, Any]:
     """Return one truth as a row of `TRUTH_SCHEMA`."""
     pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(POSE_FIELDS)
@@ -230,8 +248,9 @@ def truth_of(row: dict[str, Any]) -> Truth:
 
 
 def truth_sha256(truth: Truth) -> str:
-    """Return the hash of a truth."""
-    return hashlib.sha256(json.dumps(truth_row(truth), sort_keys=True).encode()).hexdigest()
+    """Return the hash of a truth; values that older files lack do not count."""
+    fields = {name: value for name, value in truth_row(truth).items() if ADDED.get(name) != value}
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
 def asked_under(asked: str, key: str | None) -> str:

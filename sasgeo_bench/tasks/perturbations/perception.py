@@ -8,7 +8,7 @@ score that the detector reaches on each class.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -38,9 +38,10 @@ SEEN_ANYWHERE: Final = 0.2  # fraction of the false alarms that occur whether or
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassErrors:
-    """Errors of a detector on one class."""
+    """Errors of a detector on one class, in its own domain, pixel by pixel; for line classes with a cell of tolerance."""
 
-    f1: float  # in domain, pixel by pixel; for line classes with one cell of tolerance
+    recall: float
+    precision: float
     confused_with: str | None = None
     confused: float = 0.0  # fraction of the lost cells that become that class; the others become absent
     dropped: float = 0.4  # of areas, fractions of the lost cells lost as whole objects and, `frayed`, at edges;
@@ -48,24 +49,43 @@ class ClassErrors:
     usual_share: float = 0.01  # of a usual view that the class covers; sets the false alarms in views without it
     width_m: float = 3.0  # of a false line
 
+    @property
+    def lost(self) -> float:
+        """Return the fraction of the class's cells that is missed."""
+        return 1 - self.recall
+
+    @property
+    def gained(self) -> float:
+        """Return the false alarms, as a fraction of the class's cells."""
+        return self.recall / self.precision * (1 - self.precision)
+
+
+def with_f1(f1: float, **others: Any) -> ClassErrors:  # noqa: ANN401 - fields of ClassErrors
+    """Return errors that are balanced, since only their F1 is known: recall and precision are both equal to it.
+
+    >>> with_f1(0.8).gained == with_f1(0.8).lost
+    True
+    """
+    return ClassErrors(recall=f1, precision=f1, **others)
+
 
 # Building, road, water, tree and agriculture have the scores of U-Net-EfficientNet-B4 on OpenEarthMap. The others are
 # not in it: their scores are set by hand, below that of roads for thinner classes, at or above it for wider ones.
 # Everything but the scores is set by hand too. A class that is not in this table is seen without error.
 ERRORS: Final[Mapping[str, ClassErrors]] = {
-    "road_major": ClassErrors(f1=0.77, confused_with="road_minor", confused=0.3, usual_share=0.02, width_m=7.0),
-    "road_minor": ClassErrors(f1=0.77, confused_with="parking", confused=0.2, usual_share=0.05, width_m=4.5),
-    "path_track": ClassErrors(f1=0.65, confused_with="field_boundary", confused=0.1, usual_share=0.01, width_m=2.0),
-    "railway": ClassErrors(f1=0.77, confused_with="path_track", confused=0.1, usual_share=0.003),
-    "building": ClassErrors(f1=0.89, confused_with="parking", confused=0.15, usual_share=0.12, dropped=0.5),
-    "water": ClassErrors(f1=0.92, confused_with="green", confused=0.2, usual_share=0.05, dropped=0.2),
-    "waterway": ClassErrors(f1=0.77, confused_with="path_track", confused=0.1, usual_share=0.008),
-    "coastline": ClassErrors(f1=0.85, usual_share=0.0),
-    "green": ClassErrors(f1=0.82, confused_with="farmland", confused=0.3, usual_share=0.15, dropped=0.3),
-    "farmland": ClassErrors(f1=0.87, confused_with="green", confused=0.5, usual_share=0.10, dropped=0.2),
-    "field_boundary": ClassErrors(f1=0.60, confused_with="path_track", confused=0.1, usual_share=0.004, width_m=1.5),
-    "bridge": ClassErrors(f1=0.77, usual_share=0.0005, width_m=6.0),
-    "parking": ClassErrors(f1=0.77, confused_with="road_minor", confused=0.2, usual_share=0.01, dropped=0.3),
+    "road_major": with_f1(0.77, confused_with="road_minor", confused=0.3, usual_share=0.02, width_m=7.0),
+    "road_minor": with_f1(0.77, confused_with="parking", confused=0.2, usual_share=0.05, width_m=4.5),
+    "path_track": with_f1(0.65, confused_with="field_boundary", confused=0.1, usual_share=0.01, width_m=2.0),
+    "railway": with_f1(0.77, confused_with="path_track", confused=0.1, usual_share=0.003),
+    "building": with_f1(0.89, confused_with="parking", confused=0.15, usual_share=0.12, dropped=0.5),
+    "water": with_f1(0.92, confused_with="green", confused=0.2, usual_share=0.05, dropped=0.2),
+    "waterway": with_f1(0.77, confused_with="path_track", confused=0.1, usual_share=0.008),
+    "coastline": with_f1(0.85, usual_share=0.0),
+    "green": with_f1(0.82, confused_with="farmland", confused=0.3, usual_share=0.15, dropped=0.3),
+    "farmland": with_f1(0.87, confused_with="green", confused=0.5, usual_share=0.10, dropped=0.2),
+    "field_boundary": with_f1(0.60, confused_with="path_track", confused=0.1, usual_share=0.004, width_m=1.5),
+    "bridge": with_f1(0.77, usual_share=0.0005, width_m=6.0),
+    "parking": with_f1(0.77, confused_with="road_minor", confused=0.2, usual_share=0.01, dropped=0.3),
 }
 
 
@@ -73,7 +93,7 @@ _MOST_ERROR: Final = 0.95
 _SECOND_RING: Final = 0.8  # the noise must be stronger by this for a cell two from the edge than for one at the edge
 _DROPPABLE: Final = 0.25  # an object larger than this fraction of its class in view is frayed rather than dropped
 _MOST_TAKEN: Final = 0.6  # most of a class's false alarms that come from what other classes lose to it
-_FLAWLESS: Final = ClassErrors(f1=1.0)
+_FLAWLESS: Final = with_f1(1.0)
 _STUB_SPENDS: Final = 0.85  # of the cells of a false line; the others are present already or outside the view
 
 
@@ -81,13 +101,13 @@ _STUB_SPENDS: Final = 0.85  # of the cells of a false line; the others are prese
 class Perception:
     """See a clean view with a detector's errors.
 
-    `error_factor` multiplies 1 - F1 of every class: 0 is a perfect detector, 1 one in its own domain, 1.5 to 2 one in
+    The detector "published". `error_factor` multiplies the errors of every class: 0 is a perfect detector, 1 one in its own domain, 1.5 to 2 one in
     another domain. At most 0.95 of a class goes wrong.
 
     Notes
     -----
-    For an error of x = 1 - F1, a fraction x of the cells of a class is lost and as many are seen in the wrong place, so
-    that precision and recall are both F1. Objects, edges and confusion use this budget first, patches and false lines
+    Of the cells of a class, a fraction 1 - recall is lost, and recall / precision - recall as many are seen in the wrong
+    place. Only the F1 scores are published, so recall and precision are both taken to be F1. Objects, edges and confusion use this budget first, patches and false lines
     the rest. The tests hold the measured F1 to within 0.06 of the target, pooled over views of towns, for classes that
     cover a third of their `usual_share` or more. For rarer ones, `SEEN_ANYWHERE` makes it lower.
     """
@@ -118,9 +138,10 @@ class Perception:
         """Return each class with the fraction of it that goes wrong."""
         pool = NoisePool(evidence.shape)
         errors = [ERRORS.get(name, _FLAWLESS) for name in evidence.classes]
-        shares = self.error_factor * np.array([1 - item.f1 for item in errors])
+        shares = self.error_factor * np.array([(item.lost, item.gained) for item in errors])
         if SPREAD > 0:
-            shares *= rng.gamma(SPREAD**-2, SPREAD**2, size=len(shares))
+            shares *= rng.gamma(SPREAD**-2, SPREAD**2, size=(len(errors), 1))
+        lost, gained = np.minimum(shares, _MOST_ERROR).T
         present, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
         # Noise wider than the patches: most objects are confused as a whole or not at all.
         mixed_up = smooth_noise(evidence.shape, 3 * PATCH_M / evidence.cell_size_m, rng)
@@ -130,7 +151,8 @@ class Perception:
                 mask=present[index],
                 unknown=unknown[index],
                 errors=errors[index],
-                share=min(float(shares[index]), _MOST_ERROR),
+                lost=float(lost[index]),
+                gained=float(gained[index]),
                 cell_size_m=evidence.cell_size_m,
                 pool=pool,
                 mixed_up=mixed_up,
@@ -147,7 +169,8 @@ class _Look:
     mask: Mask
     unknown: Mask
     errors: ClassErrors
-    share: float
+    lost: float
+    gained: float
     cell_size_m: float
     pool: NoisePool
     mixed_up: Field
@@ -163,7 +186,7 @@ class _Look:
 
     def lose(self, rng: np.random.Generator) -> tuple[Mask, Mask | None]:
         """Miss the fraction that goes wrong; return what is still seen, and what is taken for another class."""
-        mask, budget_cells = self.mask, self.share * np.count_nonzero(self.mask)
+        mask, budget_cells = self.mask, self.lost * np.count_nonzero(self.mask)
         if budget_cells == 0:
             return mask.copy(), None
         lose = self._lose_line if self.is_thin else self._lose_area
@@ -198,7 +221,7 @@ class _Look:
         was = self.mask
         usual_cells = self.errors.usual_share * was.size
         expected = (1 - SEEN_ANYWHERE) * np.count_nonzero(was) + SEEN_ANYWHERE * usual_cells
-        budget_cells = self.share * expected
+        budget_cells = self.gained * expected
         if budget_cells < 1:
             return
         free = ~(self.unknown | was)

@@ -6,7 +6,7 @@ import hashlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -18,9 +18,9 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, LayerBits, observe
 from sasgeo_bench.regions.region import MapGraph, Region
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
-from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.perturbations.detectors import DETECTORS
 from sasgeo_bench.tasks.private_seed import Seed
-from sasgeo_bench.tasks.query import PriorGroup, Role, Track
+from sasgeo_bench.tasks.query import PUBLISHED, Detector, PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.twin import Paste
 
@@ -120,11 +120,18 @@ class Variant:
     strength: float = 0.0
     view_cells: int = MAIN_VIEW_CELLS
     cell_size_m: float = 1.0
+    detector: Detector = PUBLISHED
 
     @property
     def name(self) -> str:
         """Return the name within the suite, part of the seed of a query's id."""
-        return f"{self.role}/{self.kind}/{self.strength:g}/{self.view_cells}/{self.cell_size_m:g}"
+        plain = f"{self.role}/{self.kind}/{self.strength:g}/{self.view_cells}/{self.cell_size_m:g}"
+        return "/".join((plain, *self.others))
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Return what its seeds are named by besides: nothing for the detector that came first."""
+        return () if self.detector == PUBLISHED else (self.detector,)
 
     @property
     def side_m(self) -> float:
@@ -140,12 +147,14 @@ class Variant:
 class Choice:
     """A selection of a suite's variants; an empty field selects all.
 
-    `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected.
+    `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected. Each variant is drawn once for
+    each of `detectors`, at the same site.
     """
 
     views_cells: tuple[int, ...] = ()
     kinds: tuple[str, ...] = ()
     tracks: tuple[Track, ...] = ()
+    detectors: tuple[Detector, ...] = (PUBLISHED,)
 
     def takes(self, variant: Variant, track: Track) -> bool:
         """Return whether a variant on a track is selected."""
@@ -157,7 +166,7 @@ class Choice:
 
     def lack(self, suite: "Suite") -> str | None:
         """Return why the selection does not fit the suite, or None if it does."""
-        if self == EVERYTHING:
+        if replace(self, detectors=EVERYTHING.detectors) == EVERYTHING:
             return None
         stresses = [variant for variant in suite.variants if variant.role == "stress"]
         there: dict[str, tuple[Sequence[object], Sequence[object]]] = {
@@ -369,8 +378,9 @@ class Shot:
 
     def perceived(self, clean: Evidence | None = None, *, error_factor: float = 1.0) -> Evidence:
         """Return a clean view (of the world unless given) with errors, which are equal in all variants of a site."""
-        rng = self.seeds.rng("perception", self.variant.view_cells, self.variant.cell_size_m)
-        return Perception(error_factor=error_factor)(self.clean() if clean is None else clean, rng)
+        variant = self.variant
+        rng = self.seeds.rng("perception", variant.view_cells, variant.cell_size_m, *variant.others)
+        return DETECTORS[variant.detector](error_factor)(self.clean() if clean is None else clean, rng)
 
 
 def changed_share(first: Evidence, second: Evidence) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
-from sasgeo_bench.tasks.perturbations.fields import SIGMA, Field, NoisePool, dilated, highest_within
+from sasgeo_bench.tasks.perturbations.fields import SIGMA, Field, NoisePool, dilated, disc, highest_within
 from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
 
 Where = Literal["ground", "roads"]
@@ -31,7 +31,7 @@ class MeasuredErrors:
     is given, the precision follows from it and from the view, and `precision` is what towns come near. Else false alarms
     follow from `precision`, besides those that other classes are called. `small_m2` is the area at which an
     object is half as likely to be missed as a tiny one. `outline` is the fraction of the false alarms that continue the
-    outline of something seen. `alarms_on` names where the others lie.
+    outline of something seen, with bulges about `bulge_m` deep. `alarms_on` names where the others lie.
     """
 
     recall: float
@@ -40,6 +40,7 @@ class MeasuredErrors:
     of_yards: float | None = None
     small_m2: float = 20.0
     outline: float = 0.6
+    bulge_m: float = 1.5
     width_m: float = 3.0  # of a false line
     alarms_on: Where = "ground"
 
@@ -53,20 +54,22 @@ class MeasuredErrors:
 # classes, grass among them, is taken to be ground within YARD_M of a road or building: what a map leaves empty beyond
 # is mostly grass that nobody mapped. With these yards a town has both the measured fractions and the measured precision.
 MEASURED: Final[Mapping[str, MeasuredErrors]] = {
-    "road_major": MeasuredErrors(
-        recall=0.93, precision=0.80, called={"road_minor": 0.05}, of_yards=0.007, width_m=6.0
-    ),
-    "road_minor": MeasuredErrors(
-        recall=0.93, precision=0.80, called={"road_major": 0.05}, of_yards=0.045, width_m=4.0
-    ),
+    "road_major": MeasuredErrors(recall=0.93, precision=0.80, called={"road_minor": 0.05}, of_yards=0.007, width_m=6.0),
+    "road_minor": MeasuredErrors(recall=0.93, precision=0.80, called={"road_major": 0.05}, of_yards=0.045, width_m=4.0),
     "path_track": MeasuredErrors(recall=0.96, precision=0.91, width_m=2.0, outline=0.3),
     "railway": MeasuredErrors(recall=0.85, precision=0.85, called={"path_track": 0.05}, outline=0.5),
     "building": MeasuredErrors(recall=0.97, precision=0.86, of_yards=0.058, outline=0.55),
-    "water": MeasuredErrors(recall=0.87, precision=0.90, called={"green": 0.03}, small_m2=250.0, outline=0.8),
+    "water": MeasuredErrors(
+        recall=0.87, precision=0.90, called={"green": 0.03}, small_m2=250.0, outline=0.8, bulge_m=3.0
+    ),
     "waterway": MeasuredErrors(recall=0.60, precision=0.75, called={"green": 0.10}, outline=0.3),
     "coastline": MeasuredErrors(recall=0.87, precision=0.87, outline=1.0),
-    "green": MeasuredErrors(recall=0.76, precision=0.85, called={"farmland": 0.08}, small_m2=60.0, outline=0.5),
-    "farmland": MeasuredErrors(recall=0.47, precision=0.85, called={"green": 0.37}, small_m2=200.0, outline=0.5),
+    "green": MeasuredErrors(
+        recall=0.76, precision=0.85, called={"farmland": 0.08}, small_m2=60.0, outline=0.5, bulge_m=6.0
+    ),
+    "farmland": MeasuredErrors(
+        recall=0.47, precision=0.85, called={"green": 0.37}, small_m2=200.0, outline=0.5, bulge_m=6.0
+    ),
     "field_boundary": MeasuredErrors(recall=0.45, precision=0.55, called={"green": 0.15}, width_m=2.0, outline=0.1),
     "bridge": MeasuredErrors(recall=0.85, precision=0.75, called={"road_minor": 0.10}, alarms_on="roads", outline=0.3),
     "parking": MeasuredErrors(recall=0.75, precision=0.70, called={"road_minor": 0.12}, outline=0.5),
@@ -82,8 +85,8 @@ ALARM_M2: Final = 30.0  # median area of a false building
 BAND_M: Final = (12.0, 60.0)  # lengths of false lines
 YARD_M: Final = 5.0  # from a road or building
 FAR_SHARE: Final = 0.03  # how much rarer false roads and buildings are on ground farther away; a guess
-_BULGE_M: Final = 4.0  # depth of a bulge where the noise is one deviation stronger
 _ROUNDED_M: Final = 0.8  # corners are rounded by a blur of this deviation
+_PINHOLE_CELLS: Final = 1.5
 _MOST_ERROR: Final = 0.95
 _MOST_GROUND: Final = 0.5
 _SMALL_SHARE: Final = 0.6  # of the lost cells, at most, that are lost as small objects
@@ -148,6 +151,7 @@ class _View:
     ground: Mask
     yards: Mask
     pool: NoisePool
+    outlines: dict[str, Field] = field(default_factory=dict)
 
     @classmethod
     def of(cls, evidence: Evidence) -> "_View":
@@ -169,6 +173,12 @@ class _View:
     def noise(self, width_m: float, rng: np.random.Generator) -> Field:
         """Draw smooth noise of deviation 1."""
         return self.pool.take(width_m / self.cell_m, rng) / np.float32(SIGMA)
+
+    def outline(self, name: str, rng: np.random.Generator) -> Field:
+        """Return the noise of a class's outline: it bulges where this is high, and shrinks where it is low."""
+        if name not in self.outlines:
+            self.outlines[name] = self.noise(OUTLINE_M, rng)
+        return self.outlines[name]
 
     def any_of(self, names: tuple[str, ...]) -> Mask:
         """Return where any of the classes is present."""
@@ -194,17 +204,20 @@ class _View:
             score = self.noise(HIDDEN_M, rng)
         else:
             kept &= _rounded(mask, _ROUNDED_M * min(factor, 2.0) / self.cell_m)
-            score = _BULGE_M * self.noise(OUTLINE_M, rng) - self._depth_m(kept)
+            score = -errors.bulge_m * self.outline(name, rng) - self._depth_m(mask)
         rest = lost * total - (total - np.count_nonzero(kept))
         return kept & (score < highest_within(score, kept, rest, rng)) if rest > 0 else kept
 
     def _confused(self, mask: Mask, count: float, rng: np.random.Generator) -> Mask:
-        """Return `count` cells that look like another class: mostly whole objects, or large parts of large ones."""
-        looks = self.noise(GROUND_M, rng)
-        objects = find_objects(mask)
+        """Return about `count` cells that look like another class: small objects as a whole, parts of large ones."""
+        objects, looks = find_objects(mask), self.noise(GROUND_M, rng)
         own = np.concatenate((np.zeros(1), _OBJECT_SPREAD * rng.standard_normal(len(objects.areas_cells))))
+        is_small = objects.areas_cells * self.cell_m**2 < (GROUND_M / 2) ** 2
+        share = count / max(1, np.count_nonzero(mask))
+        chosen = objects.mask_of(is_small & (rng.random(len(is_small)) < share))
+        large = objects.mask_of(~is_small)
         looks = np.asarray(looks + own.astype(np.float32)[objects.labels], dtype=np.float32)
-        return mask & (looks >= highest_within(looks, mask, count, rng))
+        return chosen | (large & (looks >= highest_within(looks, large, share * np.count_nonzero(large), rng)))
 
     def _small(self, mask: Mask, small_m2: float, budget: float, rng: np.random.Generator) -> Mask:
         """Return objects to miss: the smaller, the more likely; on average they spend a part of the budget at most."""
@@ -241,9 +254,11 @@ class _View:
             return
         before = np.count_nonzero(seen)
         if seen.any():
-            score = _BULGE_M * self.noise(OUTLINE_M, rng) - self._depth_m(~seen)
+            score = errors.bulge_m * self.outline(name, rng) - self._depth_m(~seen)
             near = free & ~seen
             seen |= near & (score >= highest_within(score, near, errors.outline * budget, rng))
+            if name not in thin_classes():
+                seen |= mask & _closed(seen)  # a bulge leaves no moat where the outline was
         left = budget - (np.count_nonzero(seen) - before)
         if left < 1:
             return
@@ -310,6 +325,11 @@ class _View:
             budget -= count
             if budget <= 0:
                 return
+
+
+def _closed(mask: Mask) -> Mask:
+    """Return a mask with its pinholes filled."""
+    return np.asarray(cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_CLOSE, disc(_PINHOLE_CELLS))).view(np.bool_)
 
 
 def _rounded(mask: Mask, sigma_cells: float) -> Mask:

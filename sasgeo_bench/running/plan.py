@@ -42,9 +42,10 @@ class RunRequest:
     `is_shut_in`, trusted code runs without isolation, and `run.json` says so.
 
     `train` are tasks with truths, of places that are not asked, for a matcher with a `learn`; `most_trained` bounds
-    their queries, of one `detector`, evenly over places, then suites, then sites. `split` defines places and how far apart training and
-    test places must lie. An oracle (`is_oracle`) may train on what it is asked, and is never ranked. `hidden` are
-    files that the matcher must not see besides truths and the like, such as that of a private seed.
+    their queries, evenly over places, then suites, then sites; only those of `detector` are used. `split` defines
+    places and how far apart training and test places must lie. An oracle (`is_oracle`) may train on what it is asked,
+    and is never ranked. `hidden` are files that the matcher must not see besides truths and the like, such as that of a
+    private seed.
     """
 
     spec: str

@@ -92,7 +92,8 @@ def plan_training(
     _check_names(maps)
     pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, detector)]
     if not pairs:
-        message = f"--train {next(iter(tasks.values()))} holds no queries of detector {detector!r}: there is nothing to learn from"
+        first = next(iter(tasks.values()))
+        message = f"--train {first} holds no queries of detector {detector!r}: there is nothing to learn from"
         raise ConfigError(message)
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
     order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))

@@ -106,13 +106,13 @@ class RowJitter(Warp):
         """Draw a sum of sines over the rows for each component."""
         up_m = centres(shape, cell_size_m).up_m
         shares = (1 - _ALONG_SHARE, _ALONG_SHARE)
-        field = np.zeros((2, *shape))
-        for component, lengths_m, share in zip(field, (_ACROSS_M, _ALONG_M), shares, strict=True):
+        shakes = []
+        for lengths_m, share in zip((_ACROSS_M, _ALONG_M), shares, strict=True):
             phase = rng.uniform(0, 2 * np.pi, _ROW_WAVES)
             shake = np.sin(2 * np.pi * up_m / rng.uniform(*lengths_m, _ROW_WAVES) + phase).sum(axis=1, keepdims=True)
             shake -= shake.mean()
-            component += shake * np.sqrt(share / max((shake**2).mean(), 1e-12))
-        return self._scaled(field)
+            shakes.append(shake * np.sqrt(share / max((shake**2).mean(), 1e-12)))
+        return self._scaled(np.stack([np.broadcast_to(shake, shape) for shake in shakes]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,9 +27,9 @@ class MeasuredErrors:
     """Errors on one class, in its own domain, pixel by pixel; for line classes with a cell of tolerance.
 
     `called` holds the fractions of the class that are seen as other classes; the rest of 1 - `recall` is seen as
-    nothing. `of_yards` is the fraction of the empty ground beside roads and buildings that is seen as this one; where it
-    is given, the precision follows from it and from the view, and `precision` is what towns come near. Else false alarms
-    follow from `precision`, besides those that other classes are called. `small_m2` is the area at which an
+    nothing. `of_yards` is the fraction of the empty ground beside roads and buildings that is seen as this one; where
+    it is given, the precision follows from it and from the view, and `precision` is what towns come near. Else false
+    alarms follow from `precision`, besides those that other classes are called. `small_m2` is the area at which an
     object is half as likely to be missed as a tiny one. `outline` is the fraction of the false alarms that continue the
     outline of something seen, with bulges about `bulge_m` deep. `alarms_on` names where the others lie.
     """
@@ -52,7 +52,7 @@ class MeasuredErrors:
 # Guessed: that 5 % of either sort of road is called the other, which leaves 0.98 as a road, and how the 5.2 % divide
 # between them; every other class, `called`, precision and share of outlines; all sizes and widths. What is none of 26
 # classes, grass among them, is taken to be ground within YARD_M of a road or building: what a map leaves empty beyond
-# is mostly grass that nobody mapped. With these yards a town has both the measured fractions and the measured precision.
+# is mostly grass that nobody mapped. With these yards a town has the measured fractions and the measured precision.
 MEASURED: Final[Mapping[str, MeasuredErrors]] = {
     "road_major": MeasuredErrors(recall=0.93, precision=0.80, called={"road_minor": 0.05}, of_yards=0.007, width_m=6.0),
     "road_minor": MeasuredErrors(recall=0.93, precision=0.80, called={"road_major": 0.05}, of_yards=0.045, width_m=4.0),
@@ -107,7 +107,7 @@ class MeasuredPerception:
     -----
     A class loses what is called another class, then small objects, then bites of its outline or stretches of a line.
     It gains what others are called, then bulges of its outline, then objects of its own shape: blocks for buildings,
-    bands for lines, patches for areas. False buildings and roads lie on ground that shows nothing, mostly beside others.
+    bands for lines, patches for areas. False buildings and roads lie on empty ground, mostly beside others.
     The tests hold recall, precision and the fractions of the yards to the table, pooled over views of towns.
     """
 

@@ -38,7 +38,7 @@ SEEN_ANYWHERE: Final = 0.2  # fraction of the false alarms that occur whether or
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassErrors:
-    """Errors of a detector on one class, in its own domain, pixel by pixel; for line classes with a cell of tolerance."""
+    """Errors of a detector on one class, in its domain, pixel by pixel; for line classes with a cell of tolerance."""
 
     recall: float
     precision: float
@@ -101,15 +101,16 @@ _STUB_SPENDS: Final = 0.85  # of the cells of a false line; the others are prese
 class Perception:
     """See a clean view with a detector's errors.
 
-    The detector "published". `error_factor` multiplies the errors of every class: 0 is a perfect detector, 1 one in its own domain, 1.5 to 2 one in
-    another domain. At most 0.95 of a class goes wrong.
+    The detector "published". `error_factor` multiplies the errors of every class: 0 is a perfect detector, 1 one in its
+    own domain, 1.5 to 2 one in another domain. At most 0.95 of a class goes wrong.
 
     Notes
     -----
-    Of the cells of a class, a fraction 1 - recall is lost, and recall / precision - recall as many are seen in the wrong
-    place. Only the F1 scores are published, so recall and precision are both taken to be F1. Objects, edges and confusion use this budget first, patches and false lines
-    the rest. The tests hold the measured F1 to within 0.06 of the target, pooled over views of towns, for classes that
-    cover a third of their `usual_share` or more. For rarer ones, `SEEN_ANYWHERE` makes it lower.
+    Of the cells of a class, a fraction 1 - recall is lost, and recall / precision - recall as many are seen in the
+    wrong place. Only the F1 scores are published, so recall and precision are both taken to be F1. Objects, edges and
+    confusion use this budget first, patches and false lines the rest. The tests hold the measured F1 to within 0.06 of
+    the target, pooled over views of towns, for classes that cover a third of their `usual_share` or more. For rarer
+    ones, `SEEN_ANYWHERE` makes it lower.
     """
 
     error_factor: float = 1.0

@@ -6,6 +6,7 @@ missed more often than large ones, fields are confused as a whole, outlines bulg
 bad view is bad for all classes.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -30,8 +31,9 @@ class MeasuredErrors:
     nothing. `of_yards` is the fraction of the empty ground beside roads and buildings that is seen as this one; where
     it is given, the precision follows from it and from the view, and `precision` is what towns come near. Else false
     alarms follow from `precision`, besides those that other classes are called. `small_m2` is the area at which an
-    object is half as likely to be missed as a tiny one. `outline` is the fraction of the false alarms that continue the
-    outline of something seen, with bulges about `bulge_m` deep. `alarms_on` names where the others lie.
+    object is half as likely to be missed as a tiny one; they are `small_share` of the lost cells at most. `outline` is
+    the fraction of the false alarms that continue the outline of something seen, with bulges about `bulge_m` deep.
+    `alarms_on` names where the others lie.
     """
 
     recall: float
@@ -39,6 +41,7 @@ class MeasuredErrors:
     called: Mapping[str, float] = field(default_factory=dict)
     of_yards: float | None = None
     small_m2: float = 20.0
+    small_share: float = 0.6
     outline: float = 0.6
     bulge_m: float = 1.5
     width_m: float = 3.0  # of a false line
@@ -48,7 +51,8 @@ class MeasuredErrors:
 # Measured, a 26-class U-Net on drone images of the same ground that it was trained on, so optimistic: recall and
 # precision of building, road, path and bridge; 5.8 % of what is none of the classes becomes building and 5.2 % road;
 # 8-12 % of bridges become road; pools are hardly ever seen. Measured, aerial tiles with a geographic split: recall of
-# water 0.87, forest 0.79, grass 0.73 (our green: the mean), arable 0.47, of which 37 points are called grass.
+# water 0.87 (here: beside the pools), forest 0.79, grass 0.73 (our green: the mean), arable 0.47, of which 37 points
+# are called grass.
 # Guessed: that 5 % of either sort of road is called the other, which leaves 0.98 as a road, and how the 5.2 % divide
 # between them; every other class, `called`, precision and share of outlines; all sizes and widths. What is none of 26
 # classes, grass among them, is taken to be ground within YARD_M of a road or building: what a map leaves empty beyond
@@ -60,7 +64,13 @@ MEASURED: Final[Mapping[str, MeasuredErrors]] = {
     "railway": MeasuredErrors(recall=0.85, precision=0.85, called={"path_track": 0.05}, outline=0.5),
     "building": MeasuredErrors(recall=0.97, precision=0.86, of_yards=0.058, outline=0.55),
     "water": MeasuredErrors(
-        recall=0.87, precision=0.90, called={"green": 0.03}, small_m2=250.0, outline=0.8, bulge_m=3.0
+        recall=0.87,
+        precision=0.90,
+        called={"green": 0.03},
+        small_m2=250.0,
+        small_share=math.inf,
+        outline=0.8,
+        bulge_m=3.0,
     ),
     "waterway": MeasuredErrors(recall=0.60, precision=0.75, called={"green": 0.10}, outline=0.3),
     "coastline": MeasuredErrors(recall=0.87, precision=0.87, outline=1.0),
@@ -89,7 +99,6 @@ _ROUNDED_M: Final = 0.8  # corners are rounded by a blur of this deviation
 _PINHOLE_CELLS: Final = 1.5
 _MOST_ERROR: Final = 0.95
 _MOST_GROUND: Final = 0.5
-_SMALL_SHARE: Final = 0.6  # of the lost cells, at most, that are lost as small objects
 _OBJECT_SPREAD: Final = 2.0  # how far objects differ in what they look like, in deviations of the noise within them
 _TRIES: Final = 5  # draws of a false object for each that is expected
 _STRUCTURES: Final = ("road_major", "road_minor", "building", "parking")
@@ -199,7 +208,8 @@ class _View:
             called.setdefault(other, []).append(confused)
             kept &= ~confused
         budget = lost * total - (total - np.count_nonzero(kept))
-        kept &= ~self._small(kept, errors.small_m2, budget, rng)
+        limit = errors.small_share * max(budget, 1.0)
+        kept &= ~self._small(kept, errors.small_m2, min(factor, 1.0), limit, rng)
         if name in thin_classes():
             score = self.noise(HIDDEN_M, rng)
         else:
@@ -219,14 +229,14 @@ class _View:
         looks = np.asarray(looks + own.astype(np.float32)[objects.labels], dtype=np.float32)
         return chosen | (large & (looks >= highest_within(looks, large, share * np.count_nonzero(large), rng)))
 
-    def _small(self, mask: Mask, small_m2: float, budget: float, rng: np.random.Generator) -> Mask:
-        """Return objects to miss: the smaller, the more likely; on average they spend a part of the budget at most."""
+    def _small(self, mask: Mask, small_m2: float, most: float, limit: float, rng: np.random.Generator) -> Mask:
+        """Return objects to miss: the smaller, the more likely, up to `most`; on average at most `limit` cells."""
         objects = find_objects(mask)
         areas = objects.areas_cells
-        chance = 1 / (1 + (areas * self.cell_m**2 / small_m2) ** 1.5)
+        chance = most / (1 + (areas * self.cell_m**2 / small_m2) ** 1.5)
         expected = float(chance @ areas)
         if expected > 0:
-            chance = chance * min(1.0, max(_SMALL_SHARE * budget, 0.0) / expected)
+            chance = chance * min(1.0, limit / expected)
         return objects.mask_of(rng.random(len(areas)) < chance)
 
     def _depth_m(self, mask: Mask) -> Field:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 else:  # loaded when a table is made
     gpd = lazy_loader.load("geopandas")
 
+VECTOR_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway")
 COLUMNS: Final = ("class", "level", "is_bridge", "geometry")
 _DECIMALS: Final = 1  # decimetres: finer than any detector, and far smaller on disk
 _EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere

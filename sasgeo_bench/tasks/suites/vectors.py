@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
+from sasgeo_bench.tasks.query import PUBLISHED
 from sasgeo_bench.tasks.suites.base import Shot, State
-from sasgeo_bench.tasks.vectors import vector_table
+from sasgeo_bench.tasks.suites.measured_vectors import MeasuredVectorNoise, perceive_coarsely
+from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, vector_table
 
 if TYPE_CHECKING:
     import geopandas as gpd
 
-VECTOR_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway")
 _LEAST_M: Final = 2.0
 _WAVES: Final = 8
 _WAVELENGTHS_M: Final = (60.0, 150.0)
@@ -66,14 +67,12 @@ def perceive_vectors(
 
 
 def site_vectors(shot: Shot, pose: Pose | None = None) -> "gpd.GeoDataFrame":
-    """Perceive the vectors of a shot, at its site unless another pose is given."""
-    return perceive_vectors(
-        shot.scene.world,
-        pose or shot.site.pose,
-        side_m=shot.variant.side_m,
-        noise=VectorNoise(),
-        rng=shot.rng("vectors"),
-    )
+    """Perceive the vectors of a shot with its detector, at its site unless another pose is given."""
+    world, place, side_m = shot.scene.world, pose or shot.site.pose, shot.variant.side_m
+    rng = shot.rng("vectors", *shot.variant.others)
+    if shot.variant.detector == PUBLISHED:
+        return perceive_vectors(world, place, side_m=side_m, noise=VectorNoise(), rng=rng)
+    return perceive_coarsely(world, place, side_m=side_m, noise=MeasuredVectorNoise(), rng=rng)
 
 
 def smooth_shift(rms_m: float, rng: np.random.Generator) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:

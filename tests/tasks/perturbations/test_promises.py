@@ -10,7 +10,8 @@ from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import share_changed
-from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
+from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, RowJitter, Tilt
+from sasgeo_bench.tasks.perturbations.measured import MeasuredPerception
 from sasgeo_bench.tasks.perturbations.occlusion import (
     AdversarialMask,
     Border,
@@ -27,6 +28,7 @@ from sasgeo_bench.tasks.perturbations.season import Season
 RATES = rates_by_hand()
 ALL = (
     Perception(error_factor=1.0),
+    MeasuredPerception(error_factor=1.0),
     Rectangles(share=0.3),
     Border(share=0.3),
     TiltWedge(share=0.3),
@@ -35,6 +37,8 @@ ALL = (
     AdversarialMask(share=0.3),
     FalseUnknown(share=0.2),
     LocalWarp(rms_m=10.0),
+    RowJitter(rms_m=10.0),
+    Tilt(rms_m=10.0),
     CentralCrop(share=0.3),
     Season(kind="leaf_on", strength=0.6),
     Season(kind="snow", strength=0.6),
@@ -43,8 +47,9 @@ ALL = (
     Ageing(years=10.0, rates=RATES, place="here", redrawn=0.3),
 )
 DETERMINISTIC = (AdversarialMask, CentralCrop)
-MOVES = (LocalWarp,)
-STRENGTH = {Perception: "error_factor", LocalWarp: "rms_m", Season: "strength", Ageing: "years"}  # of the others: share
+MOVES = (LocalWarp, RowJitter, Tilt)
+STRENGTH = {Season: "strength", Ageing: "years"}  # of the others: share
+STRENGTH |= dict.fromkeys((Perception, MeasuredPerception), "error_factor") | dict.fromkeys(MOVES, "rms_m")
 every = pytest.mark.parametrize("perturbation", ALL, ids=lambda item: getattr(item, "kind", type(item).__name__))
 
 

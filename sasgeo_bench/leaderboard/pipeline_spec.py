@@ -200,7 +200,7 @@ class PipelineFile(NamedDocument):
         suites += [] if self.paper is None else [PAPER_SUITE, *map(paper_suite, self.paper.crop_readings)]
         for what, listed in (
             ("suite", suites),
-            *(("detector", task.detectors) for task in self.task),
+            *(("detector", [str(name) for name in task.detectors]) for task in self.task),
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
             ("contrast", [item.name for item in self.contrast]),

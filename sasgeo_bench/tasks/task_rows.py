@@ -226,7 +226,7 @@ def with_added(truths: Rows) -> Rows:
     >>> with_added(pa.table({"query_id": ["a"]})).to_pylist()
     [{'query_id': 'a', 'detector': 'published'}]
     """
-    lost = [name for name in ADDED if name not in truths.schema.names]
+    lost: list[str] = [name for name in ADDED if name not in truths.schema.names]
     columns = [*truths.columns, *(pa.array([ADDED[name]] * truths.num_rows, pa.string()) for name in lost)]
     schema = pa.schema([*truths.schema, *map(TRUTH_SCHEMA.field, lost)], metadata=truths.schema.metadata)
     return type(truths).from_arrays(columns, schema=schema)

@@ -110,6 +110,7 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
         (("--prior", "r500-weak"), "'r500-weak' is no prior group: r100, r250, r500, r2000 or rnone"),
         (("--prior", "r300-weak-s3"), "'r300-weak-s3' is no prior group"),
         (("--region-files", "nowhere"), "there is no folder nowhere"),
+        (("--detector", "published", "--detector", "mine"), "--detector 'mine' is unknown: published or measured"),
     ],
 )
 def test_a_mistake_gets_one_line_and_exit_2_and_nothing_is_written(words, told, mistake, tmp_path):

@@ -241,6 +241,9 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ({"[[contrast]]": MIRRORED + "[[contrast]]"}, "contrasts 'mirrored' and 'nothing' compare the same"),
         ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
+        ({"sites = 1": "sites = 1\ndetectors = []"}, "at least 1 item"),
+        ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "'published' or 'measured'"),
+        ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
         (
@@ -423,11 +426,30 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     newer = {
         "learning": True,
         "contrast": {"__all__": {"pilot"}},
-        "task": {"__all__": {"views_cells", "kinds", "tracks"}},
+        "task": {"__all__": {"views_cells", "kinds", "tracks", "detectors"}},
     }
     assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude=newer).encode()).hexdigest()
-    chosen = small(**{"sites = 1": "sites = 1\nviews_cells = [192]"})
-    assert chosen.sha256 != spec.sha256
+    for key in ("views_cells = [192]", 'detectors = ["published", "measured"]'):
+        assert small(**{"sites = 1": f"sites = 1\n{key}"}).sha256 != spec.sha256
+    taught = [
+        parse_toml(LEARNING.replace("[learning]", f"[learning]{said}"), PipelineFile, source="it") for said in SAID
+    ]
+    assert taught[0].sha256 == taught[1].sha256 != taught[2].sha256
+
+
+SAID = ("", '\ndetector = "published"', '\ndetector = "measured"')
+
+
+def test_detectors_of_a_task_reach_its_queries_and_those_of_learning_the_training_set(tmp_path):
+    spec = parse_toml(
+        LEARNING.replace("[learning]", f"[learning]{SAID[2]}").replace(
+            "[[task]]", '[[task]]\ndetectors = ["published", "measured"]'
+        ),
+        PipelineFile,
+        source="it",
+    )
+    plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
+    assert {request.choice.detectors for request in plan.requests} == {("published", "measured")}
 
 
 def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp_path):

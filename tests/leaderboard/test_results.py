@@ -10,7 +10,8 @@ import pytest
 
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.publishing.archive import stored_settings
-from sasgeo_bench.publishing.archive_file import MOST_BYTES
+from sasgeo_bench.publishing.archive_file import MOST_BYTES, unpack_tasks
+from sasgeo_bench.tasks.task_files import read_truths
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 BOARDS = sorted(folder.name for folder in RESULTS.glob("*/") if folder.is_dir())
@@ -42,6 +43,14 @@ def test_results_are_small():
 @pytest.mark.parametrize("name", BOARDS)
 def test_all_controls_held(name):
     assert pd.read_parquet(RESULTS / name / "controls.parquet")["holds"].all()
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_stored_truths_are_of_the_published_detector(name, tmp_path):
+    """Older ones have no column that would say so."""
+    tasks = unpack_tasks(RESULTS / name, tmp_path)
+    truths = read_truths(tmp_path / "truth" / tasks[0].relative_to(tmp_path / "tasks"))
+    assert {truth.detector for truth in truths} == {"published"}
 
 
 def test_every_row_of_a_table_on_the_page_stands_on_a_board():

@@ -7,6 +7,8 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -213,6 +215,23 @@ def test_a_training_set_is_the_same_whatever_order_its_tasks_are_named_in(tasks)
     assert found[0].count == 7
     assert found[0].places == ("town-grid", "town-riverside")
     assert plan_training(train, asked=[], split=None, most=8).sha256 != found[0].sha256
+
+
+def test_matchers_learn_from_the_views_of_one_detector(tasks, tmp_path):
+    out = Path(shutil.copytree(tasks, tmp_path / "other"))
+    task, truths = out / "tasks" / CLEAN, out / "truth" / CLEAN / task_files.TRUTH
+    table = pq.read_table(truths)
+    detectors = ["measured" if at % 3 == 0 else "published" for at in range(len(table))]
+    at = table.column_names.index("detector")
+    pq.write_table(table.set_column(at, "detector", pa.array(detectors)), truths)
+    counts = Counter(detectors)
+    for detector, count in counts.items():
+        found = plan_training([task], asked=[], split=None, most=2000, detector=detector)
+        assert found.count == count
+    assert plan_training([task], asked=[], split=None, most=2000).count == counts["published"]
+    pq.write_table(table.set_column(at, "detector", pa.array(["measured"] * len(table))), truths)
+    with pytest.raises(ConfigError, match="holds no queries of detector 'published'"):
+        plan_training([task], asked=[], split=None, most=2000)
 
 
 @given(st.lists(st.tuples(*(st.sampled_from("abc") for _ in range(3))), min_size=1, max_size=40), st.randoms())

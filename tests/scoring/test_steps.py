@@ -55,6 +55,15 @@ def test_steps_that_are_ages_of_a_map_are_named_by_the_ages_that_maps_have():
     assert names_of(table) == ["matcher", *(f"{name}, 192 cells, n = 40" for name in names)]
 
 
+def test_detectors_are_strata_where_there_are_several():
+    table = frame(np.ones(COUNT)).assign(detector="published")
+    assert not [name for name, _ in strata(table) if name.startswith("detector")]
+    table.loc[::3, "detector"] = "measured"
+    found = dict(strata(table))
+    assert found["detector measured"].sum() == COUNT // 3
+    np.testing.assert_array_equal(found["detector published"], ~found["detector measured"])
+
+
 def test_a_change_of_real_maps_is_named_for_what_it_mostly_is():
     table = frame(np.ones(COUNT)).assign(changed_share=0.3)
     mapped, made = (dict(strata(table.assign(suite=suite))) for suite in ("real-age", "growth"))

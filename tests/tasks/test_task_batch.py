@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many requests: no query hangs on how many processes draw, nor on which variants are left out."""
 
+from collections import Counter
+
 import pytest
 
 from sasgeo_bench.errors import ConfigError
@@ -63,6 +65,29 @@ def test_what_is_left_out_changes_no_other_query(tmp_path, lay_towns):
     assert {name: query.prior for name, query in some.items()} == {name: all_of_it[name].prior for name in some}
     assert {query.track for query in some.values()} == {"localization"}
     assert {query.evidence.shape for query in some.values()} == {(192, 192)}
+
+
+def test_each_detector_sees_every_place_and_the_published_one_as_without_the_other(tmp_path, lay_towns):
+    found = {}
+    for name, detectors in (("one", ("published",)), ("both", ("published", "measured"))):
+        lay_towns(tmp_path / name, TOWNS[0])
+        choice = Choice(views_cells=(96,), kinds=("G1 tilt",), detectors=detectors)
+        drawn = list(carry_out(wanted(tmp_path / name, "local-warp", regions=TOWNS[:1], choice=choice)))
+        truths = {
+            truth.query_id: truth
+            for item in drawn
+            for folder in item.folders
+            for truth in task_files.read_truths(
+                tmp_path / name / "truth" / folder.relative_to(tmp_path / name / "tasks")
+            )
+        }
+        found[name] = (queries_of(drawn), truths)
+    (one, _), (both, truths) = found["one"], found["both"]
+    assert {name for name, truth in truths.items() if truth.detector == "published"} == set(one)
+    assert all((both[name].evidence.cells == query.evidence.cells).all() for name, query in one.items())
+    assert all(both[name].vectors.to_wkt().equals(query.vectors.to_wkt()) for name, query in one.items())
+    pairs = Counter((truth.pair_id, truth.role, truth.kind, truth.pose) for truth in truths.values())
+    assert set(pairs.values()) == {2}
 
 
 def test_controls_and_falsifiers_are_drawn_whatever_the_kinds():

@@ -3,7 +3,7 @@
 
 import datetime as dt
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import geopandas as gpd
@@ -32,7 +32,16 @@ from sasgeo_bench.tasks.task_files import (
     task_faults,
     write_task,
 )
-from sasgeo_bench.tasks.task_rows import ASKED, QUERY_SCHEMA, asked_sha256, query_of, query_row, truth_of, truth_row
+from sasgeo_bench.tasks.task_rows import (
+    ASKED,
+    QUERY_SCHEMA,
+    asked_sha256,
+    query_of,
+    query_row,
+    truth_of,
+    truth_row,
+    truth_sha256,
+)
 
 ROOT = Path(__file__).parents[2]
 ABOUT = {"suite": "clean", "title": "Clean", "region": "here", "map_fingerprint": "0"}
@@ -215,6 +224,18 @@ def test_a_query_comes_back_from_its_row_as_it_was(query):
 @given(truths)
 def test_a_truth_comes_back_from_its_row_as_it_was(truth):
     assert truth_of(truth_row(truth)) == truth
+
+
+def test_truths_of_before_there_were_detectors_are_of_the_published_one(written):
+    path = written[1] / TRUTH
+    pq.write_table(pq.read_table(path).drop_columns(["detector"]), path)
+    assert {truth.detector for truth in read_truths(written[1])} == {"published"}
+
+
+def test_what_is_learned_from_the_published_detector_keeps_its_hash():
+    one = one_truth(query_id="a" * 24)
+    assert truth_sha256(one) == "134a6243d85d4f58eda1fb7c9465cc2526cf89e5d9ce1d60deb132086b368984"
+    assert truth_sha256(replace(one, detector="measured")) != truth_sha256(one)
 
 
 @settings(max_examples=15)

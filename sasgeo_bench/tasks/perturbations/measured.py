@@ -223,7 +223,7 @@ class _View:
         objects, looks = find_objects(mask), self.noise(GROUND_M, rng)
         own = np.concatenate((np.zeros(1), _OBJECT_SPREAD * rng.standard_normal(len(objects.areas_cells))))
         is_small = objects.areas_cells * self.cell_m**2 < (GROUND_M / 2) ** 2
-        share = count / max(1, np.count_nonzero(mask))
+        share = count / max(1, int(np.count_nonzero(mask)))
         chosen = objects.mask_of(is_small & (rng.random(len(is_small)) < share))
         large = objects.mask_of(~is_small)
         looks = np.asarray(looks + own.astype(np.float32)[objects.labels], dtype=np.float32)
@@ -233,8 +233,8 @@ class _View:
         """Return objects to miss: the smaller, the more likely, up to `most`; on average at most `limit` cells."""
         objects = find_objects(mask)
         areas = objects.areas_cells
-        chance = most / (1 + (areas * self.cell_m**2 / small_m2) ** 1.5)
-        expected = float(chance @ areas)
+        chance = np.asarray(most / (1 + (areas * self.cell_m**2 / small_m2) ** 1.5), dtype=np.float64)
+        expected = float((chance * areas).sum())
         if expected > 0:
             chance = chance * min(1.0, limit / expected)
         return objects.mask_of(rng.random(len(areas)) < chance)
@@ -285,7 +285,8 @@ class _View:
         median = ALARM_M2 / self.cell_m**2
         tries = int(_TRIES * budget / median) + 1
         areas = median * rng.lognormal(0.0, 0.7, size=tries)
-        shapes = np.sqrt(areas)[:, None] * np.stack((sides := rng.uniform(0.7, 1.0, size=tries), 1 / sides), axis=1)
+        slim = rng.uniform(0.7, 1.0, size=tries)
+        shapes = np.sqrt(areas)[:, None] * np.stack((slim, 1 / slim), axis=1)
         places, turns = self._places(free, tries, rng), rng.uniform(0, 180, size=tries)
         corners = [
             cv2.boxPoints((place, size, turn)).round().astype(np.int32)

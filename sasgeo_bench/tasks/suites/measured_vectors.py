@@ -189,12 +189,13 @@ def _merged(
     found = []
     for label in dict.fromkeys(group.tolist()):
         own = np.flatnonzero(group == label)
-        whole = shapes[own[0]]
+        first = int(own[0])
+        whole = shapes[first]
         if len(own) > 1:
             half_m = noise.merged_m / 2 + 0.1
-            whole = shapely.union_all([shapes[at] for at in own]).buffer(half_m, join_style="mitre")
+            whole = shapely.union_all([shapes[at] for at in own.tolist()]).buffer(half_m, join_style="mitre")
             whole = max(shapely.get_parts(whole.buffer(-half_m, join_style="mitre")), key=lambda part: part.area)
-        found.append((int(own[0]), whole))
+        found.append((first, whole))
     return found
 
 
@@ -208,14 +209,14 @@ def _false(
     """Return drives that branch off lines, and sheds beside buildings, that are not there."""
     found = []
     for _ in range(rng.poisson(noise.false_share * len(lines))):
-        line = lines[rng.integers(len(lines))].shape
+        line = lines[int(rng.integers(len(lines)))].shape
         begin = shapely.get_coordinates(shapely.line_interpolate_point(line, rng.random(), normalized=True))[0]
         turn, length_m = rng.uniform(0, 2 * np.pi), rng.uniform(10, 40)
         end = begin + length_m * np.array((np.cos(turn), np.sin(turn)))
         shape = shapely.LineString((begin, np.clip(end, -side_m / 2, side_m / 2)))
         found.append(_Thing(name="road_minor", level=0, is_bridge=False, shape=shape))
     for _ in range(rng.poisson(noise.false_share * len(areas))):
-        near = shapely.get_coordinates(areas[rng.integers(len(areas))].shape.centroid)[0]
+        near = shapely.get_coordinates(areas[int(rng.integers(len(areas)))].shape.centroid)[0]
         middle, sides = near + rng.normal(0, 15, size=2), rng.uniform(3, 9, size=2) / 2
         turn = rng.uniform(0, np.pi / 2)
         spin = np.array(((np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))))

@@ -431,24 +431,18 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude=newer).encode()).hexdigest()
     for key in ("views_cells = [192]", 'detectors = ["published", "measured"]'):
         assert small(**{"sites = 1": f"sites = 1\n{key}"}).sha256 != spec.sha256
-    taught = [
-        parse_toml(LEARNING.replace("[learning]", f"[learning]{said}"), PipelineFile, source="it") for said in SAID
-    ]
-    assert taught[0].sha256 == taught[1].sha256 != taught[2].sha256
+    taught = [taught_by(line).sha256 for line in ("", 'detector = "published"', 'detector = "measured"')]
+    assert taught[0] == taught[1] != taught[2]
 
 
-SAID = ("", '\ndetector = "published"', '\ndetector = "measured"')
+def taught_by(line, text=LEARNING):
+    """Return the file with another line below [learning]."""
+    return parse_toml(text.replace("[learning]", f"[learning]\n{line}"), PipelineFile, source="taught.toml")
 
 
-def test_detectors_of_a_task_reach_its_queries_and_those_of_learning_the_training_set(tmp_path):
-    spec = parse_toml(
-        LEARNING.replace("[learning]", f"[learning]{SAID[2]}").replace(
-            "[[task]]", '[[task]]\ndetectors = ["published", "measured"]'
-        ),
-        PipelineFile,
-        source="it",
-    )
-    plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
+def test_the_detectors_of_a_task_reach_its_queries(tmp_path):
+    text = LEARNING.replace("[[task]]", '[[task]]\ndetectors = ["published", "measured"]')
+    plan = plan_pipeline(taught_by("", text), out=tmp_path, tell=lambda _: None)
     assert {request.choice.detectors for request in plan.requests} == {("published", "measured")}
 
 

@@ -56,6 +56,7 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
             "feature_density": 0.1,
             "alias_index": 0.8,
             "scene": "urban",
+            "detector": "published",
             "is_present": True,
             "status": "ok",
             "ceiling": 1.0,

@@ -5,6 +5,7 @@ import datetime as dt
 import json
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import geopandas as gpd
 import numpy as np
@@ -19,7 +20,7 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Query, Truth
+from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Detector, Query, Truth
 from sasgeo_bench.tasks.task_files import (
     QUERIES,
     TASK,
@@ -136,6 +137,7 @@ truths = st.builds(
     alias_index=shares,
     block=words,
     scene=words,
+    detector=st.sampled_from(get_args(Detector)),
     measured=st.dictionaries(words, st.floats(allow_nan=False), max_size=3),
 )
 

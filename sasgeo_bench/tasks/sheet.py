@@ -194,7 +194,7 @@ def _text(panel: Panel) -> tuple[str, ...]:
     alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
     measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items() if name not in _OF_TWIN)
     return (
-        f"{truth.role}: {truth.kind}" + (f", {truth.detector}" if truth.detector != PUBLISHED else ""),
+        f"{truth.role}: {truth.kind}" + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
         strength_text(truth),
         f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
         f"priors {query.prior_group}; {len(query.candidates)} candidates"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the private seed that a command is given."""
+"""Read the private seed that a command is given, and the seed of sealed places."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,14 @@ import typer
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.tasks.private_seed import LEAST_BITS, REPRODUCING_BITS, VARIABLE, PrivateSeed, take_seed
+from sasgeo_bench.tasks.private_seed import (
+    LEAST_BITS,
+    REPRODUCING_BITS,
+    SEALED_VARIABLE,
+    VARIABLE,
+    PrivateSeed,
+    take_seed,
+)
 from sasgeo_bench.tasks.task_plan import PRIVATE_ROOT
 
 SeedFile = Annotated[
@@ -16,6 +23,13 @@ SeedFile = Annotated[
     typer.Option(
         help=f"file NAME.seed with a private seed, readable by you alone (or the seed in {VARIABLE}): draw by it, into "
         "OUT/private"
+    ),
+]
+SealedSeedFile = Annotated[
+    Path | None,
+    typer.Option(
+        help=f"file NAME.seed with a seed, readable by you alone (or the seed in {SEALED_VARIABLE}): open the sealed "
+        "places of the split, and draw them by it"
     ),
 ]
 
@@ -29,8 +43,21 @@ def private_seed(file: Path | None, *, tell: Tell, public: int | None = None) ->
         message = "--seed is public and a private seed is given too: leave one of them out"
         raise ConfigError(message)
     tell(f"drawing by a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}, into OUT/{PRIVATE_ROOT}")
-    if seed.bits < LEAST_BITS:
-        tell(f"warning: {seed.bits} bits are no secret: anyone who sees a query can find the seed; use 32 hex digits")
-    elif seed.bits < REPRODUCING_BITS:
+    _warn_of_bits(seed, tell)
+    if LEAST_BITS <= seed.bits < REPRODUCING_BITS:
         tell(f"warning: a board of this seed makes no row reproduced: that takes {REPRODUCING_BITS} bits")
     return seed
+
+
+def sealed_seed(file: Path | None, *, tell: Tell) -> PrivateSeed | None:
+    """Take the seed of sealed places of a file or of the environment; None without one."""
+    seed = take_seed(file, is_sealed=True)
+    if seed is not None:
+        tell(f"sealed places are drawn by a seed of {seed.bits} bits, commitment {seed.commitment[:12]}")
+        _warn_of_bits(seed, tell)
+    return seed
+
+
+def _warn_of_bits(seed: PrivateSeed, tell: Tell) -> None:
+    if seed.bits < LEAST_BITS:
+        tell(f"warning: {seed.bits} bits are no secret: anyone who sees a query can find the seed; use 32 hex digits")

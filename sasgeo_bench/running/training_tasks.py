@@ -114,7 +114,7 @@ def _hash_of(hashes: Sequence[tuple[str, str]]) -> str:
 
 
 def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Split | None) -> None:
-    """Raise `ConfigError` if regions share a name or place, or have blocks nearer than the buffer of the split.
+    """Raise `ConfigError` if regions share a name or place, have blocks nearer than the buffer, or one is sealed.
 
     `train` and `asked` give for each region a task on it that an error can name.
     """
@@ -124,6 +124,11 @@ def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Spl
         raise ConfigError(message)
     if split is None:
         return
+    sealed = next((name for name in train if split.sealed_place(name)), None)
+    if sealed is not None:
+        place = split.sealed_place(sealed)
+        message = f"--train {train[sealed]} is of the sealed place {place!r}, which never trains: leave it out"
+        raise ConfigError(message)
     places = {place: name for name in train for place in split.places_in(name)}
     shared = next(((place, name) for name in asked for place in split.places_in(name) if place in places), None)
     if shared is not None:

@@ -85,20 +85,22 @@ class Turn:
 def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Iterator[Turn]:
     """Yield every use of a split for scored rows; each row is tested at most once, and no place calibrates itself.
 
-    A hold-out split has one turn, by the part of each query; a cross-fit one for each place on the board. With
-    `is_taught`, for a matcher that was trained on other places, only the fold's own calibration places calibrate.
+    A hold-out split has one turn, by the part of each query; a cross-fit one for each place on the board. A sealed
+    place calibrates no other. With `is_taught`, for a matcher that was trained on other places, only the fold's own
+    calibration places calibrate.
     """
     place, part = scores["place"].to_numpy(), scores["part"].to_numpy()
     if split.spec.kind == "holdout":
         yield Turn(test=part == "test", calibration=part == "calibration", is_own=True)
         return
+    is_sealed = np.isin(place, split.sealed)
     for fold in split.folds:
         test = place == fold.held_out
         if not test.any():
             continue
         own = np.array([fold.part_of.get(name) == "calibration" for name in place], dtype=bool)
         is_own = is_taught or bool(own.any())
-        yield Turn(test=test, calibration=own if is_own else ~test, is_own=is_own)
+        yield Turn(test=test, calibration=own if is_own else ~(test | is_sealed), is_own=is_own)
 
 
 def judge(

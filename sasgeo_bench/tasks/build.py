@@ -131,8 +131,8 @@ def _request_sha256(request: Request) -> str:
         "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
         "region": request.region.model_dump(mode="json"),
         "elsewhere": request.elsewhere and request.elsewhere.model_dump(mode="json"),
-        # Halves decide only where methods train, so changing them redraws nothing.
-        "split": request.split.spec.model_dump(mode="json", exclude={"place": {"__all__": {"half"}}}),
+        # Halves decide only where methods train, so changing them redraws nothing; what is sealed has its own seed.
+        "split": request.split.spec.model_dump(mode="json", exclude={"place": {"__all__": {"half", "sealed"}}}),
         "count": [request.count, request.may_be_fewer],
         "seed": request.seed if isinstance(request.seed, int) else request.seed.commitment,
         "group": None if request.group is None else request.group.name,
@@ -315,7 +315,7 @@ def put_task(
     """Write queries below `out/tasks` and their truths below `out/truth`, each folder whole or not at all.
 
     `pairs` are in the order of the query ids. `about` becomes `task.json`; its `suite` and `region` name the folders.
-    `hidden` becomes `truth.json`; `task.json` repeats the commitment of a private seed.
+    `hidden` becomes `truth.json`; `task.json` repeats the commitment of a private or sealed seed.
 
     Raises
     ------
@@ -330,7 +330,7 @@ def put_task(
     task_files.check_ours(task_folder, (task_files.QUERIES, task_files.TASK))
     task_files.check_ours(truth_folder, (task_files.TRUTH, task_files.TRUTH_OF))
     _check_unmixed(truth_folder, hidden)
-    about |= {name: hidden[name] for name in (task_files.PRIVATE,) if name in hidden}
+    about |= {name: hidden[name] for name in (task_files.PRIVATE, task_files.SEALED) if name in hidden}
     try:
         with (
             locked(task_folder, tell=tell),

@@ -24,6 +24,7 @@ _DIGITS: Final = re.compile(r"[0-9a-f]{1,1024}")
 class PrivateSeed:
     """A seed that is never written: files hold its commitment, messages and `repr` nothing.
 
+    With `is_sealed` it draws the sealed places of a split, otherwise all queries of a private run.
     `text` holds random digits, decimal or hexadecimal, as of `secrets.token_hex(16)`; anything else raises a
     ConfigError that does not quote it. Matchers must not see `file`.
 
@@ -36,15 +37,21 @@ class PrivateSeed:
 
     text: str = field(repr=False)
     file: Path | None = field(default=None, compare=False)
+    is_sealed: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the digits."""
         if not _DIGITS.fullmatch(self.text):
             message = (
-                f"the private seed of {self.file or 'the environment'} must be random digits 0-9 and a-f alone, as "
+                f"the {self.kind} seed of {self.file or 'the environment'} must be random digits 0-9 and a-f alone, as "
                 "secrets.token_hex(16) makes them"
             )
             raise ConfigError(message)
+
+    @property
+    def kind(self) -> str:
+        """Return "private", or "sealed"."""
+        return "sealed" if self.is_sealed else "private"
 
     @property
     def bits(self) -> int:
@@ -58,12 +65,12 @@ class PrivateSeed:
         Nobody finds 128 random bits: 10^12 guesses a second take 10^19 years. Guessing finds a few bits, here and by
         the id of a query.
         """
-        return hashlib.sha256(f"sasgeo-bench private seed {self.text}".encode()).hexdigest()
+        return hashlib.sha256(f"sasgeo-bench {self.kind} seed {self.text}".encode()).hexdigest()
 
     @property
     def root(self) -> str:
         """Return the text that replaces the number of a public seed; no number has the same text."""
-        return f"private {self.text}"
+        return f"{self.kind} {self.text}"
 
 
 Seed = int | PrivateSeed
@@ -73,17 +80,22 @@ def seed_record(seed: Seed) -> dict[str, Any]:
     """Return what files hold of a seed: a public one itself, of a private one the commitment and its bits."""
     if isinstance(seed, int):
         return {"seed": seed}
-    return {"private_seed": {"commitment": seed.commitment, "bits": seed.bits}}
+    return {f"{seed.kind}_seed": {"commitment": seed.commitment, "bits": seed.bits}}
 
 
 VARIABLE: Final = "SASGEO_SEED"
+SEALED_VARIABLE: Final = "SASGEO_SEALED_SEED"
 SUFFIX: Final = ".seed"  # by which every run recognizes the file and hides it from matchers
 _MOST_BYTES: Final = 4096  # more digits are refused
 _PR_SET_DUMPABLE: Final = 4
 
 
-def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None) -> PrivateSeed | None:
+def take_seed(
+    file: Path | None, environ: MutableMapping[str, str] | None = None, *, is_sealed: bool = False
+) -> PrivateSeed | None:
     """Take the private seed of a file `<name>.seed`, or of the environment; None without any.
+
+    With `is_sealed` it is the seed of sealed places, which has a flag and a variable of its own.
 
     The variable is removed from the environment. From then on other processes of the user can read neither the memory
     nor the initial environment of this one (Linux).
@@ -95,15 +107,20 @@ def take_seed(file: Path | None, environ: MutableMapping[str, str] | None = None
     StoreError
         If the file cannot be read, others can read it, or it has another suffix.
     """
-    text = (os.environ if environ is None else environ).pop(VARIABLE, None)
+    kind, flag, variable = (
+        ("sealed", "--sealed-seed-file", SEALED_VARIABLE) if is_sealed else ("private", "--seed-file", VARIABLE)
+    )
+    text = (os.environ if environ is None else environ).pop(variable, None)
     if file is not None and text is not None:
-        message = f"--seed-file and {VARIABLE} both give a private seed: leave one of them out"
+        message = f"{flag} and {variable} both give a {kind} seed: leave one of them out"
         raise ConfigError(message)
     if file is None and text is None:
         return None
     if environ is None:
         _close_memory()
-    return PrivateSeed((text or "").strip()) if file is None else PrivateSeed(_read(file), file=file.resolve())
+    if file is None:
+        return PrivateSeed((text or "").strip(), is_sealed=is_sealed)
+    return PrivateSeed(_read(file), file=file.resolve(), is_sealed=is_sealed)
 
 
 def _read(file: Path) -> str:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 import pyproj
 import shapely
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from sasgeo_bench.config import Document, Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError
@@ -29,20 +29,37 @@ _GEOD: Final = pyproj.Geod(ellps="WGS84")
 
 
 class Place(Document):
-    """Regions or blocks that always stay together; a hold-out gives each a `part`, a cross-fit a `half`."""
+    """Regions or blocks that always stay together; a hold-out gives each a `part`, a cross-fit a `half`.
+
+    A `sealed` place is a test place whose queries are drawn only with a seed that is given at run time. Nothing is ever
+    learned from it or calibrated on it.
+    """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     regions: list[str] = []
     blocks: list[str] = []
     part: Part | None = None
     half: Half | None = None
+    sealed: bool = False
 
     @model_validator(mode="after")
     def _holds_something(self) -> Self:
         if not self.regions and not self.blocks:
             message = f"place {self.name!r} needs regions or blocks"
             raise ValueError(message)
+        if self.sealed and self.blocks:
+            message = f"place {self.name!r} is sealed, and names single blocks: a sealed place needs whole regions"
+            raise ValueError(message)
+        if self.sealed and self.part not in {None, "test"}:
+            message = f"place {self.name!r} is sealed, and its part is {self.part!r}: a sealed place can only test"
+            raise ValueError(message)
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `sealed` where it is not set: splits without it keep the hash of older versions."""
+        fields: dict[str, Any] = write(self)
+        return fields if self.sealed else {name: value for name, value in fields.items() if name != "sealed"}
 
 
 class SplitFile(NamedDocument):
@@ -74,8 +91,10 @@ class SplitFile(NamedDocument):
                 message = f"place {wrong!r} {fault}"
                 raise ValueError(message)
         for half in HALVES if self.kind == "crossfit" else ():
-            if sum(place.half == half for place in self.place) < _LEAST_PLACES:
-                message = f"half {half!r} needs two places at least: one is tested, and another one calibrates"
+            own = [place for place in self.place if place.half == half]
+            if sum(not place.sealed for place in own) < _LEAST_PLACES:
+                open_ones = "two places that are not sealed" if any(place.sealed for place in own) else "two places"
+                message = f"half {half!r} needs {open_ones} at least: one is tested, and another one calibrates"
                 raise ValueError(message)
         return self
 
@@ -143,7 +162,7 @@ def blocks_of(region: str, grid: Grid, *, block_m: float = 1000.0) -> tuple[Bloc
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """One use of a split: every place in one part.
+    """One use of a split: every place in one part; sealed places are in none but the test part.
 
     `held_out` is the test place of a cross-fit fold. The rest of its half calibrates and the other half trains, so that
     one training serves a whole half, on places that neither test nor calibrate it.
@@ -177,6 +196,15 @@ class Split:
         """Return place -> half of a cross-fit; empty for a hold-out."""
         return {place.name: place.half for place in self.spec.place if place.half is not None}
 
+    @cached_property
+    def sealed(self) -> tuple[str, ...]:
+        """Return the names of the sealed places, in the order of the file."""
+        return tuple(place.name for place in self.spec.place if place.sealed)
+
+    def sealed_place(self, region: str) -> str | None:
+        """Return the sealed place that a region lies in; None if it lies in none."""
+        return next((place for place in self.places_in(region) if place in self.sealed), None)
+
     def places_in(self, region: str) -> tuple[str, ...]:
         """Return the places that hold blocks of a region."""
         return tuple(place for place, blocks in self.blocks.items() if any(block.region == region for block in blocks))
@@ -203,7 +231,8 @@ class Split:
             count, part = len(self.blocks[place.name]), place.part or f"half {place.half}"
             regions = ", ".join(dict.fromkeys(block.region for block in self.blocks[place.name]))
             blocks = f"{count:4d} {'block' if count == 1 else 'blocks':6s}"
-            lines.append(f"  {part:12s} {place.name:18s} {blocks}  {regions}")
+            mark = " (sealed)" if place.sealed else ""
+            lines.append(f"  {part:12s} {place.name:18s} {blocks}  {regions}{mark}")
         near = nearest_pair(self)
         if self.half_of:
             lines.append(
@@ -215,9 +244,10 @@ class Split:
 
 
 def _fold(spec: SplitFile, held_out: str) -> Fold:
-    """Hold one place out: the rest of its half calibrates, the other half trains."""
+    """Hold one place out: the rest of its half calibrates, the other half trains; sealed places do neither."""
     own = next(place.half for place in spec.place if place.name == held_out)
-    parts: dict[str, Part] = {place.name: "calibration" if place.half == own else "train" for place in spec.place}
+    others = [place for place in spec.place if not place.sealed]
+    parts: dict[str, Part] = {place.name: "calibration" if place.half == own else "train" for place in others}
     return Fold(held_out=held_out, part_of=parts | {held_out: "test"})
 
 

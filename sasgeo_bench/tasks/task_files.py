@@ -55,6 +55,7 @@ TASK: Final = "task.json"
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
 PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
+SEALED: Final = "sealed_seed"  # the same of queries of a sealed place
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
@@ -101,6 +102,7 @@ class TaskManifest(Document):
     prior_groups: list[str] | None = None
     candidates_sha256: str | None = None
     private_seed: dict[str, str | int] | None = None  # its commitment and bits
+    sealed_seed: dict[str, str | int] | None = None  # the same
     files: TaskFiles
     licence: str | None = None
     attribution: str | None = None

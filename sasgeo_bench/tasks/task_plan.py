@@ -54,12 +54,16 @@ class Request(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted(Settings):
-    """Suites, a split, and regions as ids or files; without regions, all of the split that can be built."""
+    """Suites, a split, and regions as ids or files; without regions, all of the split that can be built.
+
+    `sealed_seed` draws the sealed places of the split; without it they are left out.
+    """
 
     suites: tuple[str, ...]
     regions: tuple[str, ...]
     split: str
     region_folders: tuple[Path, ...] = ()
+    sealed_seed: PrivateSeed | None = None
 
 
 def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
@@ -68,8 +72,8 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
     Raises
     ------
     ConfigError
-        If a suite, region or split is unknown, the split is not sound or lacks a region, the count is not positive, or
-        the truths would be among the tasks.
+        If a suite, region or split is unknown, the split is not sound or lacks a region, the count is not positive, the
+        truths would be among the tasks, or all regions are sealed.
     """
     for name in wanted.suites:
         fault = wanted.choice.lack(find_suite(name))
@@ -95,10 +99,31 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         raise ConfigError(message)
     settings = {item.name: getattr(wanted, item.name) for item in fields(Settings)}
     return tuple(
-        Request(suite=name, region=item, split=split, elsewhere=wrong_place(split, item, known), **settings)
-        for item in {item.id: item for item in named}.values()
+        Request(
+            suite=name,
+            region=item,
+            split=split,
+            elsewhere=wrong_place(split, item, known),
+            **settings | ({"seed": wanted.sealed_seed} if split.sealed_place(item.id) else {}),
+        )
+        for item in _without_sealed({item.id: item for item in named}, split, wanted, tell)
         for name in dict.fromkeys(wanted.suites)
     )
+
+
+def _without_sealed(
+    named: Mapping[str, RegionFile], split: Split, wanted: Wanted, tell: Tell
+) -> tuple[RegionFile, ...]:
+    """Leave out regions of sealed places unless their seed is given, and tell so in one line."""
+    closed = [] if wanted.sealed_seed is not None else [name for name in named if split.sealed_place(name)]
+    if not closed:
+        return tuple(named.values())
+    places = ", ".join(dict.fromkeys(filter(None, map(split.sealed_place, closed))))
+    message = f"sealed places of split {split.spec.id!r} are left out: {places} (leaderboard --sealed-seed-file opens them)"
+    if len(closed) == len(named):
+        raise ConfigError(message)
+    tell(message)
+    return tuple(item for name, item in named.items() if name not in closed)
 
 
 def root_of(out: Path, seed: PrivateSeed | None) -> Path:
@@ -143,15 +168,19 @@ def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -
 def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile]) -> RegionFile | None:
     """Return the region for views of a wrong place: the next place of the split of the same kind, synthetic or real.
 
-    It depends on the split alone, so that asking for more regions changes no query.
+    It depends on the split alone, so that asking for more regions changes no query. In a hold-out it is of the same
+    part, so that nobody learns from views of a test place. No view is of a sealed place.
     """
     places = [[name for name in place.regions if name in known] for place in split.spec.place]
     at = next((index for index, names in enumerate(places) if region.id in names), None)
     if at is None:
         return None
-    is_town = region.pick(None).town is not None
+    own, is_town = split.spec.place[at], region.pick(None).town is not None
     for step in range(1, len(places)):
-        for name in places[(at + step) % len(places)]:
+        other = (at + step) % len(places)
+        if split.spec.place[other].sealed or split.spec.place[other].part != own.part:
+            continue
+        for name in places[other]:
             if (known[name].pick(None).town is not None) == is_town:
                 return known[name]
     return None

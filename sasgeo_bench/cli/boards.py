@@ -9,9 +9,9 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, print_table, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, print_table, read_day, say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.cli.seeds import SeedFile, private_seed
+from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.leaderboard.board import Board
@@ -198,6 +198,10 @@ class LeaderboardOptions(Options):
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1
     dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None
     seed_file: SeedFile = None
+    sealed_seed_file: SealedSeedFile = None
+    opened: Annotated[
+        str | None, typer.Option(help="day on which sealed places are opened, as in 2026-11-23; default: today (UTC)")
+    ] = None
     private: Private = None
     results: Results = None
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")] = (
@@ -210,6 +214,7 @@ class LeaderboardOptions(Options):
 def leaderboard_command(options: LeaderboardOptions) -> None:
     """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
     spec = read_pipeline_file(find_pipeline_file(options.pipeline))
+    opened = None if options.opened is None else read_day(options.opened, flag="--opened")
     plan = plan_pipeline(
         spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
         out=options.out,
@@ -217,6 +222,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         extract_folders=tuple(options.extracts or ()),
         region_folders=tuple(options.region_files or ()),
         private=private_seed(options.seed_file, tell=tell),
+        sealed=sealed_seed(options.sealed_seed_file, tell=tell),
     )
     plan = replace(plan, jobs=options.jobs, dask=options.dask)
     if options.dry_run:
@@ -229,7 +235,13 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         read_private(private, plan.spec.identity)
     with shown_progress() as progress:
         board = run_pipeline(
-            plan, tell=tell, progress=progress, results=results, has_cases=options.cases, private=private
+            plan,
+            tell=tell,
+            progress=progress,
+            results=results,
+            has_cases=options.cases,
+            private=private,
+            opened=opened,
         )
     show_board(board)
     say(board_folder(plan))

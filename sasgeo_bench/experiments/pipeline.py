@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline file -> queries, runs and a board; steps that are up to date are skipped."""
 
+import datetime as dt
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,9 +13,11 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.experiments.lessons import Lessons, needed, trains
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.paper.task import region_name
+from sasgeo_bench.experiments.sealed import Seal, open_seal, seal_of
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
@@ -24,12 +27,13 @@ from sasgeo_bench.matching.plugins import YARDSTICK, check_names
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import contrast_of, pack_board
 from sasgeo_bench.publishing.archive_folder import check_results
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.scoring.contestants import read_scored_task
+from sasgeo_bench.scoring.contestants import read_scored_task, rows_to_rank
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
@@ -38,7 +42,7 @@ from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
-from sasgeo_bench.tasks.split import HALVES, Half
+from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -55,7 +59,7 @@ class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
     With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
-    cluster to run on instead.
+    cluster to run on instead. `seal` tells of sealed places, None without any.
     """
 
     spec: PipelineFile
@@ -65,6 +69,25 @@ class PipelinePlan:
     jobs: int = 1
     dask: str | None = None
     private: PrivateSeed | None = None
+    seal: Seal | None = None
+
+    @property
+    def split(self) -> Split | None:
+        """Return the split of the tasks; None for the paper's experiment alone."""
+        return self.requests[0].split if self.requests else None
+
+    @property
+    def lessons(self) -> Lessons | None:
+        """Return who learns from where; None without learning."""
+        if self.split is None or self.spec.learning is None:
+            return None
+        return Lessons(split=self.split, controls=self.controls[0].split, learning=self.spec.learning)
+
+    @property
+    def seed_files(self) -> tuple[Path, ...]:
+        """Return the files of seeds, which no matcher may see."""
+        seeds = (self.private, None if self.seal is None else self.seal.seed)
+        return tuple(seed.file for seed in seeds if seed is not None and seed.file is not None)
 
     def to_text(self) -> str:
         """Return which parts of each stage are up to date; every matcher is loaded to find out.
@@ -75,13 +98,8 @@ class PipelinePlan:
         stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
         lines = [f"{self.spec.id}: {self.spec.title}"]
         lines += [line for stage in stages for line in stage.lines()]
-        if self.spec.learning is not None:
-            suites, most = ", ".join(self.spec.learning.suites), self.spec.learning.most
-            lines.append(
-                f"  learning: each half is asked after learning from the other ({suites}, at most {most} queries)"
-            )
-            if self.spec.learning.oracles:
-                lines.append(f"    {', '.join(self.spec.learning.oracles)}: from the half itself, never ranked")
+        lines += [] if self.lessons is None else self.lessons.lines(self.requests)
+        lines += [] if self.seal is None else self.seal.lines()
         lines += _run_lines(self, stages, controls)
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
         lines.append(f"  board: {board_folder(self)}")
@@ -174,7 +192,9 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
             continue
         left, done = _count(runs)
         planned = runs[0].plan
-        lacking = [item for stage in own_stages for item in stage.lacking if _is_asked(plan, spec, item.suite)]
+        lacking = [
+            item for stage in own_stages for item in stage.lacking if _is_asked(plan, spec, item.suite, item.region)
+        ]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
         more = f", and what is drawn; {behind} answered there before" if lacking else ""
@@ -210,13 +230,15 @@ def plan_pipeline(
     extract_folders: tuple[Path, ...] = (),
     region_folders: tuple[Path, ...] = (),
     private: PrivateSeed | None = None,
+    sealed: PrivateSeed | None = None,
 ) -> PipelinePlan:
     """Turn a pipeline file into requests; only files of settings are read.
 
     `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
     serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
-    seed, below `out/private`. Raise `ConfigError` for an unknown suite, region or split, or if no region can be
-    built here; `MatchError` for an unknown matcher or rejector.
+    seed, below `out/private`. `sealed` draws the sealed places of the split, which are left out without it. Raise
+    `ConfigError` for an unknown suite, region or split, or if no region can be built here, or learned from, or ranked;
+    `MatchError` for an unknown matcher or rejector.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
     out, seed = root_of(out, private), private or spec.seed
@@ -232,6 +254,7 @@ def plan_pipeline(
             group=None if task.prior is None else PriorGroup.parse(task.prior),
             extract_folders=extract_folders,
             region_folders=region_folders,
+            sealed_seed=sealed,
             may_be_fewer=True,
             choice=Choice(
                 views_cells=tuple(task.views_cells),
@@ -248,18 +271,34 @@ def plan_pipeline(
     if spec.task and not requests:
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)
-    if spec.learning is not None and not requests[0].split.half_of:
-        message = f"[learning] needs halves, and split {spec.split!r} is a hold-out: name a cross-fit, or leave it out"
+    kept = needed(requests, spec.learning) if requests else ()
+    left = {item.region.id for item in requests} - {item.region.id for item in kept}
+    if left:
+        tell(f"nothing learns, so train places are left out: {', '.join(sorted(left))}")
+    split = requests[0].split if requests else None
+    return PipelinePlan(
+        spec=spec,
+        requests=kept,
+        controls=_plan_controls(seed, out, split),
+        out=out,
+        private=private,
+        seal=None if split is None else seal_of(split, kept, sealed, private, out=out),
+    )
+
+
+def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request, ...]:
+    """Plan the controls of every board, in towns that the split neither trains on nor seals."""
+    regions = [name for name in CONTROL_REGIONS if _may_control(name, split)]
+    if not regions:
+        specs = {name: read_region_file(path) for name, path in list_region_files().items()}
+        towns = [name for name, spec in specs.items() if spec.pick(None).town is not None]
+        regions = [name for name in towns if _may_control(name, split)][:1]
+    if split is not None and not regions:
+        message = f"split {split.spec.id!r} trains on every embedded town or seals it, and controls need one: free one"
         raise ConfigError(message)
-    controls = _plan_controls(seed, out)
-    return PipelinePlan(spec=spec, requests=tuple(requests), controls=controls, out=out, private=private)
-
-
-def _plan_controls(seed: Seed, out: Path) -> tuple[Request, ...]:
-    """Plan the controls of every board."""
     controls = Wanted(
         suites=(CONTROLS,),
-        regions=CONTROL_REGIONS,
+        regions=tuple(regions),
         split=CONTROL_SPLIT,
         count=CONTROL_SITES,
         seed=seed,
@@ -267,6 +306,11 @@ def _plan_controls(seed: Seed, out: Path) -> tuple[Request, ...]:
         may_be_fewer=True,
     )
     return plan_requests(controls, tell=_silent)
+
+
+def _may_control(region: str, split: Split | None) -> bool:
+    """Return whether controls may be drawn on an embedded town."""
+    return split is None or not (trains(split, region) or split.sealed_place(region))
 
 
 def _silent(line: str) -> None:
@@ -282,31 +326,36 @@ def run_pipeline(
     results: Path | None = None,
     has_cases: bool = True,
     private: Path | None = None,
+    opened: dt.date | None = None,
 ) -> Board:
     """Draw what is missing, run queries without a row, score all of it, and write the board to out/boards/<id>/.
 
     `results` is a folder to store the board in, with the answers and truths it was made of, as <id>/. `has_cases` shows
     failed queries with their truths on the board. `private` is the board of a private seed of this pipeline, which the
-    rows are compared with. Raise `ConfigError` if no region can carry any of the suites; `StoreError` if the board
-    cannot be stored in `results`, before anything is done, or as `pack_board` does after the board is written.
+    rows are compared with. `opened` is the day on which sealed places are opened, today unless given. Raise
+    `ConfigError` if no region can carry any of the suites, or all that could be ranked is sealed; `StoreError` if the
+    board cannot be stored in `results`, before anything is done, or as `pack_board` does after the board is written.
     """
-    if results is not None:
-        check_results(results / plan.spec.id, board_folder(plan))
+    stored = None if results is None else results / plan.spec.id
+    if stored is not None:
+        check_results(stored, board_folder(plan))
+    sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
     tasks = [*_draw(plan.requests, tell, jobs=plan.jobs), *_draw_paper(plan, tell)]
-    if not tasks:
+    asked = [task for task in tasks if not _is_train(plan, base_of(task.name))]
+    if not asked:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
     contrasts = tuple(contrast_of(item.model_dump(exclude={"why", "pilot"})) for item in plan.spec.contrast)
-    _check_contrasts(plan, contrasts, tasks, tell)
+    _check_contrasts(plan, contrasts, asked, tell)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
     folders = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
-    split = plan.requests[0].split if plan.requests else None
+    split = plan.split
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
     pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
     request = ScoreRequest(
         predictions=folders,
-        tasks=[*tasks, *controls],
+        tasks=[*asked, *controls],
         root=plan.out,
         board=board_folder(plan),
         split=split,
@@ -319,11 +368,12 @@ def run_pipeline(
         by_block=() if plan.spec.paper is None else tuple(plan.spec.paper.crops),
         jobs=plan.jobs,
         private=private,
+        sealed=sealed,
         failed=failures.found,
     )
     board = make_board(request, tell=tell, progress=progress)
-    if results is not None:
-        tell(pack_board(board, request, results / plan.spec.id).to_text())
+    if stored is not None:
+        tell(pack_board(board, request, stored).to_text())
     return board
 
 
@@ -331,11 +381,10 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
     if not contrasts:
         return
-    split = plan.requests[0].split if plan.requests else None
-    place_of = {} if split is None else split.place_of
+    place_of = {} if plan.split is None else plan.split.place_of
     read = [read_scored_task(folder, plan.out / "truth") for folder in tasks]
     frames = [score_task(task.heads, task.truths, {}, place_of=place_of) for task in read]
-    design = pd.concat(frames, ignore_index=True)
+    design = rows_to_rank({plan.spec.id: pd.concat(frames, ignore_index=True)}, plan.split)[plan.spec.id]
     pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
     check_contrasts(contrasts, pilots, design, tell=tell)
 
@@ -365,7 +414,7 @@ def _run_all(
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """One run of a matcher; a matcher that learns has one for each half, which its name states."""
+    """One run of a matcher; a matcher that learns has one for each lesson, which its name states."""
 
     name: str
     plan: RunPlan
@@ -398,12 +447,9 @@ def _count(runs: Sequence[_Run]) -> tuple[int, int]:
 
 
 def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Run]:
-    """Plan the runs of a matcher: one, or with learning one for each half after learning from the other.
-
-    An oracle learns from the half itself.
-    """
-    own = [task for task in tasks if _is_asked(plan, spec, task.parent.name)]
-    learning = plan.spec.learning
+    """Plan the runs of a matcher: one, or with learning one for each lesson."""
+    own = [task for task in tasks if _is_asked(plan, spec, task.parent.name, base_of(task.name))]
+    learning, lessons = plan.spec.learning, plan.lessons
     is_oracle = learning is not None and spec in learning.oracles
     whole = plan_run(
         RunRequest(
@@ -415,7 +461,7 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
             jobs=plan.jobs,
             dask=plan.dask,
             is_oracle=is_oracle,
-            hidden=() if plan.private is None or plan.private.file is None else (plan.private.file,),
+            hidden=plan.seed_files,
         )
     )
     if is_oracle and not is_unranked(whole.card.name):
@@ -424,45 +470,31 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
             f"oracles begin with {YARDSTICK}, so that no board ranks them"
         )
         raise ConfigError(message)
-    if learning is None or not whole.learns or not own:
+    if lessons is None or not whole.learns or not own:
         return [_Run(name="", plan=whole)]
-    halves = {task: _half_of(plan, task) for task in tasks}
-    runs = []
-    for half in (*HALVES, None):
-        asked = [task for task in own if halves[task] == half]
-        train = [
-            task
-            for task in tasks
-            if task.parent.name in learning.suites
-            and None not in {half, halves[task]}
-            and (halves[task] == half) == is_oracle
-        ]
-        request = replace(
-            whole.request,
-            tasks=asked,
-            train=train,
-            most_trained=learning.most,
-            detector=learning.detector,
-            split=plan.requests[0].split,
-        )
-        if asked:
-            runs.append(_Run(name="no half" if half is None else f"half {half}", plan=plan_run(request)))
-    return runs
+    learning = lessons.learning
+    request = replace(
+        whole.request, most_trained=learning.most, detector=learning.detector, split=lessons.split
+    )
+    return [
+        _Run(name=lesson.name, plan=plan_run(replace(request, tasks=lesson.asked, train=lesson.train)))
+        for lesson in lessons.of(own, tasks, is_oracle=is_oracle)
+    ]
 
 
-def _is_asked(plan: PipelinePlan, spec: str, suite: str) -> bool:
-    """Return whether a matcher is asked on a suite: controls on all, all on the controls, else by the file."""
-    to_all = {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}
-    return suite in to_all or spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec)
+def _is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
+    """Return whether a matcher is asked on a task: controls on all, all on the controls, else by the file.
+
+    Nobody is asked on a train place of a hold-out.
+    """
+    if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
+        return True
+    return not _is_train(plan, region) and (spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec))
 
 
-def _half_of(plan: PipelinePlan, task: Path) -> Half | None:
-    """Return the half of a task's region in the split of the pipeline or else of the controls; None for the paper."""
-    region = base_of(task.name)
-    for request in (*plan.requests[:1], *plan.controls[:1]):
-        for place in request.split.places_in(region):
-            return request.split.half_of.get(place)
-    return None
+def _is_train(plan: PipelinePlan, region: str) -> bool:
+    """Return whether a region only trains, in a hold-out."""
+    return plan.split is not None and trains(plan.split, region)
 
 
 def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:

@@ -127,6 +127,21 @@ class SeedRecord(_Record):
     is_worse: bool
 
 
+class OpeningRecord(_Record):
+    """One opening of a sealed place: the seed that drew it, and the day."""
+
+    commitment: Sha256
+    bits: Annotated[int, Field(ge=1)]
+    opened: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")]
+
+
+class SealedRecord(_Record):
+    """A sealed place: the commitment of the seed that the board draws it by, if it does, and every opening."""
+
+    drawn_by: Sha256 | None
+    openings: list[OpeningRecord]
+
+
 class _OnBothSeeds(_Record):
     verdict: Literal["run here", "reproduced", "not reproduced"]
     why: str
@@ -171,6 +186,7 @@ class BoardRecord(_Record):
     pipeline: PipelineRecord | None = None
     private_seed: PrivateRecord | None = None
     private: PrivateRecord | None = None
+    sealed: dict[str, SealedRecord] = {}
     split: str | None = None
     draws: int | None = None
     contrasts: list[ContrastRecord] | None = None

@@ -53,8 +53,9 @@ class ScoreRequest:
 
     `pipeline` is name and hash of the pipeline that requests the board, if one does. `private` is a board of a private
     seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
-    of their maps, and their results on a private seed where no private board is named. `failed` names entries that
-    failed before scoring, and why.
+    of their maps, and their results on a private seed where no private board is named; their sealed places, too.
+    `sealed` is the record of sealed places (`openings.sealed_record`). `failed` names entries that failed before
+    scoring, and why.
     """
 
     predictions: Sequence[Path]
@@ -75,6 +76,7 @@ class ScoreRequest:
     jobs: int = 1
     private: Path | None = None
     kept: Mapping[str, Any] = field(default_factory=dict)
+    sealed: Mapping[str, Any] = field(default_factory=dict)
     failed: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -82,6 +84,7 @@ class ScoreRequest:
 class Board:
     """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
 
+    `with_calibration` also holds rows of the calibration places of a hold-out split, which no figure counts.
     `remarks` are those of rejectors on their fits; `protection` has no row where no answer has a protection level.
     `judged` are the results of rejectors by matcher and rejector, `measured` the measurements of truths by query id,
     and `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
@@ -93,6 +96,7 @@ class Board:
     scores: dict[str, pd.DataFrame]
     predictions: dict[str, dict[str, Prediction]]
     table: pd.DataFrame
+    with_calibration: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     falsifiers: tuple[Falsifier, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
@@ -164,7 +168,7 @@ def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], ca
 
 def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
     """Return the content of `board.json`."""
-    seed = seed_of(board.tasks)
+    seed, sealed = seed_of(board.tasks), request.sealed or request.kept.get("sealed")
     return {
         "scorer_version": SCORER_VERSION,
         "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
@@ -173,6 +177,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
         "libraries": _libraries(),
         "pipeline": dict(request.pipeline) or None,
         **{name: seed for name, seed in ((task_files.PRIVATE, seed), ("private", board.on_private.seed)) if seed},
+        **({"sealed": dict(sealed)} if sealed else {}),
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
         "contrasts": [asdict(item) for item in request.contrasts],

@@ -21,6 +21,7 @@ from sasgeo_bench.scoring.contestants import (
     read_tasks,
     rows_to_rank,
     score_entries,
+    scored_rows,
 )
 from sasgeo_bench.scoring.contrasts import hold_contrasts
 from sasgeo_bench.scoring.controls import gains_without_stress, hold_controls, hold_falsifiers
@@ -57,7 +58,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     judgings = [
         RejectionTask(
             matcher=entry.name,
-            scores=board.scores[entry.name],
+            scores=board.with_calibration[entry.name],
             predictions=board.predictions[entry.name],
             rules=rules,
             split=request.split,
@@ -97,7 +98,8 @@ def _contest(request: ScoreRequest, failures: Failures, tell: Tell) -> Contest:
 def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell: Tell) -> Board:
     """Return the board with the entries to rank, which of them are set apart, and how they fared on a private seed."""
     verdicts = hold_controls(contest.scores)
-    scores = rows_to_rank(contest, tell=tell)
+    scored = scored_rows(contest, request.split, tell=tell)
+    scores = rows_to_rank(scored, request.split)
     entries = tuple(item.entry for item in contest.answers if item.entry.name in scores)
     apart = set_apart(entries, scores, request.split, verdicts)
     for name, why in apart.items():
@@ -121,6 +123,7 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
     return Board(
         entries=tuple(replace(entry, how=on_private.how(entry)) for entry in entries),
         scores=scores,
+        with_calibration=scored,
         predictions={item.entry.name: item.predictions for item in contest.answers},
         table=pd.DataFrame(),
         verdicts=verdicts,
@@ -170,9 +173,10 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
     findings = hold_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
     falsifiers = hold_falsifiers(held, scores, draws=draws)
     levels = []
-    for name, frame in scores.items():
+    for name in scores:
         with board.failures.of(f"protection levels of {name}"):
-            levels.append(protection_frame(name, frame, board.predictions[name], request.split))
+            rows = board.with_calibration[name]
+            levels.append(protection_frame(name, rows, board.predictions[name], request.split))
     some = [frame for frame in levels if len(frame)]
     return replace(
         board,

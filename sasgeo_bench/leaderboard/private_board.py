@@ -201,6 +201,34 @@ def seed_lines(about: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def sealed_lines(about: Mapping[str, Any]) -> list[str]:
+    """Return by sealed place whether the board holds it, and when it was opened.
+
+    >>> sealed_lines({"sealed": {"porto": {"drawn_by": None, "openings": []}}})
+    ['Sealed place porto: not opened, and so not on this board.']
+    """
+    return [f"Sealed place {place}: {_sealed_state(item)}." for place, item in (about.get("sealed") or {}).items()]
+
+
+def _sealed_state(item: Mapping[str, Any]) -> str:
+    days = {
+        one["commitment"]: f"{one['opened']} by a seed of commitment {one['commitment'][:12]}"
+        for one in item["openings"]
+    }
+    if not days:
+        return "not opened, and so not on this board"
+    first = next(iter(days))
+    if item["drawn_by"] is None:
+        return f"opened on {days[first]}, and not on this board"
+    if item["drawn_by"] == first:
+        return f"opened on {days[first]}"
+    number = list(days).index(item["drawn_by"]) + 1
+    return (
+        f"opened on {days[item['drawn_by']]}; this is opening {number}, after {days[first]}, so the place was no longer "
+        "unseen"
+    )
+
+
 _VERSIONS: Final = {"scorer_version": SCORER_VERSION, "task_version": TASK_VERSION, "data_version": DATA_VERSION}
 _WHOSE: Final = ("version", "hash")
 _TASK: Final = ("suite", "region", "map_date")

@@ -10,7 +10,7 @@ import pandas as pd
 from sasgeo_bench.errors import counted, named
 from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of, step_tables
 from sasgeo_bench.leaderboard.columns import NOTE, RANKS_NOTE, TERMS
-from sasgeo_bench.leaderboard.private_board import seed_lines
+from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
@@ -121,6 +121,7 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -
     lines = [
         *control_lines(more.get("verdicts", ())),
         *seed_lines(about),
+        *sealed_lines(about),
         *warnings_of(board),
         *training_lines(about),
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.get("failed", {}).items()),

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
-from sasgeo_bench.leaderboard.private_board import seed_lines
+from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text
 from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
@@ -211,6 +211,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
             "controls_state": _controls_state(controls),
             "has_controls": bool(controls),
             "seed_line": seed_lines(source.about)[0],
+            "sealed_lines": sealed_lines(source.about),
             "seeds": seed_table(source.about),
             "warnings": warnings_of(source.board),
             "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,

@@ -256,21 +256,24 @@ def score_entries(
     return Contest(answers=left, tasks=tuple(tasks), scores=scores)
 
 
-def rows_to_rank(contest: Contest, *, tell: Callable[[str], None]) -> dict[str, pd.DataFrame]:
+def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], None]) -> dict[str, pd.DataFrame]:
     """Return by entry the scored rows of the suites of which it was asked every task, without those of controls.
 
-    Entries without such a suite are missing; `tell` receives a line about the other suites of an entry. Raise
-    ConfigError if no entry is left.
+    Train places of a hold-out `split` do not count. Entries without such a suite are missing; `tell` receives a line
+    about the other suites of an entry. Raise ConfigError if no entry is left.
     """
+    unused = {"train"} if split is not None and split.spec.kind == "holdout" else set()
+    tasks = [task for task in contest.tasks if not {head.part for head in task.heads} <= unused]
     found = {}
     for item in contest.answers:
-        asked = {task.about["suite"] for task in contest.tasks if task.folder in item.asked}
-        lacking = {CONTROLS} | {task.about["suite"] for task in contest.tasks if task.folder not in item.asked}
+        asked = {task.about["suite"] for task in tasks if task.folder in item.asked}
+        lacking = {CONTROLS} | {task.about["suite"] for task in tasks if task.folder not in item.asked}
         lost = sorted(asked & lacking - {CONTROLS})
         if lost:
             tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
         scores = contest.scores[item.entry.name]
-        rows = scores[scores["suite"].isin(asked - lacking)].reset_index(drop=True)
+        is_used = scores["suite"].isin(asked - lacking) & ~scores["part"].isin(unused)
+        rows = scores[is_used].reset_index(drop=True)
         if len(rows):
             found[item.entry.name] = rows
     if not found:
@@ -278,6 +281,21 @@ def rows_to_rank(contest: Contest, *, tell: Callable[[str], None]) -> dict[str, 
             f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
             "its tasks (--tasks names some)"
         )
+        raise ConfigError(message)
+    return found
+
+
+def rows_to_rank(scored: Mapping[str, pd.DataFrame], split: Split | None) -> dict[str, pd.DataFrame]:
+    """Return by entry the rows of `scored_rows` that figures and ranks count: in a hold-out `split` of test places.
+
+    Entries without any are missing. Raise ConfigError if no entry is left.
+    """
+    if split is None or split.spec.kind != "holdout":
+        return dict(scored)
+    counted_rows = {name: rows[rows["part"] != "calibration"].reset_index(drop=True) for name, rows in scored.items()}
+    found = {name: rows for name, rows in counted_rows.items() if len(rows)}
+    if not found:
+        message = f"there is nothing to rank: no query is of a test place of the hold-out {split.spec.id!r}"
         raise ConfigError(message)
     return found
 

@@ -33,7 +33,7 @@ class Opening(BaseModel):
         """Return the opening by a seed on a day.
 
         >>> Opening.of(PrivateSeed("3f" * 16, is_sealed=True), dt.date(2026, 11, 23)).to_text()
-        '2026-11-23 by seed 1b8a8f6b2a0e'
+        '2026-11-23 by seed cd5fd9130682'
         """
         return cls(commitment=seed.commitment, bits=seed.bits, opened=opened)
 
@@ -68,11 +68,12 @@ def parse_openings(content: object, path: Path) -> Openings:
 
 def joined_openings(first: Openings, second: Openings) -> Openings:
     """Return the openings of both by place, each seed once, by its first day."""
-    found = {}
+    found: dict[str, dict[str, Opening]] = {}
     for place in dict.fromkeys((*first, *second)):
-        known = sorted((*first.get(place, ()), *second.get(place, ())), key=lambda item: item.opened)
-        found[place] = tuple({item.commitment: item for item in reversed(known)}.values())[::-1]
-    return found
+        own = found.setdefault(place, {})
+        for item in sorted((*first.get(place, ()), *second.get(place, ())), key=lambda item: item.opened):
+            own.setdefault(item.commitment, item)
+    return {place: tuple(own.values()) for place, own in found.items()}
 
 
 def record_openings(out: Path, split: str, places: Iterable[str], opening: Opening, *, tell: Tell) -> Openings:

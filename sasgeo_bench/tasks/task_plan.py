@@ -119,7 +119,9 @@ def _without_sealed(
     if not closed:
         return tuple(named.values())
     places = ", ".join(dict.fromkeys(filter(None, map(split.sealed_place, closed))))
-    message = f"sealed places of split {split.spec.id!r} are left out: {places} (leaderboard --sealed-seed-file opens them)"
+    message = (
+        f"sealed places of split {split.spec.id!r} are left out: {places} (leaderboard --sealed-seed-file opens them)"
+    )
     if len(closed) == len(named):
         raise ConfigError(message)
     tell(message)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sealed places of a pipeline: closed without their seed; with it they are opened, and the opening is recorded."""
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.leaderboard.board_files import BOARD, read_board
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.tasks.openings import (
+    Opening,
+    Openings,
+    joined_openings,
+    parse_openings,
+    read_openings,
+    record_openings,
+    sealed_record,
+)
+from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.task_plan import Request
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seal:
+    """The sealed places of a split: those that a pipeline draws, the seed, and the openings before it."""
+
+    split: Split
+    drawn: tuple[str, ...]
+    seed: PrivateSeed | None
+    openings: Openings
+    out: Path
+
+    def lines(self) -> list[str]:
+        """Report by place whether it is left out, opened, or opened again."""
+        return [f"  sealed {place}: {self._state(place)}" for place in self.split.sealed]
+
+    def _state(self, place: str) -> str:
+        before = self.openings.get(place, ())
+        if self.seed is None or place not in self.drawn:
+            ending = f"opened on {before[-1].to_text()}" if before else "not opened"
+            return f"left out, {ending} (--sealed-seed-file opens it)"
+        same = next((item for item in before if item.commitment == self.seed.commitment), None)
+        if same is not None:
+            return f"opened on {same.to_text()}"
+        again = f" again, after {before[-1].to_text()}: it is no longer unseen" if before else ""
+        return f"to be opened{again}, by seed {self.seed.commitment[:12]}"
+
+
+def seal_of(
+    split: Split, requests: Sequence[Request], seed: PrivateSeed | None, private: PrivateSeed | None, *, out: Path
+) -> Seal | None:
+    """Return the sealed places of a pipeline; None without any.
+
+    Raise `ConfigError` if their seed is given and nothing is sealed, or together with a private seed.
+    """
+    if seed is not None and private is not None:
+        message = "a private seed draws no sealed place: give --seed-file or --sealed-seed-file, not both"
+        raise ConfigError(message)
+    regions = dict.fromkeys(item.region.id for item in requests)
+    drawn = tuple(dict.fromkeys(place for name in regions if (place := split.sealed_place(name)) is not None))
+    if seed is not None and not drawn:
+        message = f"no region of the pipeline is of a sealed place of split {split.spec.id!r}: leave the seed out"
+        raise ConfigError(message)
+    if not split.sealed:
+        return None
+    return Seal(split=split, drawn=drawn, seed=seed, openings=read_openings(out, split.spec.id), out=out)
+
+
+def open_seal(
+    seal: Seal, requests: Sequence[Request], *, opened: dt.date | None, stored: Path | None, tell: Tell
+) -> Any:  # noqa: ANN401 - JSON
+    """Record that sealed places are opened, before anything is drawn, and return the entry of `board.json` on them.
+
+    `opened` is the day, today (UTC) unless given. `stored` is the folder of stored results of this very pipeline,
+    whose openings count, too. Raise `ConfigError` if every test place of a hold-out is sealed and stays closed.
+    """
+    split = seal.split
+    places = {place for item in requests for place in split.places_in(item.region.id)}
+    if split.spec.kind == "holdout" and not any(split.part_of(place) == "test" for place in places):
+        message = f"every test place of split {split.spec.id!r} is sealed, so nothing is ranked: --sealed-seed-file"
+        raise ConfigError(f"{message} opens them")
+    openings = seal.openings if stored is None else joined_openings(seal.openings, _stored_openings(stored))
+    if seal.seed is not None:
+        day = opened or dt.datetime.now(tz=dt.UTC).date()
+        opening = Opening.of(seal.seed, day)
+        now = record_openings(seal.out, split.spec.id, seal.drawn, opening, tell=tell)
+        openings = joined_openings(openings, now)
+    return sealed_record(openings, split.sealed, seal.drawn, seal.seed)
+
+
+def _stored_openings(stored: Path) -> Openings:
+    """Return the openings that the board of stored results tells of; none without such a board."""
+    if not (stored / BOARD).is_file():
+        return {}
+    record = read_board(stored)[0].get("sealed") or {}
+    return parse_openings({place: item.get("openings", ()) for place, item in record.items()}, stored / BOARD)

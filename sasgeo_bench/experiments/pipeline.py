@@ -13,11 +13,11 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
-from sasgeo_bench.experiments.lessons import Lessons, needed, trains
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.paper.task import region_name
 from sasgeo_bench.experiments.sealed import Seal, open_seal, seal_of
+from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
@@ -77,11 +77,11 @@ class PipelinePlan:
         return self.requests[0].split if self.requests else None
 
     @property
-    def lessons(self) -> Lessons | None:
-        """Return who learns from where; None without learning."""
+    def training_groups(self) -> TrainingGroups | None:
+        """Return the groups that learn from the same places; None without learning."""
         if self.split is None or self.spec.learning is None:
             return None
-        return Lessons(split=self.split, controls=self.controls[0].split, learning=self.spec.learning)
+        return TrainingGroups(split=self.split, controls=self.controls[0].split, learning=self.spec.learning)
 
     @property
     def seed_files(self) -> tuple[Path, ...]:
@@ -98,7 +98,7 @@ class PipelinePlan:
         stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
         lines = [f"{self.spec.id}: {self.spec.title}"]
         lines += [line for stage in stages for line in stage.lines()]
-        lines += [] if self.lessons is None else self.lessons.lines(self.requests)
+        lines += [] if self.training_groups is None else self.training_groups.lines(self.requests)
         lines += [] if self.seal is None else self.seal.lines()
         lines += _run_lines(self, stages, controls)
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
@@ -414,7 +414,7 @@ def _run_all(
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """One run of a matcher; a matcher that learns has one for each lesson, which its name states."""
+    """One run of a matcher; a matcher that learns has one for each group, which its name states."""
 
     name: str
     plan: RunPlan
@@ -447,9 +447,9 @@ def _count(runs: Sequence[_Run]) -> tuple[int, int]:
 
 
 def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Run]:
-    """Plan the runs of a matcher: one, or with learning one for each lesson."""
+    """Plan the runs of a matcher: one, or with learning one for each group."""
     own = [task for task in tasks if _is_asked(plan, spec, task.parent.name, base_of(task.name))]
-    learning, lessons = plan.spec.learning, plan.lessons
+    learning, groups = plan.spec.learning, plan.training_groups
     is_oracle = learning is not None and spec in learning.oracles
     whole = plan_run(
         RunRequest(
@@ -470,15 +470,13 @@ def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Ru
             f"oracles begin with {YARDSTICK}, so that no board ranks them"
         )
         raise ConfigError(message)
-    if lessons is None or not whole.learns or not own:
+    if groups is None or not whole.learns or not own:
         return [_Run(name="", plan=whole)]
-    learning = lessons.learning
-    request = replace(
-        whole.request, most_trained=learning.most, detector=learning.detector, split=lessons.split
-    )
+    learning = groups.learning
+    request = replace(whole.request, most_trained=learning.most, detector=learning.detector, split=groups.split)
     return [
-        _Run(name=lesson.name, plan=plan_run(replace(request, tasks=lesson.asked, train=lesson.train)))
-        for lesson in lessons.of(own, tasks, is_oracle=is_oracle)
+        _Run(name=group.name, plan=plan_run(replace(request, tasks=group.asked, train=group.train)))
+        for group in groups.of(own, tasks, is_oracle=is_oracle)
     ]
 
 

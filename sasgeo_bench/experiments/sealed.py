@@ -81,8 +81,11 @@ def open_seal(
     split = seal.split
     places = {place for item in requests for place in split.places_in(item.region.id)}
     if split.spec.kind == "holdout" and not any(split.part_of(place) == "test" for place in places):
-        message = f"every test place of split {split.spec.id!r} is sealed, so nothing is ranked: --sealed-seed-file"
-        raise ConfigError(f"{message} opens them")
+        message = (
+            f"every test place of split {split.spec.id!r} is sealed, so that nothing can be ranked: --sealed-seed-file "
+            "opens them"
+        )
+        raise ConfigError(message)
     openings = seal.openings if stored is None else joined_openings(seal.openings, _stored_openings(stored))
     if seal.seed is not None:
         day = opened or dt.datetime.now(tz=dt.UTC).date()

@@ -224,8 +224,8 @@ def _sealed_state(item: Mapping[str, Any]) -> str:
         return f"opened on {days[first]}"
     number = list(days).index(item["drawn_by"]) + 1
     return (
-        f"opened on {days[item['drawn_by']]}; this is opening {number}, after {days[first]}, so the place was no longer "
-        "unseen"
+        f"opened on {days[item['drawn_by']]}; this is opening {number}, after {days[first]}, so the place was no "
+        "longer unseen"
     )
 
 

@@ -90,7 +90,7 @@ def record_openings(out: Path, split: str, places: Iterable[str], opening: Openi
                 again = f", opened before on {before[place][-1].to_text()}" if before.get(place) else ""
                 tell(f"opening sealed place {place}{again}")
             with fresh_file(path, mend="check the free space and your rights") as scratch:
-                scratch.write_text(json_text(_ADAPTER.dump_python(known, mode="json")), encoding="utf-8")
+                scratch.write_text(json_text(_ADAPTER.dump_python(dict(known), mode="json")), encoding="utf-8")
     return known
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who learns from where: the tasks that a matcher is asked together, and the tasks it learns from before."""
+"""Training groups: the tasks that a matcher is asked together, and the tasks that it learns from before."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ _NOT_TRAINED: Final = ("calibration", "test")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Lesson:
-    """One run of a matcher that learns: task folders it is asked, and those it learns from; none if it stays untaught.
+class TrainingGroup:
+    """Task folders that a matcher is asked in one run, and those it learns from before; none if it stays untaught.
 
     `name` is the half in a cross-fit, "held out" in a hold-out.
     """
@@ -29,15 +29,15 @@ class Lesson:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Lessons:
-    """Plan of all lessons: the split of a pipeline, that of its controls, and its table `[learning]`."""
+class TrainingGroups:
+    """Training groups of a pipeline: the split of a pipeline, that of its controls, and its table `[learning]`."""
 
     split: Split
     controls: Split
     learning: LearningSpec
 
-    def of(self, asked: Sequence[Path], tasks: Sequence[Path], *, is_oracle: bool) -> list[Lesson]:
-        """Return the lessons of a matcher that is asked some of all `tasks`; an oracle learns from what it is asked.
+    def of(self, asked: Sequence[Path], tasks: Sequence[Path], *, is_oracle: bool) -> list[TrainingGroup]:
+        """Return the groups of a matcher that is asked some of all `tasks`; an oracle learns from what it is asked.
 
         In a cross-fit each half is asked after learning from the other. In a hold-out all that is not for training is
         asked after learning from the train places. Tasks of no place, as the paper's, are asked untaught. A sealed
@@ -47,14 +47,14 @@ class Lessons:
         names = [HELD_OUT] if is_holdout(self.split) else [f"half {half}" for half in HALVES]
         none = f"no {'part' if is_holdout(self.split) else 'half'}"
         found = [
-            Lesson(
+            TrainingGroup(
                 name=name or none,
                 asked=tuple(task for task in asked if groups[task] == name),
                 train=tuple(task for task in tasks if name and self._teaches(task, groups[task], name, is_oracle)),
             )
             for name in (*names, None)
         ]
-        return [lesson for lesson in found if lesson.asked]
+        return [group for group in found if group.asked]
 
     def _teaches(self, task: Path, group: str | None, name: str, is_oracle: bool) -> bool:  # noqa: FBT001
         """Return whether a task trains for a group of places."""

@@ -213,3 +213,20 @@ def many_rows(count):
             for value in (round(1 - at / count, 4),)
         ]
     )
+
+
+def split_file(folder: Path, kind: str = "holdout", **places: str) -> Path:
+    """A split of embedded towns, 5 km between parts: each town is a place with a part or half, or "sealed" before it.
+
+    `split_file(folder, suburb="train", grid="sealed test")` trains on one town and seals another.
+    """
+    lines = [f'id = "towns-alone"\ntitle = "Towns"\nkind = "{kind}"\nbuffer_m = 5000.0']
+    for name, text in places.items():
+        *seal, part = text.split()
+        key = "part" if kind == "holdout" else "half"
+        town = f"town-{name.replace('_', '-')}"
+        lines.append(f'[[place]]\nname = "{town}"\nregions = ["{town}"]\n{key} = "{part}"')
+        lines += ["sealed = true"] if seal else []
+    path = folder / "towns-alone.toml"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path

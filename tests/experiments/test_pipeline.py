@@ -21,6 +21,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import (
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks
+from tests.handmade import split_file
 from tests.threaded import threaded
 
 pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings")
@@ -189,11 +190,13 @@ def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"sites = 1": "sites = 2"}, {"crossfit": "holdout"}, {"title": "seed = 1\ntitle"}],
+    [{"sites = 1": "sites = 2"}, {"crossfit": "SPLIT"}, {"title": "seed = 1\ntitle"}],
 )
-def test_what_changes_queries_has_them_drawn_anew(made, changes):
+def test_what_changes_queries_has_them_drawn_anew(made, changes, tmp_path):
     plan, _, _ = made
     assert made_tasks(plan.requests[0]) is not None
+    split = split_file(tmp_path, suburb="test", grid="train")
+    changes = {old: new.replace("SPLIT", str(split)) for old, new in changes.items()}
     other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
     assert made_tasks(other.requests[0]) is None
 
@@ -399,13 +402,13 @@ def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_its
             'oracles = ["oracle_x"]',
             "learning names the oracle 'oracle_x', which is not among 'matchers'",
         ),
-        ('"crossfit"', '"holdout"', "needs halves, and split 'holdout' is a hold-out: name a cross-fit, or leave"),
+        ('"crossfit"', '"holdout"', r"\[learning\] has no region of a train place of the hold-out 'holdout'"),
     ],
 )
 def test_learning_that_makes_no_sense_is_refused_in_one_line(tmp_path, old, new, words):
     with pytest.raises(ConfigError, match=words) as error:
         plan_pipeline(
-            parse_toml(LEARNING.replace(old, new), PipelineFile, source="taught.toml"),
+            parse_toml(LEARNING.replace(old, new).replace('"town-suburb", ', ""), PipelineFile, source="taught.toml"),
             out=tmp_path,
             tell=lambda _: None,
         )

@@ -275,3 +275,7 @@ def test_regions_of_one_place_and_blocks_within_the_buffer_are_refused():
         check_apart({"here": task}, {"there": task}, two_parts(1199.0))
     check_apart({"here": task}, {"there": task}, two_parts(1200.0))
     check_apart({"here": task}, {"there": task}, None)
+    sealed = {"name": "two", "regions": ["there", "beyond"], "part": "test", "sealed": True}
+    split = two_parts(5000.0, place=[{"name": "one", "regions": ["here"], "part": "train"}, sealed])
+    with pytest.raises(ConfigError, match="is of the sealed place 'two', which never trains: leave it out"):
+        check_apart({"beyond": task}, {}, split)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splits: blocks tile a region, parts keep their distance in metres, and every fault names the pair."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import shapely
@@ -141,6 +143,56 @@ def test_a_split_file_with_a_fault_is_refused(text, fault):
 def test_places_that_contradict_each_other_are_refused(places, kind, fault):
     with pytest.raises(ValueError, match=fault):
         spec(places, kind)
+
+
+def test_a_split_without_sealed_places_has_the_hash_it_had_before_there_were_any():
+    """Tasks hold the hash of their split: it may not change with a key that a file leaves out."""
+    known = {
+        "crossfit": "b06f638a5b7f4126c4954f43800ada650a852354825897f94ad1414e32a43863",
+        "holdout": "cb8e4b705c81f7c437c7ed2965f0a4cdc1fef5780c348eb9b6d0159a5734af91",
+    }
+    for name, before in known.items():
+        shipped = read_split_file(find_split_file(name))
+        assert hashlib.sha256(shipped.model_dump_json().encode()).hexdigest() == before
+    assert spec([TWO[0], TWO[1] | {"sealed": True}]).model_dump_json() != spec(TWO).model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("places", "kind", "fault"),
+    [
+        ([TWO[0] | {"sealed": True}, TWO[1]], "holdout", "place 'a' is sealed, and its part is 'train'"),
+        (
+            [TWO[0], {"name": "b", "blocks": ["b/0-0"], "part": "test", "sealed": True}],
+            "holdout",
+            "a sealed place needs whole regions",
+        ),
+        (
+            [*halved("aabb")[:3], {"name": "d", "regions": ["d"], "half": "b", "sealed": True}],
+            "crossfit",
+            "half 'b' needs two places that are not sealed at least",
+        ),
+    ],
+)
+def test_a_sealed_place_only_tests_and_is_whole(places, kind, fault):
+    with pytest.raises(ValueError, match=fault):
+        spec(places, kind)
+
+
+def test_a_sealed_place_is_tested_in_its_fold_and_in_no_other():
+    places = [item | {"sealed": item["name"] == "c"} for item in halved("aaabb")]
+    split = make_split(
+        spec(places, "crossfit"), {name: grid(500_000.0 + 20_000 * at) for at, name in enumerate("abcde")}
+    )
+    for fold in split.folds:
+        assert fold.part_of.get("c") == ("test" if fold.held_out == "c" else None)
+    assert (split.sealed, split.sealed_place("c"), split.sealed_place("a")) == (("c",), "c", None)
+    assert [line.endswith(" (sealed)") for line in split.to_text().splitlines()[1:6]] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 800), st.integers(0, 1500))

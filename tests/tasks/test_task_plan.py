@@ -97,7 +97,7 @@ def test_without_regions_those_with_an_extract_are_taken_too(tmp_path, real_extr
 
 def test_a_region_file_of_ones_own_goes_with_a_split_of_ones_own(tmp_path):
     own = own_region(tmp_path)
-    split = own_split(tmp_path, "mine", "town-grid")
+    split = own_split(tmp_path, "mine", "town-suburb", "town-grid")  # train, test, train
     (item,) = plan(tmp_path, regions=(str(own),), split=str(split))
     assert item.region.id == "mine"
     assert item.elsewhere.id == "town-grid"
@@ -170,6 +170,7 @@ def test_a_wrong_place_is_another_place_of_the_split_and_a_town_for_a_town(known
         for region, spec in known.items():
             other = wrong_place(split, spec, known)
             assert place[other.id] != place[region]
+            assert name == "crossfit" or split.part_of(place[other.id]) == split.part_of(place[region])
             assert (other.pick(None).town is None) == (spec.pick(None).town is None)
 
 

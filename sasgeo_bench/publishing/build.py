@@ -212,7 +212,7 @@ def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
         spec = read_split_file(find_split_file(str(about.get("split") or "")))
     except ConfigError:
         return {}
-    return {region: (place.name, place.half or place.part or "") for place in spec.place for region in place.regions}
+    return {region: (place.name, place.half or place.part or "") for place in spec.place for region in place.region_ids}
 
 
 def _pictures(record: Mapping[str, Any]) -> Pictures:

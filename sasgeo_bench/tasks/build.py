@@ -131,8 +131,11 @@ def _request_sha256(request: Request) -> str:
         "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
         "region": request.region.model_dump(mode="json"),
         "elsewhere": request.elsewhere and request.elsewhere.model_dump(mode="json"),
-        # Halves decide only where methods train, so changing them redraws nothing; what is sealed has its own seed.
-        "split": request.split.spec.model_dump(mode="json", exclude={"place": {"__all__": {"half", "sealed"}}}),
+        # Halves decide only where methods train, countries how rows cluster: changing them redraws nothing. What is
+        # sealed has its own seed.
+        "split": request.split.spec.model_dump(
+            mode="json", exclude={"place": {"__all__": {"half", "country", "sealed"}}}
+        ),
         "count": [request.count, request.may_be_fewer],
         "seed": request.seed if isinstance(request.seed, int) else request.seed.commitment,
         "group": None if request.group is None else request.group.name,

@@ -33,6 +33,7 @@ class Place(Document):
 
     A `sealed` place is a test place whose queries are drawn only with a seed that is given at run time. Nothing is ever
     learned from it or calibrated on it.
+    Places of one `country` have the same mappers: they all stand in one part or half, and cluster together.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
@@ -41,6 +42,7 @@ class Place(Document):
     part: Part | None = None
     half: Half | None = None
     sealed: bool = False
+    country: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")] | None = None
 
     @model_validator(mode="after")
     def _holds_something(self) -> Self:
@@ -57,9 +59,15 @@ class Place(Document):
 
     @model_serializer(mode="wrap")
     def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `sealed` where it is not set: splits without it keep the hash of older versions."""
+        """Leave out `sealed` and `country` where they are not set: such splits keep the hash of older versions."""
         fields: dict[str, Any] = write(self)
-        return fields if self.sealed else {name: value for name, value in fields.items() if name != "sealed"}
+        unset = {name for name in ("sealed", "country") if not fields.get(name)}
+        return {name: value for name, value in fields.items() if name not in unset}
+
+    @property
+    def region_ids(self) -> tuple[str, ...]:
+        """Return the regions that the place has blocks of, in the order of the file."""
+        return tuple(dict.fromkeys((*self.regions, *(name.split("/")[0] for name in self.blocks))))
 
 
 class SplitFile(NamedDocument):
@@ -90,6 +98,12 @@ class SplitFile(NamedDocument):
                 fault = f"needs a {name}" if is_needed else f"must not have a {name} in {kinds[name]}"
                 message = f"place {wrong!r} {fault}"
                 raise ValueError(message)
+        sides: dict[str, str] = {}
+        for place in self.place:
+            side = place.part or f"half {place.half}"
+            if place.country and sides.setdefault(place.country, side) != side:
+                message = f"country {place.country!r} is in {sides[place.country]} and, with {place.name!r}, in {side}"
+                raise ValueError(message)
         for half in HALVES if self.kind == "crossfit" else ():
             own = [place for place in self.place if place.half == half]
             if sum(not place.sealed for place in own) < _LEAST_PLACES:
@@ -101,12 +115,7 @@ class SplitFile(NamedDocument):
     @property
     def region_ids(self) -> tuple[str, ...]:
         """Return every region of the split, in the order of the file."""
-        named = (
-            region
-            for place in self.place
-            for region in (*place.regions, *(name.split("/")[0] for name in place.blocks))
-        )
-        return tuple(dict.fromkeys(named))
+        return tuple(dict.fromkeys(region for place in self.place for region in place.region_ids))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,6 +213,11 @@ class Split:
     def sealed_place(self, region: str) -> str | None:
         """Return the sealed place that a region lies in; None if it lies in none."""
         return next((place for place in self.places_in(region) if place in self.sealed), None)
+
+    @cached_property
+    def country_of(self) -> Mapping[str, str]:
+        """Return place -> country, the second level of clustering; the place itself where no country is given."""
+        return {place.name: place.country or place.name for place in self.spec.place}
 
     def places_in(self, region: str) -> tuple[str, ...]:
         """Return the places that hold blocks of a region."""

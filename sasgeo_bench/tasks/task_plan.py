@@ -173,7 +173,7 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
     It depends on the split alone, so that asking for more regions changes no query. In a hold-out it is of the same
     part, so that nobody learns from views of a test place. No view is of a sealed place.
     """
-    places = [[name for name in place.regions if name in known] for place in split.spec.place]
+    places = [[name for name in place.region_ids if name in known] for place in split.spec.place]
     at = next((index for index, names in enumerate(places) if region.id in names), None)
     if at is None:
         return None

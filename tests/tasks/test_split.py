@@ -216,13 +216,42 @@ def test_footprints_of_different_parts_never_meet(seed, buffer_m, apart_m):
     assert gap_m > 0 or buffer_m == 0
 
 
-@pytest.mark.parametrize("name", ["holdout", "crossfit"])
-def test_the_shipped_splits_hold_every_shipped_region_once_five_kilometres_apart(name):
+def shipped(name):
     grids = {region: read_region_file(path).grid() for region, path in list_region_files().items()}
-    shipped = read_split_file(find_split_file(name))
-    split = make_split(shipped, grids)
-    assert sorted(shipped.region_ids) == sorted(grids)
+    return make_split(read_split_file(find_split_file(name)), grids)
+
+
+@pytest.mark.parametrize("name", ["holdout", "crossfit"])
+def test_the_shipped_splits_by_country_hold_the_same_regions_five_kilometres_apart(name):
+    split = shipped(name)
+    towns = {"canillo", "fuglafjordur", "runavik", "soldeu", "sorvagur", "tvoroyri", "vestmanna"}
+    assert set(split.spec.region_ids) == set(list_region_files()) - towns
     assert nearest_pair(split).gap_m >= 5000.0
+
+
+def test_the_split_by_towns_holds_every_shipped_region_and_their_views_never_meet():
+    split = shipped("places")
+    assert sorted(split.spec.region_ids) == sorted(list_region_files())
+    assert nearest_pair(split).gap_m >= 2 * split.spec.reach_m + 800.0
+
+
+def test_towns_stand_in_the_half_of_their_country_and_cluster_by_it():
+    towns, countries = shipped("places"), shipped("crossfit")
+    assert {place: towns.country_of[place] for place in ("vaduz", "soldeu", "porto", "lauf")} == {
+        "vaduz": "liechtenstein",
+        "soldeu": "andorra",
+        "porto": "porto",  # a place without a country is its own
+        "lauf": "germany",
+    }
+    half_of = countries.half_of | {"germany": "b", "united-states": "a"}
+    assert all(half == half_of[towns.country_of[place]] for place, half in towns.half_of.items())
+    assert set(countries.country_of.items()) == {(name, name) for name in countries.blocks}
+
+
+def test_a_country_in_two_halves_is_refused_with_the_place_named():
+    places = [place | {"country": "lowland"} if place["name"] in "ac" else place for place in halved("aabb")]
+    with pytest.raises(ValueError, match="country 'lowland' is in half a and, with 'c', in half b"):
+        spec(places, "crossfit")
 
 
 @pytest.fixture(scope="module")

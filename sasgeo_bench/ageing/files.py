@@ -14,6 +14,7 @@ import pandas as pd
 from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing
 from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
 from sasgeo_bench.ageing.plots import draw_ageing
+from sasgeo_bench.ageing.ratebook import VERSION
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.parquet import read_frame, write_frame
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -30,11 +31,12 @@ they share; lines by the length within {NEAR_M:g} m of a line of the other map. 
 appeared of the newer: by amount (ground or length), and by number, which counts each thing of which more than half
 vanished or appeared. The two differ where things are small. Re-drawn is what was kept and moved by more than
 {REDRAWN_M:g} m (areas: their centroid, so an area that grew has moved too). Ground lost and gained is what the class no
-longer, or newly, covers. Rates are those of an exponential life whose end is known only to lie between two dates, by
-amount, with 95 % intervals from 1,000 draws of blocks of 1 km. Part of what vanished or appeared is retagged: another
-class of its kind replaced it, or was replaced. Tags attribute part to the world (construction, demolished, a start
-date after the older map) or to mapping that catches up (a start date before). The rest is untold (unexplained). A
-dash: nothing to measure, or a rate from dates less than {LEAST_DAYS} days apart; "all": no bound."""
+longer, or newly, covers, with things that were redrawn, and lines in their drawn width: a raster sees it. Rates are
+those of an exponential life whose end is known only to lie between two dates, by amount, with 95 % intervals from 1,000
+draws of blocks of 1 km. Part of what vanished or appeared is retagged: another class of its kind replaced it, or was
+replaced. Tags attribute part to the world (construction, demolished, a start date after the older map) or to mapping
+that catches up (a start date before). The rest is untold (unexplained). A dash: nothing to measure, or a rate from
+dates less than {LEAST_DAYS} days apart; "all": no bound."""
 
 _BOTH_WAYS: Final = ("vanished", "vanished_number", "appeared", "appeared_number")
 _CONTROLS: Final = """\
@@ -186,6 +188,7 @@ def _place_cells(ageing: Ageing) -> list[str]:
 
 _RATE_HEAD: Final = (
     *("first amount", "last amount", "vanishes, %/year", "appears, %/year"),
+    *("ground lost, %/year", "ground gained, %/year"),
     *("vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
     *("re-drawn, amount", "ids gone, number"),
     *("of vanished: world, retagged, untold", "of appeared: world, catch-up, retagged, untold"),
@@ -203,8 +206,7 @@ def _rate_table(table: pd.DataFrame, *, by: str) -> str:
                 str(name),
                 _amount(share["amount_from"], share["unit"]),
                 _amount(share["amount_to"], share["unit"]),
-                _rate(rate, "vanish_per_year"),
-                _rate(rate, "appear_per_year"),
+                *(_rate(rate, column) for column in _RATEBOOK_RATES),
                 *(_percent(share[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "id_vanished")),
                 _shares(rate, "vanished", ("world", "retagged", "untold")),
                 _shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")),
@@ -271,11 +273,12 @@ def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 _RATEBOOK_HEAD: Final = f"""\
 # Yearly rates by place and class, written by `sasgeo-bench compare-ageing --rates`; not to be edited.
 # {ATTRIBUTION}
+version = {VERSION}
 attribution = {quoted(ATTRIBUTION)}
 licence = {quoted(LICENCE)}
 """
 _RATEBOOK_COUNTS: Final = ("n_from", "n_to")
-_RATEBOOK_RATES: Final = ("vanish_per_year", "appear_per_year")
+_RATEBOOK_RATES: Final = ("vanish_per_year", "appear_per_year", "ground_lost_per_year", "ground_gained_per_year")
 _RATEBOOK_SHARES: Final = ("redrawn_share", "shift_median_m", "shift_p90_m")
 
 

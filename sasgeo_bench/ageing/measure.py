@@ -134,7 +134,11 @@ _DECIMALS: Final = 6
 _REASONS: Final = ("world", "catch_up", "retagged")
 
 # Column -> pandas dtype. Shares lie within 0..1 and are NaN of an empty whole.
-_RATES: Final = tuple(f"{what}_per_year{end}" for what in ("vanish", "appear") for end in ("", "_lo", "_hi"))
+_RATES: Final = tuple(
+    f"{what}_per_year{end}"
+    for what in ("vanish", "appear", "ground_lost", "ground_gained")
+    for end in ("", "_lo", "_hi")
+)
 _SHARES: Final = (
     *("vanished_share", "appeared_share", "vanished_number_share", "appeared_number_share", "redrawn_share"),
     *("retagged_share", "ground_lost_share", "ground_gained_share", "shift_median_m", "shift_p90_m"),
@@ -210,8 +214,9 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
 
     Only objects visible from above count, as in the layers: a stream put into a culvert has vanished, and is counted as
     retagged. `vanished_share` is of the older amount, `appeared_share` of the newer; `*_number_share` is the same by
-    number of things, each of which counts as gone (or new) if more than half of it is. Dates less than `LEAST_DAYS`
-    apart get shares but no rates.
+    number of things, each of which counts as gone (or new) if more than half of it is. Rates of ground count what the
+    class no longer, or newly, covers, so they hold what was redrawn too. Dates less than `LEAST_DAYS` apart get shares
+    but no rates.
     """
     kinds: dict[str, Kind] = {item.name: item.kind for item in load_taxonomy().classes}
     stocks = [_stocks(state, history.area, kinds) for state in history.states]
@@ -242,10 +247,11 @@ def _stocks(state: State, area: shapely.Geometry, kinds: dict[str, Kind]) -> dic
     features = state.features
     shapes = cut_to(np.asarray(features.geometry.array, dtype=object), area)
     classes, visible = features["class"].to_numpy(), features["is_visible"].to_numpy()
+    widths_m = features["width_m"].to_numpy(dtype=np.float64)
     found = {}
     for name, kind in kinds.items():
         rows = np.flatnonzero((classes == name) & visible)
-        things = make_areas(shapes[rows]) if kind == "area" else make_pieces(shapes[rows])
+        things = make_areas(shapes[rows]) if kind == "area" else make_pieces(shapes[rows], widths_m[rows])
         hidden = shapes[(classes == name) & ~visible]
         found[name] = _Stock(
             things=things, keys=_keys(features, rows[things.rows]), hidden=hidden[~shapely.is_empty(hidden)]
@@ -383,15 +389,20 @@ def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> d
     """Return the part that rows of one interval and of all share: dates, rates, explanations, number of blocks."""
     years = np.array([change.years for change in changes])
     first, last = changes[0].date_from, changes[-1].date_to
-    tables = _block_tables(changes)
-    sides = {"vanish": (tables[:2], "n_from"), "appear": (tables[2:], "n_to")}
+    old, new = _block_tables(changes)
+    sides = {
+        "vanish": (old.lost, old.amount, "n_from"),
+        "appear": (new.lost, new.amount, "n_to"),
+        "ground_lost": (old.uncovered, old.amount, "n_from"),
+        "ground_gained": (new.uncovered, new.amount, "n_to"),
+    }
     rates: dict[str, object] = {}
-    for what, (amounts, count) in sides.items():
+    for what, (lost, amount, count) in sides.items():
         rate = Rate(per_year=np.nan, lo=np.nan, hi=np.nan)
         if (last - first).days >= LEAST_DAYS:
             things = sum(getattr(change, count) for change in changes)
             rng = seeded_rng(place, name, span, first, last, what)
-            rate = bootstrap_rate(*amounts, years, things=things, rng=rng)
+            rate = bootstrap_rate(lost, amount, years, things=things, rng=rng)
         column = f"{what}_per_year"
         rates |= {column: rate.per_year, f"{column}_lo": rate.lo, f"{column}_hi": rate.hi}
     return {
@@ -402,7 +413,7 @@ def _rates(changes: Sequence[_Change], span: str, *, place: str, name: str) -> d
         **rates,
         **_explained("vanished", [(change.old, change.vanished) for change in changes]),
         **_explained("appeared", [(change.new, change.appeared) for change in changes]),
-        "blocks": len(tables[0]),
+        "blocks": len(old.amount),
     }
 
 
@@ -414,19 +425,37 @@ def _explained(what: str, sides: Sequence[tuple[Verdict, _Why]]) -> dict[str, fl
     return {f"{what}_{name}_share": shares[name] for name in shares if f"{what}_{name}_share" in DTYPES}
 
 
-def _block_tables(changes: Sequence[_Change]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return lost and whole amount of the older state, then of the newer; each of shape (blocks, intervals)."""
-    verdicts = [(change.old, change.new) for change in changes]
-    cells = [_cells(verdict.xy_m) for pair in verdicts for verdict in pair]
-    blocks, number = np.unique(np.concatenate(cells), return_inverse=True)
-    parts = np.split(number, np.cumsum([len(cell) for cell in cells])[:-1])
-    tables = np.zeros((4, len(blocks), len(changes)))
-    for column, pair in enumerate(verdicts):
-        for side, verdict in enumerate(pair):
-            of_unit = parts[2 * column + side]
-            tables[2 * side, :, column] = np.bincount(of_unit, weights=verdict.lost, minlength=len(blocks))
-            tables[2 * side + 1, :, column] = np.bincount(of_unit, weights=verdict.amount, minlength=len(blocks))
-    return tables[0], tables[1], tables[2], tables[3]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Blocks:
+    """Amounts of one side of all intervals by block, each of shape (blocks, intervals)."""
+
+    amount: Floats
+    lost: Floats
+    uncovered: Floats
+
+
+def _block_tables(changes: Sequence[_Change]) -> tuple[_Blocks, _Blocks]:
+    """Add up the amounts of the older states, then of the newer ones, in the same blocks."""
+    sides = ([change.old for change in changes], [change.new for change in changes])
+    cells = [[_cells(verdict.xy_m) for verdict in side] for side in sides]
+    blocks = np.unique(np.concatenate([cell for side in cells for cell in side]))
+    old, new = (_added_up(side, own, blocks) for side, own in zip(sides, cells, strict=True))
+    return old, new
+
+
+def _added_up(verdicts: Sequence[Verdict], cells: Sequence[Ints], blocks: Ints) -> _Blocks:
+    at = [np.searchsorted(blocks, cell) for cell in cells]
+    sums = {
+        name: np.stack(
+            [
+                np.bincount(where, weights=getattr(verdict, name), minlength=len(blocks)).astype(np.float64)
+                for where, verdict in zip(at, verdicts, strict=True)
+            ],
+            axis=1,
+        )
+        for name in ("amount", "lost", "uncovered")
+    }
+    return _Blocks(**sums)
 
 
 def _cells(xy_m: Floats) -> Ints:

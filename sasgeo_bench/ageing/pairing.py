@@ -17,6 +17,7 @@ NEAR_M: Final = 5.0  # roads in OSM lie within about 6 m of the truth, and so do
 REDRAWN_M: Final = 1.0  # below this a shift is rounding or a tidied corner
 COVER_SHARE: Final = 0.5  # of an area covered by another class or a hint that explains it
 STEP_M: Final = 5.0  # lines are compared in pieces no longer than this
+LEAST_WIDTH_M: Final = 1.0  # of the ground under a line: a cell of a map, however thin a fence is
 _CENTIMETRES: Final = 100.0
 _LEAST_M2: Final = 1e-6
 _POLYGONAL: Final = (3, 6)
@@ -42,13 +43,14 @@ class Pieces:
 
     `things` numbers the things 0..T-1, `rows` (T,) gives the row of the table each comes from. `keys` identifies equal
     segments in either direction. `segments` are the lines that other states measure their distance to, with whole areas
-    of the class (squares), which have no length here.
+    of the class (squares), which have no length here. `widths_m` (P,) is the width of the ground under each piece.
     """
 
     rows: Ints
     things: Ints
     middles: Floats
     lengths_m: Floats
+    widths_m: Floats
     keys: NDArray[np.uint64]
     segments: Geometries
 
@@ -57,9 +59,9 @@ class Pieces:
 class Verdict:
     """The part of one state that is missing in another, by unit: an area thing or a piece of a line, shape (U,).
 
-    `amount` and `lost` are in m2 or m; `uncovered` is the amount that no thing of the class covers exactly, whatever
-    the pairing; `xy_m` (U, 2) is the place of the unit; `thing` (U,) numbers its thing, and `shift_m` (T,) is the shift
-    of each matched thing, NaN if unknown.
+    `amount` and `lost` are in m2 or m; `uncovered` is the amount of ground that no thing of the class covers, whatever
+    the pairing: a raster sees this. `xy_m` (U, 2) is the place of the unit; `thing` (U,) numbers its thing, and
+    `shift_m` (T,) is the shift of each matched thing, NaN if unknown.
     """
 
     amount: Floats
@@ -109,8 +111,10 @@ def make_areas(shapes: Geometries) -> Areas:
     return Areas(rows=rows, shapes=valid[rows])
 
 
-def make_pieces(shapes: Geometries) -> Pieces:
+def make_pieces(shapes: Geometries, widths_m: Floats | None = None) -> Pieces:
     """Cut line things of a table's rows into pieces; areas among them only support other lines.
+
+    `widths_m` (N,) is the width in which each row is drawn, `LEAST_WIDTH_M` at least and where it is unknown.
 
     >>> pieces = make_pieces(np.array([shapely.LineString([(0, 0), (12, 0)]), shapely.box(0, 0, 1, 1)]))
     >>> pieces.lengths_m.tolist(), len(pieces.segments)
@@ -131,9 +135,12 @@ def make_pieces(shapes: Geometries) -> Pieces:
     order = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count)
     along = ((order + 0.5) / count[segment])[:, None]
     lines = shapely.linestrings(np.stack((starts, ends), axis=1)) if len(lengths) else np.array([], dtype=object)
+    things = owner[part[joined]][segment]
+    widths = np.full(len(rows), LEAST_WIDTH_M) if widths_m is None else np.fmax(widths_m[rows], LEAST_WIDTH_M)
     return Pieces(
         rows=rows,
-        things=owner[part[joined]][segment],
+        things=things,
+        widths_m=widths[things],
         middles=starts[segment] + along * (ends - starts)[segment],
         lengths_m=(lengths / np.maximum(count, 1))[segment],
         keys=_segment_keys(starts, ends)[segment],
@@ -247,12 +254,17 @@ def _covered_m2(left: Ints, shared: Geometries, shared_m2: Floats, *, count: int
 def compare_pieces(these: Pieces, others: Pieces) -> Verdict:
     """Find which pieces of line have no line of the other state within `NEAR_M`; a piece is lost whole or not at all.
 
-    The shift of a thing is the median, over its kept length, of the distance to the other state.
+    The shift of a thing is the median, over its kept length, of the distance to the other state. A piece that lies d
+    beside its line of width w no longer covers d / w of its ground.
 
     >>> old = make_pieces(np.array([shapely.LineString([(0, 0), (20, 0)])]))
     >>> new = make_pieces(np.array([shapely.LineString([(0, 2), (10, 2)])]))
-    >>> float(compare_pieces(old, new).lost.sum())
-    5.0
+    >>> found = compare_pieces(old, new)
+    >>> float(found.lost.sum()), float(found.uncovered.sum())
+    (5.0, 20.0)
+    >>> wide = make_pieces(np.array([shapely.LineString([(0, 0), (20, 0)])]), np.array([8.0]))
+    >>> float(compare_pieces(wide, new).uncovered.sum().round(3))
+    9.501
     """
     distance = np.zeros(len(these.keys))
     changed = np.flatnonzero(~np.isin(these.keys, others.keys))
@@ -262,8 +274,14 @@ def compare_pieces(these: Pieces, others: Pieces) -> Verdict:
     shift = np.full(len(these.rows), np.nan)
     things, medians = _medians(these.things[kept], distance[kept], these.lengths_m[kept])
     shift[things] = medians
+    beside = np.minimum(distance / these.widths_m, 1.0)
     return Verdict(
-        amount=these.lengths_m, lost=lost, uncovered=lost, xy_m=these.middles, thing=these.things, shift_m=shift
+        amount=these.lengths_m,
+        lost=lost,
+        uncovered=np.where(kept, these.lengths_m * beside, lost),
+        xy_m=these.middles,
+        thing=these.things,
+        shift_m=shift,
     )
 
 

@@ -10,11 +10,12 @@ from importlib import resources
 from typing import Annotated, Final
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from sasgeo_bench.config import Document, parse_toml
 from sasgeo_bench.errors import ConfigError
 
+VERSION: Final = 2  # of the file: 1 had no rates of ground
 LEAST_THINGS: Final = 20  # a rate of fewer things is too uncertain
 _BEFORE_DATE: Final = re.compile(r"^(.+?)[-_.]*\d{4}-\d{2}-\d{2}")
 
@@ -34,9 +35,10 @@ class Estimate(Document):
 class ClassAgeing(Document):
     """Measurements of one class in one place over a number of years; None if there was nothing to measure.
 
-    Rates are those over all intervals; `redrawn_share` (of the older amount) and the shifts compare the first map with
-    the last. The shift of an area is that of its centroid, so it means nothing where areas grow: green, farmland,
-    water.
+    Rates are those over all intervals: `vanish` and `appear` count things, `ground_lost` and `ground_gained` what the
+    class no longer, or newly, covers, so they hold what was redrawn too. `redrawn_share` (of the older amount) and the
+    shifts compare the first map with the last. The shift of an area is that of its centroid, so it means nothing where
+    areas grow: green, farmland, water.
     """
 
     years: Annotated[float, Field(gt=0)]
@@ -44,6 +46,8 @@ class ClassAgeing(Document):
     n_to: Count
     vanish_per_year: Estimate | None = None
     appear_per_year: Estimate | None = None
+    ground_lost_per_year: Estimate | None = None
+    ground_gained_per_year: Estimate | None = None
     redrawn_share: Share | None = None
     shift_median_m: NotNegative | None = None
     shift_p90_m: NotNegative | None = None
@@ -61,9 +65,20 @@ class PlaceAgeing(Document):
 class RateBook(Document):
     """All measured places; `ratebook.toml`."""
 
+    version: Annotated[int, Field(validate_default=True)] = 1  # the first had no such key
     attribution: str
     licence: str
     places: list[PlaceAgeing] = Field(alias="place")
+
+    @field_validator("version")
+    @classmethod
+    def _is_current(cls, version: int) -> int:
+        if version != VERSION:
+            message = (
+                f"a rate book of version {version}, this program reads {VERSION}: write it with compare-ageing --rates"
+            )
+            raise ValueError(message)
+        return version
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -92,11 +107,14 @@ def _stem(file: str) -> str:
 class PooledClass:
     """Rates of one class from several places, 1/year, and how it is re-drawn; None if no place has a value.
 
-    `redrawn_share` is of the amount `years` before; both are medians, as are the shifts in metres.
+    Rates of ground are those of things and of what was redrawn. `redrawn_share` is of the amount `years` before; both
+    are medians, as are the shifts in metres.
     """
 
     vanish_per_year: float
     appear_per_year: float
+    ground_lost_per_year: float
+    ground_gained_per_year: float
     years: float
     redrawn_share: float | None
     shift_median_m: float | None
@@ -138,20 +156,26 @@ def pool_rates(book: RateBook, *, exclude: Collection[str] = ()) -> PooledRates:
 
 def _pooled(found: Sequence[ClassAgeing]) -> PooledClass | None:
     olds = [item for item in found if item.n_from >= LEAST_THINGS]
-    vanish = _median([item.vanish_per_year.best for item in olds if item.vanish_per_year])
     news = [item for item in found if item.n_to >= LEAST_THINGS]
-    appear = _median([item.appear_per_year.best for item in news if item.appear_per_year])
-    if vanish is None or appear is None or not math.isfinite(vanish + appear):
+    sides = {"vanish": olds, "appear": news, "ground_lost": olds, "ground_gained": news}
+    rates = {f"{what}_per_year": _median_rate(side, f"{what}_per_year") for what, side in sides.items()}
+    if not all(map(math.isfinite, rates.values())):
         return None
     redrawn = [item for item in olds if item.redrawn_share is not None]
     return PooledClass(
-        vanish_per_year=vanish,
-        appear_per_year=appear,
+        **rates,
         years=float(np.median([item.years for item in redrawn or olds])),
         redrawn_share=_median([item.redrawn_share for item in olds]),
         shift_median_m=_median([item.shift_median_m for item in olds]),
         shift_p90_m=_median([item.shift_p90_m for item in olds]),
     )
+
+
+def _median_rate(found: Sequence[ClassAgeing], name: str) -> float:
+    """Return the median of the best estimates of a rate; NaN if no place has one."""
+    known: list[Estimate | None] = [getattr(item, name) for item in found]
+    best = _median([rate.best for rate in known if rate is not None])
+    return math.nan if best is None else best
 
 
 def _median(values: Sequence[float | None]) -> float | None:

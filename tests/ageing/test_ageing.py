@@ -113,6 +113,20 @@ def test_houses_that_vanish_move_change_id_or_tag_or_are_split_are_told_apart():
     assert found["ground_lost_share"] == pytest.approx((200 + 20) / 700, abs=1e-6)
 
 
+def test_a_road_redrawn_beside_its_place_keeps_its_length_and_loses_ground():
+    """Two of 100 m: one moves by 1 m of its 4 m, one by more than a road can move."""
+    old = [(1, "road_minor", line((0, 0), (100, 0))), (2, "road_minor", line((0, 100), (100, 100)))]
+    new = [(1, "road_minor", line((0, 1), (100, 1))), (2, "road_minor", line((0, 120), (100, 120)))]
+    states = [state(on, things) for on, things in ((OLD, old), (NEW, new))]
+    for item in states:
+        item.features["width_m"] = 4.0
+    found = row(measured(*states), "road_minor")
+    assert (found["vanished_share"], found["ground_lost_share"]) == (0.5, 0.625)
+    years = (NEW - OLD).days / 365.25
+    assert found["ground_lost_per_year"] == pytest.approx(-np.log(1 - 0.625) / years, abs=1e-6)
+    assert found["ground_gained_per_year"] == pytest.approx(-np.log(1 - 0.625) / years, abs=1e-6)
+
+
 def test_a_merge_is_a_split_seen_from_the_other_side():
     split, whole = NEW_HOUSES[6:10], OLD_HOUSES[6:]
     found = row(changes(split, whole), "building")

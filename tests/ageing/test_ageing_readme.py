@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.ageing.files import read_ageing
+from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 FOLDER = Path(__file__).parents[2] / "docs" / "ageing"
@@ -68,6 +69,17 @@ SAID = [
         for place in ("faroe", "monaco")
         for column in ("appeared_number_share", "appeared_share")
     ),
+    *(
+        ("liechtenstein", name, "pooled", column, 2)
+        for name in ("building", "road_minor", "path_track")
+        for column in ("ground_lost_per_year", "vanish_per_year")
+    ),
+    ("min", "building", "pooled", "ground_lost_per_year", 2),
+    ("max", "building", "pooled", "ground_lost_per_year", 2),
+    ("liechtenstein", "building", "pooled", "ground_gained_per_year", 2),
+    ("liechtenstein", "building", "pooled", "appear_per_year", 2),
+    ("faroe", "road_minor", "pooled", "ground_lost_per_year", 2),
+    ("faroe", "road_minor", "pooled", "vanish_per_year", 2),
 ]
 
 
@@ -123,3 +135,10 @@ def test_every_column_of_the_tables_is_told_of(tables, text):
     patterns = [re.compile(name.replace("*", r"\w*")) for name in told]
     numbers = [name for name, kind in tables["monaco"].dtypes.items() if kind.kind in "fi" and name != "years"]
     assert [name for name in numbers if not any(pattern.fullmatch(name) for pattern in patterns)] == []
+
+
+def test_ground_is_lost_two_to_four_times_as_fast_as_buildings_roads_and_paths_vanish():
+    """Finding 9, of the medians over the places, which the generator takes."""
+    pooled = pool_rates(load_ratebook()).classes
+    for name in ("building", "road_minor", "path_track"):
+        assert 2 <= pooled[name].ground_lost_per_year / pooled[name].vanish_per_year <= 4

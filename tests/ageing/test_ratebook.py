@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from sasgeo_bench.ageing.files import ratebook_text, read_ageing
 from sasgeo_bench.ageing.ratebook import (
     PACKAGED,
+    VERSION,
     ClassAgeing,
     PlaceAgeing,
     RateBook,
@@ -26,14 +27,18 @@ MEASURED = Path(__file__).parents[2] / "docs" / "ageing"
 FOLDERS = ("liechtenstein", "andorra", "monaco", "dreieich", "faroe")
 
 
+RATES = ("vanish_per_year", "appear_per_year", "ground_lost_per_year", "ground_gained_per_year")
+
+
 def seen(vanish, appear, *, n_from=100, n_to=100, **more):
-    rates = {"vanish_per_year": {"best": vanish}, "appear_per_year": {"best": appear}}
+    """A class whose ground is lost and gained twice as fast as its things."""
+    rates = {name: {"best": best} for name, best in zip(RATES, (vanish, appear, 2 * vanish, 2 * appear), strict=True)}
     return ClassAgeing.model_validate({"years": 10.0, "n_from": n_from, "n_to": n_to} | rates | more)
 
 
 def book(**places):
     made = [PlaceAgeing(name=name, area_km2=1.0, extracts=[], **{"class": found}) for name, found in places.items()]
-    return RateBook(attribution="", licence="", place=made)
+    return RateBook(version=VERSION, attribution="", licence="", place=made)
 
 
 # What is packaged is what was measured
@@ -59,7 +64,7 @@ def test_every_packaged_number_is_that_of_the_tables(measured):
             pooled, whole = rows.loc[(name, "pooled")], rows.loc[(name, "whole")]
             assert (found.n_from, found.n_to) == (pooled["n_from"], pooled["n_to"])
             assert found.years == pytest.approx(pooled["years"], abs=0.005)
-            for column in ("vanish_per_year", "appear_per_year"):
+            for column in RATES:
                 rate = getattr(found, column)
                 ends = {"": rate and rate.best, "_lo": rate and rate.lo, "_hi": rate and rate.hi}
                 for end, value in ends.items():
@@ -87,7 +92,7 @@ def test_no_control_is_among_the_packaged_places():
 
 def test_a_rate_without_bound_and_one_without_interval_are_read_back():
     text = (
-        'attribution = ""\nlicence = ""\n[[place]]\nname = "a"\narea_km2 = 1.0\nextracts = []\n'
+        f'version = {VERSION}\nattribution = ""\nlicence = ""\n[[place]]\nname = "a"\narea_km2 = 1.0\nextracts = []\n'
         "[place.class.water]\nyears = 2.0\nn_from = 1\nn_to = 2\n"
         "vanish_per_year = { best = 0.1, lo = 0.0, hi = inf }\nappear_per_year = { best = 0.2 }\n"
     )
@@ -96,6 +101,22 @@ def test_a_rate_without_bound_and_one_without_interval_are_read_back():
     assert found.appear_per_year.lo is None
     with pytest.raises(ConfigError, match="greater than or equal to 0"):
         parse_toml(text.replace("best = 0.1", "best = -0.1"), RateBook, source="book.toml")
+
+
+@pytest.mark.parametrize(("version", "got"), [("", 1), ("version = 1\n", 1), ("version = 3\n", 3)])
+def test_a_book_of_another_version_is_refused_in_one_line_that_says_how_to_mend_it(version, got):
+    text = f'{version}attribution = ""\nlicence = ""\nplace = []\n'
+    mend = "write the rate book anew with compare-ageing --rates"
+    with pytest.raises(ConfigError, match=rf"^book.toml: .*{mend}: this program reads version 2, got {got}$"):
+        parse_toml(text, RateBook, source="book.toml")
+
+
+def test_nowhere_does_ground_change_more_slowly_than_things():
+    for place in load_ratebook().places:
+        for name, found in place.classes.items():
+            for things, ground in (("vanish", "ground_lost"), ("appear", "ground_gained")):
+                slow, fast = (getattr(found, f"{what}_per_year") for what in (things, ground))
+                assert slow is None or slow.best <= fast.best, (place.name, name)
 
 
 def test_a_book_cannot_be_changed():
@@ -118,7 +139,9 @@ def test_the_pooled_rate_is_the_median_of_the_other_places():
 def test_a_place_left_out_has_no_influence_on_any_number():
     packaged = load_ratebook()
     for name in packaged.names:
-        rest = RateBook(attribution="", licence="", place=[item for item in packaged.places if item.name != name])
+        rest = RateBook(
+            version=VERSION, attribution="", licence="", place=[item for item in packaged.places if item.name != name]
+        )
         assert pool_rates(packaged, exclude=[name]) == pool_rates(rest)
 
 
@@ -137,6 +160,7 @@ def test_what_no_place_tells_of_is_none_and_a_class_without_both_rates_is_left_o
     rates = book(a={"water": seen(0.01, 0.1), "green": seen(0.0, math.inf)})
     pooled = pool_rates(rates).classes
     assert list(pooled) == ["water"]
+    assert (pooled["water"].ground_lost_per_year, pooled["water"].ground_gained_per_year) == (0.02, 0.2)
     assert (pooled["water"].redrawn_share, pooled["water"].shift_median_m) == (None, None)
     assert pool_rates(book(a={"water": seen(0, 0, redrawn_share=0.5)})).classes["water"].redrawn_share == 0.5
 

@@ -57,8 +57,8 @@ MEASURED: dict[str, Perturbation] = {
     "snow 0.5": Season(kind="snow", strength=0.5),
     "low water 0.5": Season(kind="low_water", strength=0.5),
     "harvest 0.5": Season(kind="harvest", strength=0.5),
-    "ageing 10 years": Ageing(years=10.0, rates=RATES, place="-", redrawn=0.2),
-    "ageing 30 years": Ageing(years=30.0, rates=RATES, place="-", redrawn=0.2),
+    "ageing 10 years": Ageing(years=10.0, rates=RATES, place="-"),
+    "ageing 30 years": Ageing(years=30.0, rates=RATES, place="-"),
 }
 
 

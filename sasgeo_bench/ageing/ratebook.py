@@ -74,9 +74,7 @@ class RateBook(Document):
     @classmethod
     def _is_current(cls, version: int) -> int:
         if version != VERSION:
-            message = (
-                f"a rate book of version {version}, this program reads {VERSION}: write it with compare-ageing --rates"
-            )
+            message = f"write the rate book anew with compare-ageing --rates: this program reads version {VERSION}"
             raise ValueError(message)
         return version
 

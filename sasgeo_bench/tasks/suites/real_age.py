@@ -10,11 +10,15 @@ from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, State, Suite, Sui
 
 AGES_YEARS: Final = (2.0, 5.0, 10.0)
 DAYS_PER_YEAR: Final = 365.25
-_NEAR_ENOUGH: Final = 0.6  # least ratio of the age of an extract to that of the variant, or the other way round
+_LEAST_OF_AGE: Final = 0.8  # of the age of a variant, so that none of "10 years" is less than 8
+_MOST_OF_AGE: Final = 5 / 3
 
 
 class RealAgeSuite(Suite):
-    """One view of today's world, searched for in maps of several ages; the control searches today's map."""
+    """One view of today's world, searched for in maps of several ages; the control searches today's map.
+
+    `strength` is the age that a map stands for; the truth of each query says its age in years, `age_years`.
+    """
 
     def lack(self, scene: Scene) -> str | None:
         """Refuse a region without an older extract."""
@@ -54,20 +58,19 @@ def map_of_age(scene: Scene, years: float) -> State:
 
 
 def has_age(scene: Scene, years: float) -> bool:
-    """Return whether there is a state of about that age."""
-    return (
-        bool(scene.others)
-        and _NEAR_ENOUGH <= age_years(map_of_age(scene, years), scene.world) / years <= 1 / _NEAR_ENOUGH
-    )
+    """Return whether there is a state of about that age: not much younger, and less than twice as old."""
+    if not scene.others:
+        return False
+    return _LEAST_OF_AGE <= age_years(map_of_age(scene, years), scene.world) / years <= _MOST_OF_AGE
 
 
 SUITE: Final = RealAgeSuite(
     card=SuiteCard(
         name="real-age",
-        version=1,
+        version=2,
         title="Real ageing (S1)",
-        what="The map is that of an extract about 2, 5 or 10 years older than the world that is seen; the nearest date "
-        "there is stands for each. Most of what differs was mapped since, not built.",
+        what="The map is that of an extract about 2, 5 or 10 years older than the world that is seen: the nearest date "
+        "there is, 1.6 to 3.3, 4 to 8.3 or 8 to 16.7 years. Most of what differs was mapped since, not built.",
         separates="Stability from uniform weights: stable classes should carry what volatile ones lost.",
         falsifier="The same views against the map of the same day.",
         strength_unit="years between map and world, about: age_years is what they are",

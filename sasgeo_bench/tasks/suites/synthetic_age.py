@@ -11,7 +11,6 @@ from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
-REDRAWN_WITHIN_YEARS: Final = 10.0  # span that the `redrawn` of a scene's ageing refers to
 _MOST_NEW_PER_OLD: Final = 1.0
 _SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
 _MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
@@ -36,18 +35,18 @@ class SyntheticAgeSuite(Suite):
 def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
     """Return ageing by the measured rates of other places, with no year passed yet.
 
-    The share of redrawn objects and their shift are medians over the classes whose centre moves because they were
-    redrawn and not because they grew.
+    The shift of redrawn objects is the median over the classes whose centre moves because they were redrawn and not
+    because they grew; how many are redrawn follows from the rates of the ground.
     """
-    redrawn = [pooled.classes[name] for name in _SHIFTED if name in pooled.classes]
-    shares = [
-        1 - (1 - item.redrawn_share) ** (REDRAWN_WITHIN_YEARS / item.years)
-        for item in redrawn
-        if item.redrawn_share is not None
-    ]
-    shifts_m = [item.shift_median_m for item in redrawn if item.shift_median_m is not None]
+    names = [name for name in _SHIFTED if name in pooled.classes]
+    shifts_m = [shift_m for name in names if (shift_m := pooled.classes[name].shift_median_m) is not None]
     classes = {
-        name: Rates(vanish_per_year=item.vanish_per_year, appear_per_year=item.appear_per_year)
+        name: Rates(
+            vanish_per_year=item.vanish_per_year,
+            appear_per_year=item.appear_per_year,
+            ground_lost_per_year=item.ground_lost_per_year,
+            ground_gained_per_year=item.ground_gained_per_year,
+        )
         for name, item in pooled.classes.items()
     }
     return Ageing(
@@ -55,31 +54,37 @@ def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
         rates=classes,
         measured_in=pooled.places,
         place=place,
-        redrawn=float(np.median(shares)) if shares else 0.0,
         shift_m=float(np.median(shifts_m)) / _MEDIAN_OF_SHIFT if shifts_m else 0.0,
     )
 
 
 def after(ageing: Ageing, years: float) -> Ageing:
-    """Return ageing by so many years; the share of redrawn objects grows with them.
+    """Return ageing by so many years.
 
-    A class at most doubles: rates of appearing were measured on maps that were being completed, and a complete map
-    grows less.
+    A class at most doubles, by its things and by its ground: rates of appearing were measured on maps that were being
+    completed, and a complete map grows less.
     """
-    kept = (1 - ageing.redrawn) ** (years / REDRAWN_WITHIN_YEARS)
     most = float(np.log1p(_MOST_NEW_PER_OLD)) / years if years > 0 else np.inf
-    classes = {
-        name: replace(rates, appear_per_year=min(rates.appear_per_year, most)) for name, rates in ageing.rates.items()
-    }
-    return replace(ageing, years=years, redrawn=1 - kept, rates=classes)
+    return replace(ageing, years=years, rates={name: _at_most(rates, most) for name, rates in ageing.rates.items()})
+
+
+def _at_most(rates: Rates, most_per_year: float) -> Rates:
+    """Return rates that gain no more than that."""
+    ground = rates.ground_gained_per_year
+    return replace(
+        rates,
+        appear_per_year=min(rates.appear_per_year, most_per_year),
+        ground_gained_per_year=None if ground is None else min(ground, most_per_year),
+    )
 
 
 SUITE: Final = SyntheticAgeSuite(
     card=SuiteCard(
         name="synthetic-age",
-        version=1,
+        version=2,
         title="Synthetic ageing",
-        what="Things vanish, appear and are drawn anew for 2 to 40 years, at the rates measured in other places.",
+        what="Things vanish, appear and are drawn anew for 2 to 40 years; ground is lost and gained at the rates that "
+        "were measured in other places.",
         separates="Stability from uniform weights where no second date is there; to be read beside real-age.",
         falsifier="No year has passed: scores as in the control.",
         strength_unit="years between map and world",

@@ -98,13 +98,52 @@ def test_roads_go_and_come_in_pieces(views):
     assert np.std(kept) > 0.05  # pieces, not a thinning of everything
 
 
+def ground(lost=0.0, gained=0.0, names=("building",), vanish=0.0):
+    item = Rates(vanish_per_year=vanish, appear_per_year=0.0, ground_lost_per_year=lost, ground_gained_per_year=gained)
+    return dict.fromkeys(names, item)
+
+
 def test_what_is_redrawn_stays_near_and_whole():
     village = houses()
-    for after in aged(village, rates=rates(), years=1, redrawn=0.5, shift_m=2.0, seeds=range(5)):
-        moved = (after.cells[0] != village.cells[0]).any()
-        assert moved
+    for after in aged(village, rates=ground(lost=0.1), years=1, shift_m=2.0, seeds=range(5)):
+        assert (after.cells[0] != village.cells[0]).any()
         assert count(after) == 64
         assert (after.cells == PRESENT).sum() == (village.cells == PRESENT).sum()
+
+
+@pytest.mark.parametrize("vanish", [0.0, 0.01, 0.03])
+def test_as_much_ground_is_lost_as_the_rate_says_however_much_of_it_vanishes(vanish):
+    village = houses()
+    before = village.layer("building") == PRESENT
+    views = aged(village, rates=ground(lost=0.03, vanish=vanish), years=10, shift_m=1.5)
+    kept = [((view.layer("building") == PRESENT) & before).sum() / before.sum() for view in views]
+    assert np.mean(kept) == pytest.approx(np.exp(-0.3), abs=0.03)
+    assert np.mean([count(view) for view in views]) == pytest.approx(64 * np.exp(-10 * vanish), rel=0.06)
+
+
+def test_shifts_too_small_to_lose_the_ground_are_doubled():
+    village = houses()
+    before = village.layer("building") == PRESENT
+    for shift_m in (0.6, 4.0):
+        views = aged(village, rates=ground(lost=0.06), years=10, shift_m=shift_m)
+        kept = np.mean([((view.layer("building") == PRESENT) & before).sum() / before.sum() for view in views])
+        assert kept == pytest.approx(np.exp(-0.6), abs=0.06)
+
+
+def test_redrawing_gains_ground_too_and_new_houses_the_rest():
+    village = houses(per_side=4)
+    before = village.layer("building") == PRESENT
+    for lost, gained in ((0.0, 0.03), (0.02, 0.03), (0.02, 0.0)):
+        views = [view.layer("building") == PRESENT for view in aged(village, rates=ground(lost, gained), years=10)]
+        new = np.mean([(view & ~before).sum() / view.sum() for view in views])
+        redrawn = 1 - np.exp(-10 * lost)  # as much as is lost, and no less
+        assert new == pytest.approx(max(1 - np.exp(-10 * gained), redrawn), abs=0.03)
+
+
+def test_what_is_redrawn_at_the_edge_goes_on_beyond_it():
+    lawn = houses(per_side=0, green=1)
+    for after in aged(lawn, rates=ground(lost=0.1, names=("green",)), years=10, seeds=range(3)):
+        assert (after.layer("green") == PRESENT).all()
 
 
 def test_a_place_is_never_aged_by_its_own_rates():

@@ -44,7 +44,7 @@ ALL = (
     Season(kind="snow", strength=0.6),
     Season(kind="low_water", strength=0.6),
     Season(kind="harvest", strength=0.6),
-    Ageing(years=10.0, rates=RATES, place="here", redrawn=0.3),
+    Ageing(years=10.0, rates=RATES, place="here"),
 )
 DETERMINISTIC = (AdversarialMask, CentralCrop)
 MOVES = (LocalWarp, RowJitter, Tilt)

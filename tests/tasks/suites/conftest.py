@@ -16,7 +16,7 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.split import blocks_of
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite, Variant
@@ -72,6 +72,16 @@ class Carried:
         )
 
 
+def _with_ground(rates: dict[str, Rates]) -> dict[str, Rates]:
+    """Rates whose ground is lost three times as fast as things vanish, and gained half as fast again as they appear."""
+    return {
+        name: replace(
+            item, ground_lost_per_year=3 * item.vanish_per_year, ground_gained_per_year=1.5 * item.appear_per_year
+        )
+        for name, item in rates.items()
+    }
+
+
 def _view_reach_m(suite: Suite) -> float:
     """How far from its centre a view of a suite may show anything."""
     return max(item.side_m for item in suite.variants) / 2 * 2**0.5 * largest_scale(suite.card.group)
@@ -118,7 +128,7 @@ def scene(town) -> Callable[..., Scene]:
             scenes=town(name).manifest.scenes,
             others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if name in DATED else (),
             elsewhere=State.of(town("town-riverside")),
-            ageing=Ageing(years=0.0, rates=rates_by_hand(), place="here", redrawn=0.2),
+            ageing=Ageing(years=0.0, rates=_with_ground(rates_by_hand()), place="here"),
         )
 
     return of_town

@@ -6,8 +6,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.tasks.perturbations.objects import thin_classes
 from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.suites.all_suites import SUITES
@@ -16,6 +17,7 @@ from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.stable_not_distinctive import straight_places
+from sasgeo_bench.tasks.suites.synthetic_age import after, ageing_of
 
 # What is measured of a stress, and grows with its strength.
 GROWS = {
@@ -174,6 +176,22 @@ def test_as_much_of_the_map_has_changed_as_the_truth_says(carried, name, kind):
             draft = made.draw(site, variant)
             assert draft.changed_share == draft.measured["changed_share"]
             assert 0 <= draft.changed_share <= 1
+
+
+def test_a_town_aged_by_ten_years_loses_and_gains_the_ground_that_the_rate_book_says(carried):
+    """Of what a raster sees, over many draws: a view holds few pieces of road."""
+    made, years = carried("synthetic-age"), 10.0
+    ageing = after(ageing_of(pool_rates(load_ratebook()), place="here"), years)
+    ageing = replace(ageing, rates={name: ageing.rates[name] for name in ("building", "road_minor")})
+    views = [made.scene.world.view(site.pose, size_cells=192, cell_size_m=1.0) for site in made.sites] * 25
+    both = [(view, ageing(view, np.random.default_rng(seed))) for seed, view in enumerate(views)]
+    for name, rates in ageing.rates.items():
+        masks = [tuple(state.layer(name) == PRESENT for state in pair) for pair in both]
+        old, new = (sum(int(pair[side].sum()) for pair in masks) for side in (0, 1))
+        lost = sum(int((before & ~later).sum()) for before, later in masks) / old
+        gained = sum(int((later & ~before).sum()) for before, later in masks) / new
+        assert lost == pytest.approx(1 - np.exp(-rates.ground_lost_per_year * years), rel=0.2)
+        assert gained == pytest.approx(1 - np.exp(-rates.ground_gained_per_year * years), rel=0.2)
 
 
 def test_about_as_many_houses_appear_as_growth_says(carried):

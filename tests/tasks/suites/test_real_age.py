@@ -36,7 +36,7 @@ def test_the_map_of_an_age_is_the_nearest_by_ratio(dated):
     assert age_years(town.others[0], town.world) == pytest.approx(12, abs=0.01)
 
 
-@pytest.mark.parametrize(("age", "can"), [(5.9, False), (6.1, True), (10.0, True), (16.5, True), (17.0, False)])
+@pytest.mark.parametrize(("age", "can"), [(7.9, False), (8.1, True), (10.0, True), (16.5, True), (17.0, False)])
 def test_a_date_too_far_from_an_age_does_not_stand_for_it(dated, age, can):
     assert has_age(dated(age), 10.0) == can
     usable = {(item.role, item.strength) for item in SUITE.usable(dated(age)) if item.strength in (0.0, 10.0)}

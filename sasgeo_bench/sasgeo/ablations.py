@@ -22,7 +22,9 @@ class Switches:
     of fitted rates, each class with a fitted scale of its evidence. `is_unknown_silent` ignores unknown cells of the
     view, else they count as absent. `has_graph` ranks modes with Eq. 9, too. `is_distinctive`, Eq. 6, gives rare
     configurations more weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit.
-    Unless it `knows_age`, every map counts as new, which separates stability from fitted weights.
+    Unless it `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it
+    `learns_from_old`, training views on an older map are moved to the map of their own day. `burns_vectors` reads the
+    perceived vectors as a second raster view, so that an arm without a graph sees what one with a graph sees.
     """
 
     weights: Weights = "fitted"
@@ -31,6 +33,8 @@ class Switches:
     is_distinctive: bool = False
     is_stamped: bool = False
     knows_age: bool = True
+    learns_from_old: bool = True
+    burns_vectors: bool = False
 
     @property
     def learns(self) -> bool:

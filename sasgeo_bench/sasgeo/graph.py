@@ -3,7 +3,8 @@
 
 Every term is a log-likelihood ratio of a view from here against one from a similar place. A seen node that is mapped
 adds log(hit p(offset) / density), one that is not mapped log(extra), a mapped one that is not seen log(1 - hit);
-relations of neighbours add to this. Probabilities are set by hand (`nodes.KINDS`, `GraphRules`).
+relations of neighbours add to this. The numbers are those of `GraphRules`; a view without vectors keeps its starting
+values, since only vectors teach others.
 """
 
 from collections.abc import Sequence
@@ -13,69 +14,22 @@ from typing import Final, Self
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
+from sasgeo_bench.geometry.pose import Pose, inverse
+from sasgeo_bench.sasgeo.graph_rules import (
+    GraphRules,
+    arm_offsets_deg,
+    by_area,
+    by_arms,
+    by_degree,
+    degree_step,
+)
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.nodes import KINDS, Bools, Floats, Ints
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphRules:
-    """Tolerances and likelihood ratios, set by hand."""
-
-    gate_m: float = 12.0  # largest offset of a node: twice the errors of maps and detectors, and that of a search
-    place_sigma_m: float = 6.0  # each axis: 4 m of the map, 3 m of the pose, some metres of a warp
-    # Largest common shift of neighbouring nodes, and its correlation length: after a first assignment the gate moves
-    # with the neighbours. This tolerates warps of 15 m rms with waves of 60 m and more.
-    warp_m: float = 20.0
-    stretch_m: float = 35.0
-    wander: float = 0.05  # probability that the place, an arm or the area of a right match is an outlier
-    arm_sigma_deg: float = 15.0
-    area_sigma: float = 0.2  # of the logarithm of an area
-    area_spread: float = 0.8  # standard deviation of the logarithm of areas of different houses
-    degrees: tuple[float, float, float] = (0.4, -1.2, -2.5)  # that are equal, differ by one, and by more
-    # Standard deviation of the relative place of two neighbours: a constant, and a part of their distance. A warp of
-    # 10 m rms with waves of 90 m strains by 0.4, a heading error of 3 degrees by 0.05.
-    edge_sigma_m: float = 2.0
-    edge_strain: float = 0.12
-    edge_weight: float = 0.25  # of a pair of neighbours: a node has about six, which share its place
-    link: float = 0.6  # a way between two nodes on both sides
-    false_link: float = -1.5  # in the view alone
-    lost_link: float = -0.7  # on the map alone
-
-
-def by_degree(seen: Ints, mapped: Ints, rules: GraphRules) -> Floats:
-    """Return the ratios of degrees; 0 where either is unknown, shape (P,)."""
-    off = np.minimum(np.abs(seen - mapped), len(rules.degrees) - 1)
-    return np.where((seen > 0) & (mapped > 0), np.array(rules.degrees)[off], 0.0)
-
-
-def by_area(seen_m2: Floats, mapped_m2: Floats, rules: GraphRules) -> Floats:
-    """Return the ratios of equal against unrelated areas; 0 where there are none, shape (P,)."""
-    off = np.log(seen_m2 / mapped_m2)
-    spread = 2**0.5 * rules.area_spread
-    right = np.exp(-(off**2) / (2 * rules.area_sigma**2)) / rules.area_sigma
-    chance = np.exp(-(off**2) / (2 * spread**2)) / spread
-    ratio = np.log((1 - rules.wander) * right + rules.wander * chance) - np.log(chance)
-    return np.where(np.isfinite(ratio), ratio, 0.0)
-
-
-def by_arms(seen_deg: Floats, mapped_deg: Floats, rules: GraphRules) -> Floats:
-    """Return the ratios of seen arms and the nearest mapped ones; 0 where either side has none, shape (P,)."""
-    off_deg = np.abs(wrap_deg(seen_deg[:, :, None] - mapped_deg[:, None, :]))
-    count = np.isfinite(mapped_deg).sum(axis=1, keepdims=True)
-    nearest = np.where(np.isfinite(off_deg), off_deg, np.inf).min(axis=2, initial=np.inf)
-    counts = np.isfinite(nearest)
-    nearest = np.where(counts, nearest, 0.0)
-    right = np.exp(-(nearest**2) / (2 * rules.arm_sigma_deg**2)) * (2 / np.pi) ** 0.5 / rules.arm_sigma_deg
-    chance = np.maximum(count, 1) / 180.0
-    ratio = np.log((1 - rules.wander) * right / chance + rules.wander)
-    return np.asarray(np.where(counts, ratio, 0.0).sum(axis=1))
-
-
-_HIT: Final = np.array([kind.hit for kind in KINDS])
-_EXTRA: Final = np.array([kind.extra for kind in KINDS])
+START: Final = GraphRules()  # of nodes of masks, and of all nodes before training
 _SPREAD_M: Final = np.array([kind.spread_m for kind in KINDS])
+_IS_DRAWN: Final = np.array([kind.drawing == "vectors" for kind in KINDS])
 _NONE: Final[frozenset[int]] = frozenset()
 _SLACK_M: Final = 1.0
 _LEAST_MATCHED: Final = 3  # nodes needed to estimate a local shift
@@ -100,7 +54,39 @@ class GraphScore:
     rms_m: float = 0.0
 
 
-def verify(seen: ObservedGraph, mapped: MappedGraph, poses: Sequence[Pose]) -> list[GraphScore]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matching:
+    """What the correspondences at one pose show; all but `kinds` of the nodes of vectors.
+
+    `offset_m`, shape (P, 2), are offsets of matched nodes from the view to the map, `common_m`, shape (P,), the length
+    of the shift that each shares with its neighbours. `arms_deg`, shape (A,), are angles between arms; `degrees`, shape
+    (3,), counts pairs by how much their degrees differ; `areas`, shape (Q, 2), are logarithms of areas, seen and
+    mapped. `edges`, shape (E, 2), hold the length and the strain of pairs of matched neighbours, metres; `links`, shape
+    (3,), counts ways on both sides, in the view alone and on the map alone. `kinds`, shape (4, K), counts nodes of each
+    kind: map nodes that were visible, those of them matched, seen nodes that count, those of them unmatched.
+    """
+
+    offset_m: Floats
+    common_m: Floats
+    arms_deg: Floats
+    degrees: Ints
+    areas: Floats
+    edges: Floats
+    links: Ints
+    kinds: Ints
+
+
+def match_nodes(
+    seen: ObservedGraph, mapped: MappedGraph, poses: Sequence[Pose], rules: GraphRules = START
+) -> list[Matching]:
+    """Return what the best correspondences at each pose show, for the statistics of `rule_fitting`."""
+    judge = _Judge.of(seen, mapped, rules)
+    return [judge.matching(pose) for pose in poses]
+
+
+def verify(
+    seen: ObservedGraph, mapped: MappedGraph, poses: Sequence[Pose], rules: GraphRules = START
+) -> list[GraphScore]:
     """Return the score of Eq. 9 of each pose, with its best correspondences.
 
     Examples
@@ -124,15 +110,14 @@ def verify(seen: ObservedGraph, mapped: MappedGraph, poses: Sequence[Pose]) -> l
     >>> here.score > turned.score
     True
     """
-    rules = GraphRules()
-    judge = _Judge(seen=seen, mapped=mapped, rules=rules, pull=_pull(seen.nodes.places_m, rules.stretch_m))
+    judge = _Judge.of(seen, mapped, rules)
     return [judge.score(pose) for pose in poses]
 
 
-def _pull(places_m: Floats, stretch_m: float) -> Floats:
+def _pull(places_m: Floats, stretch_m: Floats) -> Floats:
     """Return the influence of each node on the shift of others, shape (N, N), 0 on the diagonal."""
     distance_2 = ((places_m[:, None] - places_m[None]) ** 2).sum(axis=2)
-    pull = np.exp(-distance_2 / (2 * stretch_m**2))
+    pull = np.exp(-distance_2 / (2 * stretch_m[:, None] ** 2))
     np.fill_diagonal(pull, 0.0)
     return np.asarray(pull)
 
@@ -173,18 +158,42 @@ class _Judge:
     rules: GraphRules
     pull: Floats
 
+    @classmethod
+    def of(cls, seen: ObservedGraph, mapped: MappedGraph, rules: GraphRules) -> Self:
+        """Prepare a view: each drawing has rules of its own."""
+        stretch_m = _by_kind(rules, "stretch_m")[seen.nodes.kind]
+        return cls(seen=seen, mapped=mapped, rules=rules, pull=_pull(seen.nodes.places_m, stretch_m))
+
     def score(self, pose: Pose) -> GraphScore:
-        """Assign, shift each node with its neighbours, assign again and sum up."""
+        """Assign the nodes and sum up."""
         stage = self._stage(pose)
+        return self._summed(stage, self._matched(stage))
+
+    def matching(self, pose: Pose) -> Matching:
+        """Assign the nodes and tell what they show."""
+        stage = self._stage(pose)
+        return self._shown(stage, self._matched(stage))
+
+    def _matched(self, stage: _Stage) -> _Pairs:
+        """Assign, shift each node with its neighbours, and assign again."""
         pairs = self._assigned(stage, np.zeros_like(stage.places_m))
-        if len(pairs.seen) >= _LEAST_MATCHED:
-            pairs = self._assigned(stage, self._shift_m(stage, pairs))
-        return self._summed(stage, pairs)
+        if len(pairs.seen) < _LEAST_MATCHED:
+            return pairs
+        return self._assigned(stage, self._shift_m(stage, pairs))
+
+    @property
+    def _gate_m(self) -> Floats:
+        """Return the largest offset of each kind, shape (K,)."""
+        return np.asarray(_by_kind(self.rules, "gate_m") + _SPREAD_M)
+
+    def _by_drawing(self, is_drawn: Bools) -> tuple[tuple[GraphRules, Bools], ...]:
+        """Return the rules of vectors and of masks, and which rows they hold for."""
+        return ((self.rules, is_drawn), (START, ~is_drawn))
 
     def _stage(self, pose: Pose) -> _Stage:
         nodes, ours = self.mapped.nodes, self.seen.nodes
         reach_m = float(np.hypot(*self.seen.visible.shape[1:])) * self.seen.cell_size_m / 2 * pose.scale
-        reach_m += self.rules.gate_m + self.rules.warp_m + _SPREAD_M.max() + _SLACK_M
+        reach_m += (self._gate_m + _by_kind(self.rules, "shift_m")).max() + _SLACK_M
         around = self.mapped.around(np.array([pose.easting_m, pose.northing_m]), reach_m)
         around = around[self.seen.asked[nodes.kind[around]]]
         kind = nodes.kind[around]
@@ -198,8 +207,8 @@ class _Judge:
             pose=pose,
             places_m=places_m,
             around=around,
-            lost_seen=np.where(counts, np.log(_EXTRA[ours.kind]), 0.0),
-            lost_mapped=np.where(is_due, np.log1p(-_HIT[kind]), 0.0),
+            lost_seen=np.where(counts, np.log(_by_kind(self.rules, "extra")[ours.kind]), 0.0),
+            lost_mapped=np.where(is_due, np.log1p(-_by_kind(self.rules, "hit")[kind]), 0.0),
         )
 
     def _assigned(self, stage: _Stage, shift_m: Floats) -> _Pairs:
@@ -208,7 +217,8 @@ class _Judge:
         gain = pairs.score - stage.lost_seen[pairs.seen] - stage.lost_mapped[pairs.mapped]
         off_m = self._offsets_m(stage, pairs) - shift_m[pairs.seen]
         if shift_m.any():  # prefer offsets like those of neighbours
-            gain -= (off_m**2).sum(axis=1) / (2 * self.rules.place_sigma_m**2)
+            sigma_m = _by_kind(self.rules, "place_sigma_m")[self.seen.nodes.kind[pairs.seen]]
+            gain -= (off_m**2).sum(axis=1) / (2 * sigma_m**2)
         table = np.zeros((len(stage.places_m), len(stage.around)))
         table[pairs.seen, pairs.mapped] = np.maximum(gain, 0.0)
         rows, cols = np.unique(pairs.seen), np.unique(pairs.mapped)
@@ -219,23 +229,27 @@ class _Judge:
 
     def _near(self, stage: _Stage, shift_m: Floats) -> _Pairs:
         """Return pairs of one kind within the gate and their scores."""
-        ours, theirs, rules = self.seen.nodes, self.mapped.nodes, self.rules
-        at_m = stage.places_m + shift_m
-        gate_m = rules.gate_m + _SPREAD_M[ours.kind]
-        row, there = self.mapped.like(at_m, ours.kind, gate_m)
-        col = np.searchsorted(stage.around, there)
-        kind = ours.kind[row]
-        pairs = _Pairs(seen=row, mapped=col, score=np.zeros(len(row)))
-        sigma_m = np.hypot(rules.place_sigma_m, _SPREAD_M[kind])
+        ours = self.seen.nodes
+        row, there = self.mapped.like(stage.places_m + shift_m, ours.kind, self._gate_m[ours.kind])
+        pairs = _Pairs(seen=row, mapped=np.searchsorted(stage.around, there), score=np.zeros(len(row)))
         off_2 = (self._offsets_m(stage, pairs) ** 2).sum(axis=1)
+        for rules, own in self._by_drawing(_IS_DRAWN[ours.kind[row]]):
+            pairs.score[own] = self._alike(stage.pose, row[own], there[own], off_2[own], rules)
+        return pairs
+
+    def _alike(self, pose: Pose, row: Ints, there: Ints, off_2: Floats, rules: GraphRules) -> Floats:
+        """Return scores of pairs of nodes by place, degree, area and arms, shape (P,)."""
+        ours, theirs = self.seen.nodes, self.mapped.nodes
+        kind = ours.kind[row]
+        sigma_m = np.hypot(rules.place_sigma_m, _SPREAD_M[kind])
         dense = np.exp(-off_2 / (2 * sigma_m**2)) / (2 * np.pi * sigma_m**2)
-        flat = 1 / (np.pi * gate_m[row] ** 2)
+        flat = 1 / (np.pi * self._gate_m[kind] ** 2)
         place = np.log((1 - rules.wander) * dense + rules.wander * flat) - np.log(self.mapped.density_per_m2[kind])
-        score = np.log(_HIT[kind]) + place
+        score = np.log(_by_kind(self.rules, "hit")[kind]) + place
         score += by_degree(ours.degree[row], theirs.degree[there], rules)
-        score += by_area(ours.area_m2[row] * stage.pose.scale**2, theirs.area_m2[there], rules)
-        score += by_arms(ours.arms_deg[row] + stage.pose.yaw_deg, theirs.arms_deg[there], rules)
-        return _Pairs(seen=row, mapped=col, score=score)
+        score += by_area(ours.area_m2[row] * pose.scale**2, theirs.area_m2[there], rules)
+        score += by_arms(ours.arms_deg[row] + pose.yaw_deg, theirs.arms_deg[there], rules)
+        return np.asarray(score)
 
     def _offsets_m(self, stage: _Stage, pairs: _Pairs) -> Floats:
         """Return offsets from nodes of the view to those of the map, shape (P, 2)."""
@@ -245,20 +259,26 @@ class _Judge:
         """Return the mean offset of the neighbours of each node, without itself, shrunk towards 0."""
         follows = self.pull[:, pairs.seen]
         shift_m = (follows @ self._offsets_m(stage, pairs)) / (follows.sum(axis=1, keepdims=True) + 1.0)
-        length_m = np.hypot(*shift_m.T)[:, None]
-        return np.asarray(shift_m * np.minimum(1.0, self.rules.warp_m / np.maximum(length_m, 1e-9)))
+        length_m = np.hypot(*shift_m.T)
+        most_m = _by_kind(self.rules, "shift_m")[self.seen.nodes.kind]
+        return np.asarray(shift_m * np.minimum(1.0, most_m / np.maximum(length_m, 1e-9))[:, None])
 
     def _summed(self, stage: _Stage, pairs: _Pairs) -> GraphScore:
         lost_seen, lost_mapped = stage.lost_seen.copy(), stage.lost_mapped.copy()
         lost_seen[pairs.seen] = lost_mapped[pairs.mapped] = 0.0
         off_m = self._offsets_m(stage, pairs)
-        edges = np.concatenate((self._by_neighbours(stage, pairs, off_m), self._by_links(stage, pairs)))
-        good, bad = int((edges > 0).sum()), int((edges < 0).sum())
+        edges, links = self._by_neighbours(stage, pairs, off_m), self._links(stage, pairs)
+        good = int((edges > 0).sum() + links[:, 0].sum())
+        bad = int((edges < 0).sum() + links[:, 1:].sum())
         missing = int((lost_seen < 0).sum()), int((lost_mapped < 0).sum())
         fine = 2 * len(pairs.seen) + good
         judged = fine + sum(missing) + bad
         return GraphScore(
-            score=float(pairs.score.sum() + lost_seen.sum() + lost_mapped.sum() + edges.sum()),
+            score=float(pairs.score.sum() + lost_seen.sum() + lost_mapped.sum() + edges.sum())
+            + sum(
+                float(row @ (one.link, one.false_link, one.lost_link))
+                for row, one in zip(links, (self.rules, START), strict=True)
+            ),
             matched=len(pairs.seen),
             unmatched_seen=missing[0],
             unmatched_mapped=missing[1],
@@ -270,43 +290,94 @@ class _Judge:
 
     def _by_neighbours(self, stage: _Stage, pairs: _Pairs, off_m: Floats) -> Floats:
         """Return scores of the relative places of matched neighbours."""
+        ends, kind, length_m = self._neighbours(stage, pairs)
+        strain_2 = ((off_m[ends[:, 0]] - off_m[ends[:, 1]]) ** 2).sum(axis=1)
+        spread_2 = (_SPREAD_M[kind] ** 2).sum(axis=1)
+        score = np.zeros(len(ends))
+        for rules, own in self._by_drawing(np.asarray(_IS_DRAWN[kind].all(axis=1))):
+            sigma_2 = rules.edge_sigma_m**2 + (rules.edge_strain * length_m[own]) ** 2 + spread_2[own]
+            chance_2 = 2 * rules.place_sigma_m**2 + spread_2[own]  # of two independent offsets
+            ratio = np.log(chance_2 / sigma_2) - strain_2[own] / 2 * (1 / sigma_2 - 1 / chance_2)
+            ratio = np.where(sigma_2 < chance_2, np.maximum(ratio, np.log(rules.wander)), 0.0)
+            score[own] = rules.edge_weight * ratio
+        return score
+
+    def _neighbours(self, stage: _Stage, pairs: _Pairs) -> tuple[Ints, Ints, Floats]:
+        """Return pairs of matched neighbours: rows of `pairs` and kinds, shape (E, 2) each, and distances, metres."""
         at = np.full(len(stage.places_m), -1)
         at[pairs.seen] = np.arange(len(pairs.seen))
-        ends = at[self.seen.near]
-        kept = (ends >= 0).all(axis=1)
-        ends, near, rules = ends[kept], self.seen.near[kept], self.rules
+        kept = (at[self.seen.near] >= 0).all(axis=1)
+        near = self.seen.near[kept]
         length_m = np.hypot(*(stage.places_m[near[:, 0]] - stage.places_m[near[:, 1]]).T)
-        spread_2 = (_SPREAD_M[self.seen.nodes.kind[near]] ** 2).sum(axis=1)
-        sigma_2 = rules.edge_sigma_m**2 + (rules.edge_strain * length_m) ** 2 + spread_2
-        strain_2 = ((off_m[ends[:, 0]] - off_m[ends[:, 1]]) ** 2).sum(axis=1)
-        chance_2 = 2 * rules.place_sigma_m**2 + spread_2  # of two independent offsets
-        ratio = np.log(chance_2 / sigma_2) - strain_2 / 2 * (1 / sigma_2 - 1 / chance_2)
-        ratio = np.where(sigma_2 < chance_2, np.maximum(ratio, np.log(rules.wander)), 0.0)
-        return np.asarray(rules.edge_weight * ratio)
+        return at[near], self.seen.nodes.kind[near], length_m
 
-    def _by_links(self, stage: _Stage, pairs: _Pairs) -> Floats:
-        """Return scores of ways between matched nodes, on both sides or on one.
+    def _links(self, stage: _Stage, pairs: _Pairs) -> Ints:
+        """Count ways between matched nodes of vectors and of masks, shape (2, 3).
 
-        A way past an unmatched node is no contradiction: that node is counted already.
+        On both sides, in the view alone, on the map alone. A way past an unmatched node is no contradiction: that node
+        is counted already.
         """
-        ours, theirs, rules = self.seen.links, self.mapped.links, self.rules
+        ours, theirs = self.seen.links, self.mapped.links
         to_map = dict(zip(pairs.seen.tolist(), stage.around[pairs.mapped].tolist(), strict=True))
         to_view = {there: here for here, there in to_map.items()}
-        found: list[float] = []
+        row = (~_IS_DRAWN[self.seen.nodes.kind]).astype(int).tolist()
+        found = np.zeros((2, 3), dtype=np.int64)
         for one, there in to_map.items():
             for two in ours.get(one, _NONE):
                 if one < two and two in to_map:
                     if to_map[two] in theirs.get(there, _NONE):
-                        found.append(rules.link)
+                        found[row[one], 0] += 1
                     elif not _passes(theirs, there, to_map[two], matched=to_view):
-                        found.append(rules.false_link)
+                        found[row[one], 1] += 1
         for one, here in to_view.items():
             for two in theirs.get(one, _NONE):
                 if one < two and two in to_view:
                     other = to_view[two]
                     if other not in ours.get(here, _NONE) and not _passes(ours, here, other, matched=to_map):
-                        found.append(rules.lost_link)
-        return np.array(found, dtype=np.float64)
+                        found[row[here], 2] += 1
+        return found
+
+    def _shown(self, stage: _Stage, pairs: _Pairs) -> Matching:
+        """Return the differences of matched nodes, and counts."""
+        ours, theirs = self.seen.nodes, self.mapped.nodes
+        off_m, shift_m = self._offsets_m(stage, pairs), self._shift_m(stage, pairs)[pairs.seen]
+        ends, kind, length_m = self._neighbours(stage, pairs)
+        strain_m = np.hypot(*(off_m[ends[:, 0]] - off_m[ends[:, 1]]).T)
+        both = _IS_DRAWN[kind].all(axis=1)
+        own = _IS_DRAWN[ours.kind[pairs.seen]]
+        row, there = pairs.seen[own], stage.around[pairs.mapped[own]]
+        arms_deg = arm_offsets_deg(ours.arms_deg[row] + stage.pose.yaw_deg, theirs.arms_deg[there])
+        areas = np.log(np.column_stack((ours.area_m2[row] * stage.pose.scale**2, theirs.area_m2[there])))
+        has_degree = (ours.degree[row] > 0) & (theirs.degree[there] > 0)
+        steps = degree_step(ours.degree[row], theirs.degree[there])[has_degree]
+        return Matching(
+            offset_m=off_m[own],
+            common_m=np.hypot(*shift_m[own].T),
+            arms_deg=arms_deg[np.isfinite(arms_deg)],
+            degrees=np.bincount(steps, minlength=len(self.rules.degrees)),
+            areas=areas[np.isfinite(areas).all(axis=1)],
+            edges=np.column_stack((length_m, strain_m))[both],
+            links=self._links(stage, pairs)[0],
+            kinds=self._counts(stage, pairs),
+        )
+
+    def _counts(self, stage: _Stage, pairs: _Pairs) -> Ints:
+        """Return the counts of `Matching.kinds`."""
+        around, ours = self.mapped.nodes.kind[stage.around], self.seen.nodes.kind
+        is_due, counts = stage.lost_mapped < 0, stage.lost_seen < 0
+        is_matched, is_free = np.zeros_like(is_due), np.ones_like(counts)
+        is_matched[pairs.mapped], is_free[pairs.seen] = True, False
+        chosen = (around[is_due], around[is_due & is_matched], ours[counts], ours[counts & is_free])
+        return np.stack([np.bincount(kind, minlength=len(KINDS)) for kind in chosen])
+
+
+def _by_kind(rules: GraphRules, name: str) -> Floats:
+    """Return a number for each kind of node, shape (K,): of these rules for vectors, the starting value for masks.
+
+    Shares of kinds are counted in the view itself, whatever it was drawn from.
+    """
+    value = np.asarray(getattr(rules, name), dtype=np.float64)
+    return value if value.ndim else np.where(_IS_DRAWN, value, getattr(START, name))
 
 
 def _passes(links: dict[int, set[int]], one: int, two: int, *, matched: dict[int, int]) -> bool:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training on views of known place: rates at the true pose, scales of evidence from the modes of a search."""
+"""Training on views of known place: rates and rules at the true pose, weights from the modes of a search."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Final, Self
 
 import numpy as np
@@ -16,14 +17,19 @@ from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
+from sasgeo_bench.sasgeo.graph import START, Matching, match_nodes, verify
+from sasgeo_bench.sasgeo.graph_rules import GraphRules
 from sasgeo_bench.sasgeo.joint import Blend, columns
+from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
+from sasgeo_bench.sasgeo.rule_fitting import ROUNDS, broadened, fit_rules
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel, fit_scaling
 from sasgeo_bench.sasgeo.weights import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import Query, Truth, base_of
 
 MODES: Final = 16  # of each training search
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
@@ -50,8 +56,45 @@ def views_by_map(training: Training) -> ViewsByMap:
     return found
 
 
+def on_maps_of_the_day(views: ViewsByMap, regions: Mapping[str, Region]) -> ViewsByMap:
+    """Move views on an older map to the map of their own day, and drop those for which there is none.
+
+    Only the map changes: view, prior and true pose are the same, so that training with and without old maps compares
+    the same views. The pose holds, since all dates of a region have one coordinate system; cells of the view that the
+    other map does not cover count as unknown. A view and its control on the map of the day may be equal then, and
+    count twice.
+
+    Raises
+    ------
+    ConfigError
+        If no view is left.
+    """
+    found: dict[str, list[tuple[Query, Truth]]] = {}
+    for name, some in views.items():
+        for query, truth in some:
+            fresh = _map_of_the_day(name, query, regions)
+            if fresh is not None:
+                found.setdefault(fresh, []).append((replace(query, region=fresh), truth))
+    if not found:
+        message = "no training view has a map of its own day: name suites such as clean beside real-age"
+        raise ConfigError(message)
+    return found
+
+
+def _map_of_the_day(name: str, query: Query, regions: Mapping[str, Region]) -> str | None:
+    """Return the map of a name with another date or none: the view's own day; None if there is no such map."""
+    dated, plus, edits = name.partition("+")
+    if "@" not in dated:
+        return name
+    base = base_of(name)
+    for fresh in (f"{base}@{query.observed_on.isoformat()}{plus}{edits}", f"{base}{plus}{edits}"):
+        if fresh in regions and regions[fresh].manifest.extract.date == query.observed_on:
+            return fresh
+    return None
+
+
 def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -> ScorerModel:
-    """Fit rates, likeness, scales of evidence and weights of the joint score for the classes of the maps.
+    """Fit the numbers of the scorer: weights of classes if the ablation learns them, rules and weight of the graph.
 
     Raises
     ------
@@ -59,6 +102,26 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         If no view lies on its map, or maps have different classes.
     """
     views = views_by_map(training)
+    if not switches.learns_from_old:
+        views = on_maps_of_the_day(views, training.regions)
+    model = _fit_classes(training, views, switches) if switches.learns else _even(training, views)
+    lists: list[_ScoredModes] = []
+    for name, some in views.items():
+        reader = Reader.of(training.regions[name], model, replace(switches, has_graph=False))
+        lists += [_list(query, _pose(truth), reader, plan or Plan()) for query, truth in some]
+    lists = [one for one in lists if len(one.by_class) > 1]
+    if not lists:
+        return model
+    if switches.learns:
+        model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
+    if not switches.has_graph:
+        return model
+    model = replace(model, rules=_fit_rules(lists, training.regions))
+    return replace(model, blend=_fit_blend(lists, model, training.regions))
+
+
+def _fit_classes(training: Training, views: ViewsByMap, switches: Switches) -> ScorerModel:
+    """Fit rates, likeness, seasons and trust of classes."""
     tallies: dict[str, list[Tally]] = {"": []}
     stamps: list[StampTally] = []
     for name, some in views.items():
@@ -67,35 +130,59 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         for query, truth in some:
             tallies.setdefault(query.season, []).append(_tally(query, truth, region, switches))
     model = ScorerModel.of(tallies)
-    if switches.is_stamped:
-        model = replace(model, trust=fit_trust(stamps))
-    lists = []
-    for name, some in views.items():
-        reader = Reader.of(training.regions[name], model, switches)
-        lists += [_list(query, _pose(truth), reader, plan or Plan()) for query, truth in some]
-    lists = [one for one in lists if len(one.by_class) > 1]
-    if not lists:
-        return model
-    model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
-    return replace(model, blend=_fit_blend(lists, model.scaling)) if switches.has_graph else model
+    return replace(model, trust=fit_trust(stamps)) if switches.is_stamped else model
+
+
+def _even(training: Training, views: ViewsByMap) -> ScorerModel:
+    """Return the model set by hand for the classes of the maps."""
+    truths = [truth for some in views.values() for _, truth in some]
+    model = ScorerModel.by_hand(training.regions[next(iter(views))].classes)
+    return replace(model, views=len(truths), blocks=len({truth.block for truth in truths}))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _ScoredModes:
-    """Scores of the right place, first, and of the wrong modes of a search: by class, of the graph, and its nodes."""
+    """The right place of a query, first, and the wrong modes of its search, with their scores by class."""
 
+    query: Query
+    poses: Sequence[Pose]
     by_class: NDArray[np.float64]
-    graph: NDArray[np.float64] | None
-    nodes: int
 
 
-def _fit_blend(lists: Sequence[_ScoredModes], scaling: NDArray[np.float64]) -> Blend:
+Graphs = Iterator[tuple[_ScoredModes, ObservedGraph, MappedGraph]]
+
+
+def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Graphs:
+    """Yield graphs of views and of their maps, one map after the other."""
+    for name, some in groupby(lists, key=lambda one: one.query.region):
+        mapped = MappedGraph.of(regions[name])
+        for one in some:
+            yield one, ObservedGraph.of(one.query), mapped
+
+
+def _fit_rules(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> GraphRules:
+    """Estimate the rules of the graph from views with vectors; without any, the starting values hold."""
+    drawn = [one for one in lists if one.query.vectors is not None]
+    rules = START
+    for _ in range(ROUNDS if drawn else 0):
+        right: list[Matching] = []
+        wrong: list[Matching] = []
+        for one, seen, mapped in _graphs(drawn, regions):
+            first, *rest = match_nodes(seen, mapped, one.poses, broadened(rules))
+            right.append(first)
+            wrong += rest
+        rules = fit_rules(right, wrong)
+    return rules
+
+
+def _fit_blend(lists: Sequence[_ScoredModes], model: ScorerModel, regions: Mapping[str, Region]) -> Blend:
     """Fit the weights of the joint score by the same logit, with fixed scales of evidence."""
-    terms = [
-        columns(one.by_class * scaling, one.graph, Blend(alpha=1.0, beta=1.0, eta=1.0), nodes=one.nodes)
-        for one in lists
-    ]
-    sums = [np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:])) for rows in terms]
+    sums = []
+    even = Blend(alpha=1.0, beta=1.0, eta=1.0)
+    for one, seen, mapped in _graphs(lists, regions):
+        graph = np.array([found.score for found in verify(seen, mapped, one.poses, model.rules)])
+        rows = columns(one.by_class * model.scaling, graph, even, nodes=len(seen.nodes))
+        sums.append(np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:])))
     alpha, beta, eta = fit_scaling(sums, start=(1.0, Blend().beta, Blend().eta)).tolist()
     return Blend(alpha=alpha, beta=beta, eta=eta)
 
@@ -176,7 +263,4 @@ def _list(query: Query, pose: Pose, reader: Reader, plan: Plan) -> _ScoredModes:
     here = (pose.easting_m, pose.northing_m)
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]
-    verified = reading.verified(poses)
-    graph = None if verified is None else np.array([one.score for one in verified])
-    nodes = 0 if graph is None else len(reading.observed.nodes)
-    return _ScoredModes(by_class=reading.by_class(poses), graph=graph, nodes=nodes)
+    return _ScoredModes(query=query, poses=poses, by_class=reading.by_class(poses))

@@ -3,19 +3,27 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from functools import cache
+from typing import TYPE_CHECKING, Final, Self
 
 import cv2
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
 from sasgeo_bench.sasgeo.weights import STRATA, Gains, strata, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
+from sasgeo_bench.tasks.vectors import as_features
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 THIN: Final = frozenset(
     {"road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"}
@@ -105,6 +113,54 @@ def doubted(evidence: Evidence) -> Evidence:
     return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
 
 
+def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
+    """Burn perceived vectors on the cells of a view, in the classes that both have; None where they share none.
+
+    Lines have the width of their class (`line_width_m`), areas are areas, and a cell holds what covers its centre, as
+    on a map. Cells that are unknown in the view stay unknown.
+
+    Examples
+    --------
+    >>> import shapely
+    >>> from sasgeo_bench.tasks.vectors import vector_table
+    >>> house = vector_table([("building", 0, False, shapely.box(-2, -1, 0, 1))])
+    >>> cells = np.array([[[0, 0, 0, 2]] * 2], dtype=np.uint8)
+    >>> burnt(house, Evidence(classes=("building",), cells=cells, cell_size_m=1.0)).cells.tolist()
+    [[[1, 1, 0, 2], [1, 1, 0, 2]]]
+    """
+    names = tuple(name for name in evidence.classes if (vectors["class"] == name).any())
+    if not names:
+        return None
+    (rows, cols), (width_m, height_m) = evidence.shape, evidence.size_m
+    cell_m = evidence.cell_size_m
+    grid = Grid(epsg=0, west_m=-width_m / 2, north_m=height_m / 2, cell_size_m=cell_m, rows=rows, cols=cols)
+    features = as_features(vectors)
+    is_line = features["width_m"].notna().to_numpy()
+    features.loc[is_line, "width_m"] = [line_width_m(name) for name in features.loc[is_line, "class"]]
+    view = shapely.box(*grid.bounds_m)
+    cells = burn_layers(make_paint(features, names, view), grid)
+    unknown = np.stack([evidence.layer(name) == UNKNOWN for name in names])
+    return Evidence(classes=names, cells=np.where(unknown, np.uint8(UNKNOWN), cells), cell_size_m=cell_m)
+
+
+@cache
+def line_width_m(class_name: str) -> float:
+    """Return the median width of the lines of a class in the taxonomy, metres; 0 for a class without lines.
+
+    Vectors name a class and no tag, so the widths by tag value are not at hand.
+
+    Examples
+    --------
+    >>> line_width_m("road_minor"), line_width_m("railway")
+    (5.0, 3.25)
+    """
+    known = load_taxonomy()
+    if class_name not in known.names:
+        return 0.0
+    widths_m = [width_m for rule in known[class_name].rules for width_m in rule.widths.values()]
+    return float(np.median(widths_m)) if widths_m else 0.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class RasterView:
     """A view weighed by gains, in the classes of a map: factors of layers and of known cells, shape (C, rows, cols)."""
@@ -147,6 +203,14 @@ class RasterView:
         """Return the view with the score of each class scaled."""
         scale = scaling.astype(np.float32)[:, None, None]
         return replace(self, weights=self.weights * scale, known=self.known * scale)
+
+    def halved_with(self, other: Self, classes: Sequence[bool]) -> Self:
+        """Return the mean of two views in some classes, shape (C,), and their sum in the rest.
+
+        Where both show a class, each counts half: together they weigh as much as one.
+        """
+        share = np.where(classes, 0.5, 1.0).astype(np.float32)[:, None, None]
+        return replace(self, weights=share * (self.weights + other.weights), known=share * (self.known + other.known))
 
     def times(self, weight: NDArray[np.float32] | np.float32) -> Self:
         """Return the view with cells times a weight, or times weights of shape (rows, cols): w of Eq. 8."""

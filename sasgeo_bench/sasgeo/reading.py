@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
-from sasgeo_bench.regions.evidence import PRESENT
+from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import Rarity
@@ -22,7 +22,7 @@ from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import RasterView, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.raster import RasterView, burnt, doubted, likeness_by_hand, read_field
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -232,10 +232,23 @@ class Reading:
         """Return the view weighed by gains per square metre, so that scales of evidence hold for any cell size."""
         reader, seen = self.reader, self.reader.switches.seen(self.query.evidence)
         gains = reader.switches.gains(reader.model, age_years=self.age_years, season=self.query.season)
-        view = RasterView.of(seen, reader.region.classes, gains).times(np.float32(seen.cell_size_m**2))
+        view = RasterView.of(seen, reader.region.classes, gains)
+        drawn = self._burnt()
+        if drawn is not None:
+            both = [name in drawn.classes for name in reader.region.classes]
+            view = view.halved_with(RasterView.of(drawn, reader.region.classes, gains), both)
+        view = view.times(np.float32(seen.cell_size_m**2))
         if reader.rarity is None:
             return view
         return view.times(reader.rarity.weights(seen.cells, seen.classes, cell_size_m=seen.cell_size_m))
+
+    def _burnt(self) -> Evidence | None:
+        """Return the perceived vectors as a raster view, if the ablation reads them and there are any."""
+        vectors = self.query.vectors
+        if vectors is None or not self.reader.switches.burns_vectors:
+            return None
+        drawn = burnt(vectors, self.query.evidence)
+        return None if drawn is None else doubted(drawn)
 
     @cached_property
     def template(self) -> Template:
@@ -262,7 +275,8 @@ class Reading:
 
     def verified(self, poses: Sequence[Pose]) -> list[GraphScore] | None:
         """Return scores of Eq. 9, if the ablation has a graph."""
-        return None if self.reader.graph is None else verify(self.observed, self.reader.graph, poses)
+        reader = self.reader
+        return None if reader.graph is None else verify(self.observed, reader.graph, poses, reader.model.rules)
 
     def terms(self, poses: Sequence[Pose], verified: Sequence[GraphScore] | None) -> NDArray[np.float64]:
         """Return terms of Eq. 11 of each pose: see `joint.columns`."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.sasgeo.graph_rules import GraphRules
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share
@@ -74,7 +75,7 @@ def fit_scaling(
     return np.asarray(np.exp(found.x))
 
 
-VERSION: Final = 1  # of the text
+VERSION: Final = 2  # of the text
 _DIGITS: Final = 6
 # Arrays of one class in the file, with their shapes.
 _ARRAYS: Final[Mapping[str, tuple[int, ...]]] = {
@@ -94,7 +95,8 @@ class ScorerModel:
     the share of `Gains.missed` for one degree of it. `scaling`, shape (C,), scales the score of each class, since
     neighbouring cells are not independent (`temper` in the file). `trust`, shape (C, STRATA), is that in features by
     edit age (`weights.fit_trust`); `seasons` the visible share of a mapped class, shape (C,), by season; `blend`
-    weighs the joint score. `views` and `blocks` are the size of the training data, 0 for a model set by hand.
+    weighs the joint score, and `rules` are those of the graph of vectors. `views` and `blocks` are the size of the
+    training data, 0 for a model set by hand.
     """
 
     classes: tuple[str, ...]
@@ -105,6 +107,7 @@ class ScorerModel:
     trust: NDArray[np.float64]
     seasons: Mapping[str, NDArray[np.float64]]
     blend: Blend = Blend()  # noqa: RUF009 - frozen
+    rules: GraphRules = GraphRules()  # noqa: RUF009 - frozen
     views: int = 0
     blocks: int = 0
 
@@ -187,9 +190,9 @@ class ScorerModel:
             f" {json.dumps(name)}: {json.dumps(_rounded(asdict(self.rates[at]) | self._shape(at)))}"
             for at, name in enumerate(self.classes)
         ]
-        blend = json.dumps(_rounded(asdict(self.blend)))
+        blend, rules = (json.dumps(_rounded(stored)) for stored in (asdict(self.blend), self.rules.to_stored()))
         counts = f'"views": {self.views}, "blocks": {self.blocks}'
-        head = f'{{"version": {VERSION}, {counts}, "blend": {blend}, "classes": {{'
+        head = f'{{"version": {VERSION}, {counts}, "blend": {blend},\n "graph": {rules}, "classes": {{'
         return "\n".join((head, ",\n".join(rows), "}}"))
 
     def _shape(self, at: int) -> dict[str, Any]:
@@ -223,6 +226,7 @@ class ScorerModel:
                 seasons=dict(zip(SEASONS, seasons.T, strict=True)),
                 **arrays,
                 blend=Blend(**stored["blend"]),
+                rules=GraphRules.from_stored(stored["graph"]),
                 views=int(stored["views"]),
                 blocks=int(stored["blocks"]),
             )
@@ -247,5 +251,7 @@ def _rounded(values: dict[str, Any]) -> dict[str, Any]:
     return {name: _short(value) for name, value in values.items()}
 
 
-def _short(value: float | Iterable[float]) -> Any:  # noqa: ANN401 - whatever JSON holds
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else [_short(one) for one in value]
+def _short(value: float | Mapping[str, float] | Iterable[float]) -> Any:  # noqa: ANN401 - whatever JSON holds
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}")
+    return _rounded(dict(value)) if isinstance(value, Mapping) else [_short(one) for one in value]

@@ -70,7 +70,7 @@ class SasgeoMatcher:
 
 
 class LearningMatcher(SasgeoMatcher):
-    """The scorer with fitted weights."""
+    """The scorer with what it learns from train places."""
 
     def learn(self, training: Training) -> str:
         """Fit the model to views of known place."""
@@ -141,15 +141,22 @@ _OURS: Final = (
 _EVEN: Final = "gains of 1 for all classes (Eq. 7), distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for lines"
 _GRAPH: Final = (
     "correspondences by assignment within a gate and relations of matched nodes (Eq. 9), on the list of modes that the "
-    "raster found; nodes of perceived vectors, or of the thinned mask where there are none; likelihood ratios set by "
-    "hand, weights of raster, graph and contradiction (Eq. 11) {how}"
+    "raster found; nodes of perceived vectors, or of the thinned mask where there are none; tolerances and likelihood "
+    "ratios of nodes, weights of raster, graph and contradiction (Eq. 11) {how}"
 )
 _FITTED: Final = (
     "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "
     "class is like being on it, and an exponent for each class by conditional logit; all learnt on train places"
 )
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
-_GRAPH_FITTED: Final = _GRAPH.format(how="learnt")
+_GRAPH_FITTED: Final = _GRAPH.format(
+    how="learnt from train places: the rules of nodes by their plain statistics at true and wrong poses, from views with "
+    "vectors; without such views, and for nodes of masks, those set by hand hold"
+)
+_FRESH: Final = (
+    "training views on older maps are moved to the map of their own day, and dropped where there is none: with "
+    "`sasgeo` and `sasgeo_ageless` it crosses having learnt from old maps with knowing the age"
+)
 _BLIND: Final = "what is unknown counts as absent, as in all variants of the paper but its last"
 _SILENT: Final = "what is unknown says nothing"
 _LIMITS: Final = (
@@ -179,10 +186,34 @@ class SasgeoRaster(SasgeoMatcher):
     switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
 
 
-class SasgeoGraph(SasgeoMatcher):
-    """Raster and graph."""
+class SasgeoRasterVectors(SasgeoMatcher):
+    """Raster alone, uniform weights, that sees the perceived vectors too."""
 
-    card = _card("sasgeo_graph", "SASGeo: raster and graph", "Eqs. 7-9, 11", _EVEN, _GRAPH_BY_HAND, _BLIND)
+    card = _card(
+        "sasgeo_raster_vectors",
+        "SASGeo: raster, with perceived vectors burnt in",
+        "Eqs. 7-8",
+        _EVEN,
+        "perceived vectors burnt as a second view, lines in the median width of their class; where layers and vectors "
+        "both show a class, each counts half: the rival of the graph with the same sensor",
+        _BLIND,
+        limits=f"of vectors it reads where they lie, not how they connect or pass over each other; {_LIMITS}",
+    )
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True)
+
+
+class SasgeoGraph(LearningMatcher):
+    """Raster and graph; it learns the rules of the graph and the weights of Eq. 11, its raster stays uniform."""
+
+    card = _card(
+        "sasgeo_graph",
+        "SASGeo: raster and graph",
+        "Eqs. 7-9, 11",
+        _EVEN,
+        _GRAPH_FITTED,
+        _BLIND,
+        limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
+    )
     switches = Switches(weights="even", is_unknown_silent=False)
 
 
@@ -246,12 +277,47 @@ class SasgeoAgeless(LearningMatcher):
         "SASGeo without the age of the map",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights",
+        "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights; its exponents "
+        "are learnt on old maps too",
         _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,
     )
     switches = Switches(knows_age=False)
+
+
+class SasgeoFresh(LearningMatcher):
+    """The whole scorer, trained on maps of the day only."""
+
+    card = _card(
+        "sasgeo_fresh",
+        "SASGeo trained without old maps",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _FRESH,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=f"its rates of vanishing and appearing are those set by hand, which no map of the day can teach; "
+        f"{_UNTAUGHT}",
+    )
+    switches = Switches(learns_from_old=False)
+
+
+class SasgeoFreshAgeless(LearningMatcher):
+    """The whole scorer, trained on maps of the day only, without the age of the map."""
+
+    card = _card(
+        "sasgeo_fresh_ageless",
+        "SASGeo trained without old maps, without the age of the map",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _FRESH,
+        "every map is weighed as one of today is",
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=f"knows nothing of ageing; {_UNTAUGHT}",
+    )
+    switches = Switches(learns_from_old=False, knows_age=False)
 
 
 class SasgeoStamped(LearningMatcher):

@@ -115,11 +115,11 @@ def degree_step(seen: Ints, mapped: Ints) -> Ints:
 def by_area(seen_m2: Floats, mapped_m2: Floats, rules: GraphRules) -> Floats:
     """Return the ratios of equal against unrelated areas; 0 where there are none, shape (P,)."""
     off = np.log(seen_m2 / mapped_m2)
+    has_both = np.isfinite(off)
+    off = np.where(has_both, off, 0.0)
     spread = 2**0.5 * rules.area_spread
-    right = np.exp(-(off**2) / (2 * rules.area_sigma**2)) / rules.area_sigma
-    chance = np.exp(-(off**2) / (2 * spread**2)) / spread
-    ratio = np.log((1 - rules.wander) * right + rules.wander * chance) - np.log(chance)
-    return np.where(np.isfinite(ratio), ratio, 0.0)
+    right = np.log(spread / rules.area_sigma) + off**2 / 2 * (1 / spread**2 - 1 / rules.area_sigma**2)
+    return np.where(has_both, np.logaddexp(np.log1p(-rules.wander) + right, np.log(rules.wander)), 0.0)
 
 
 def by_arms(seen_deg: Floats, mapped_deg: Floats, rules: GraphRules) -> Floats:

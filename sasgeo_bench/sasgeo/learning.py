@@ -4,6 +4,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby
 from typing import Final, Self
 
@@ -148,16 +149,18 @@ class _ScoredModes:
     poses: Sequence[Pose]
     by_class: NDArray[np.float64]
 
+    @cached_property
+    def seen(self) -> ObservedGraph:
+        """Return the graph of the view."""
+        return ObservedGraph.of(self.query)
 
-Graphs = Iterator[tuple[_ScoredModes, ObservedGraph, MappedGraph]]
 
-
-def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Graphs:
-    """Yield graphs of views and of their maps, one map after the other."""
+def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Iterator[tuple[_ScoredModes, MappedGraph]]:
+    """Yield searches with the graphs of their maps, one map after the other."""
     for name, some in groupby(lists, key=lambda one: one.query.region):
         mapped = MappedGraph.of(regions[name])
         for one in some:
-            yield one, ObservedGraph.of(one.query), mapped
+            yield one, mapped
 
 
 def _fit_rules(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> GraphRules:
@@ -167,8 +170,8 @@ def _fit_rules(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> 
     for _ in range(ROUNDS if drawn else 0):
         right: list[Matching] = []
         wrong: list[Matching] = []
-        for one, seen, mapped in _graphs(drawn, regions):
-            first, *rest = match_nodes(seen, mapped, one.poses, broadened(rules))
+        for one, mapped in _graphs(drawn, regions):
+            first, *rest = match_nodes(one.seen, mapped, one.poses, broadened(rules))
             right.append(first)
             wrong += rest
         rules = fit_rules(right, wrong)
@@ -179,9 +182,9 @@ def _fit_blend(lists: Sequence[_ScoredModes], model: ScorerModel, regions: Mappi
     """Fit the weights of the joint score by the same logit, with fixed scales of evidence."""
     sums = []
     even = Blend(alpha=1.0, beta=1.0, eta=1.0)
-    for one, seen, mapped in _graphs(lists, regions):
-        graph = np.array([found.score for found in verify(seen, mapped, one.poses, model.rules)])
-        rows = columns(one.by_class * model.scaling, graph, even, nodes=len(seen.nodes))
+    for one, mapped in _graphs(lists, regions):
+        graph = np.array([found.score for found in verify(one.seen, mapped, one.poses, model.rules)])
+        rows = columns(one.by_class * model.scaling, graph, even, nodes=len(one.seen.nodes))
         sums.append(np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:])))
     alpha, beta, eta = fit_scaling(sums, start=(1.0, Blend().beta, Blend().eta)).tolist()
     return Blend(alpha=alpha, beta=beta, eta=eta)

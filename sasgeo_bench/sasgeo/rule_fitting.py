@@ -21,7 +21,8 @@ WEIGHT: Final = 30.0  # observations that a starting value counts as
 INSIDE: Final = 0.95  # share of right matches that gate and common shift leave room for
 OUTLYING: Final = 3.0  # standard deviations
 _BROAD: Final = 2.0  # of gate and offsets while rules are estimated
-_LEAST: Final = 0.01  # of a share, and of a standard deviation in units of its starting value
+_LEAST_SHARE: Final = 0.01  # and most, 1 less it
+_LEAST: Final = 0.1  # of a statistic, in units of its starting value: vectors are rounded to a decimetre
 _BINS: Final = 4  # of distances between neighbours
 _NORMAL: Final = 1.4826  # standard deviation over median deviation
 _RAYLEIGH_2: Final = 2 * np.log(2)  # median of a squared length over the variance of each axis
@@ -37,8 +38,9 @@ def fit_rules(right: Sequence[Matching], wrong: Sequence[Matching]) -> GraphRule
 
     Standard deviations are robust (1.48 median deviations), gate and common shift quantiles, ratios of degrees and
     links the logarithms of their frequencies at right poses over those at wrong ones, hits and extra nodes frequencies.
-    Strain is the line through median squared strains against squared distances. `area_spread` is that of mapped areas,
-    `stretch_m` the median distance of neighbours, `edge_weight` matched nodes for each pair of them.
+    Strain is the line through median squared strains against squared distances. `area_spread` is the plain standard
+    deviation of mapped areas, `stretch_m` the median distance of neighbours, `edge_weight` matched nodes for each pair
+    of them, `wander` the share of offsets beyond three standard deviations.
     """
     offset_m, areas, edges = (np.concatenate([getattr(one, name) for one in right]) for name in _POINTS)
     length_m, arms_deg = np.hypot(*offset_m.T), np.concatenate([one.arms_deg for one in right])
@@ -56,7 +58,7 @@ def fit_rules(right: Sequence[Matching], wrong: Sequence[Matching]) -> GraphRule
         wander=_share(far, len(length_m), START.wander),
         arm_sigma_deg=_spread(arms_deg, START.arm_sigma_deg),
         area_sigma=_spread(areas[:, 0] - areas[:, 1], START.area_sigma),
-        area_spread=_spread(areas[:, 1] - _median(areas[:, 1]), START.area_spread),
+        area_spread=_mixed(float(areas[:, 1].std()) if len(areas) else 0.0, START.area_spread, len(areas)),
         degrees=_ratios([one.degrees for one in right], [one.degrees for one in wrong], START.degrees),
         edge_sigma_m=constant_m,
         edge_strain=strain,
@@ -93,7 +95,7 @@ def _spread(values: Floats, start: float) -> float:
 
 
 def _share(count: int, total: int, start: float) -> float:
-    return float(np.clip((count + WEIGHT * start) / (total + WEIGHT), _LEAST, 1 - _LEAST))
+    return float(np.clip((count + WEIGHT * start) / (total + WEIGHT), _LEAST_SHARE, 1 - _LEAST_SHARE))
 
 
 def _kinds(counts: Ints) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -150,8 +150,8 @@ _FITTED: Final = (
 )
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
 _GRAPH_FITTED: Final = _GRAPH.format(
-    how="learnt from train places: the rules of nodes by their plain statistics at true and wrong poses, from views with "
-    "vectors; without such views, and for nodes of masks, those set by hand hold"
+    how="learnt from train places: the rules of nodes by their plain statistics at true and wrong poses, from views "
+    "with vectors; without such views, and for nodes of masks, those set by hand hold"
 )
 _FRESH: Final = (
     "training views on older maps are moved to the map of their own day, and dropped where there is none: with "
@@ -277,8 +277,8 @@ class SasgeoAgeless(LearningMatcher):
         "SASGeo without the age of the map",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights; its exponents "
-        "are learnt on old maps too",
+        "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights; its "
+        "exponents are learnt on old maps too",
         _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,

@@ -26,7 +26,7 @@ ROADS: Final = tuple(name for name, layer in LAYERS.items() if layer == ROAD)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeKind:
-    """A kind of node, its source, and probabilities set by hand.
+    """A kind of node, its source, and probabilities to start from.
 
     A node can be missed only where `classes` are known; `hit` is the probability that a visible map node is seen,
     `extra` the share of seen nodes that no map has, `spread_m` the standard deviation of its centre.
@@ -47,8 +47,9 @@ def _kind(name: str, drawing: Drawing, classes: tuple[str, ...], *chances: float
 
 _RAIL: Final = (*ROADS, "railway")
 _WATER: Final = (*ROADS, "waterway")
-# Vectors show connections and separate houses; a mask shows neither, so its nodes have kinds of their own. A detector
-# misses a tenth of the ways; where it misses one of two, there is no junction, and new ends appear.
+# Vectors show connections and separate houses; a mask shows neither, so its nodes have kinds of their own. A junction
+# is seen only where all its roads are, and a road that is missed leaves new ends: crossings are hit less often than
+# houses, and ends are often extra. These are guesses to start from (`rule_fitting`).
 KINDS: Final = (
     _kind("intersection", "vectors", ROADS, 0.75, 0.08),
     _kind("dead_end", "vectors", ROADS, 0.7, 0.5),

@@ -102,7 +102,7 @@ def _is_spur(lines: NDArray[np.object_]) -> NDArray[np.bool_]:
 
 MARGIN_M: Final = 8.0  # along the border of known cells, where objects may be cut
 NEAR_M: Final = 80.0  # neighbours whose relative places are compared
-BRIDGED_M: Final = 7.0  # facing ends of a road within this distance are a gap of the detector
+BRIDGED_M: Final = 7.0  # facing ends of roads within this distance are one road: as far as a street is wide
 LEAST_M2: Final = 12.0  # smaller patches are noise
 _FACING_DEG: Final = 30.0
 _MOSTLY: Final = 0.9  # of the cells around a place
@@ -205,13 +205,13 @@ def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
 
 
 def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Return vectors with gaps of the detector closed: between facing ends of roads within 7 m."""
+    """Return vectors with facing ends of roads within 7 m joined: a road that a detector broke is one road."""
     features = as_features(vectors)
     network = make_network(features[features["class"].isin(list(LAYERS)).to_numpy()])
     free = np.flatnonzero(network.degree(ROAD) == 1)
     places_m = network.vertices[free]
     arm_deg = arms_of(features, places_m)[:, 0]
-    if len(free) < 2:  # noqa: PLR2004 - a gap has two ends
+    if len(free) < 2:  # noqa: PLR2004 - a join has two ends
         return vectors
     pairs = cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
     ahead_deg = bearing_deg(*(places_m[pairs[:, 1]] - places_m[pairs[:, 0]]).T)

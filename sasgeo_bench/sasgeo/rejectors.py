@@ -73,7 +73,7 @@ def _evidence(answer: Prediction, item: Diagnostic) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """Medians, flags, means and spreads of calibration, which turn raw features into rows without gaps."""
+    """Medians, flags, means and spreads of calibration, which turn raw features into complete rows."""
 
     medians: NDArray[np.float64]
     is_flagged: NDArray[np.bool_]
@@ -112,7 +112,7 @@ _FOLDS: Final = 4
 _PER_TREE: Final = 500  # answers of one tree at most: more cost time and gain nothing at this depth
 
 
-# From rows of features without gaps, shape (N, F), to log-odds of a false fix, shape (N,).
+# From complete rows of features, shape (N, F), to log-odds of a false fix, shape (N,).
 LogOdds = Callable[[Rows], NDArray[np.float64]]
 
 

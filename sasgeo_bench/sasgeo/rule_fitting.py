@@ -20,7 +20,7 @@ ROUNDS: Final = 2  # the second assigns with what the first found
 WEIGHT: Final = 30.0  # observations that a starting value counts as
 INSIDE: Final = 0.95  # share of right matches that gate and common shift leave room for
 OUTLYING: Final = 3.0  # standard deviations
-_BROAD: Final = 2.0  # of gate and offsets while rules are estimated
+_BROAD: Final = 2.0  # of tolerances while rules are estimated
 _LEAST_SHARE: Final = 0.01  # and most, 1 less it
 _LEAST: Final = 0.1  # of a statistic, in units of its starting value: vectors are rounded to a decimetre
 _BINS: Final = 4  # of distances between neighbours
@@ -29,8 +29,16 @@ _RAYLEIGH_2: Final = 2 * np.log(2)  # median of a squared length over the varian
 
 
 def broadened(rules: GraphRules) -> GraphRules:
-    """Return rules that let nodes match from farther off, so that estimates are not cut by an earlier gate."""
-    return replace(rules, gate_m=_BROAD * rules.gate_m, place_sigma_m=_BROAD * rules.place_sigma_m)
+    """Return rules for matching nodes while rules are estimated.
+
+    Tolerances are twice as broad, so that estimates are not cut by an earlier gate, and degrees say nothing: else nodes
+    of wrong places would be matched where their degrees agree, and agreement would look common there.
+    """
+    return replace(
+        rules,
+        degrees=(0.0,) * len(rules.degrees),
+        **{name: _BROAD * getattr(rules, name) for name in ("gate_m", "place_sigma_m", "arm_sigma_deg", "area_sigma")},
+    )
 
 
 def fit_rules(right: Sequence[Matching], wrong: Sequence[Matching]) -> GraphRules:

@@ -23,6 +23,7 @@ OUTLYING: Final = 3.0  # standard deviations
 _BROAD: Final = 2.0  # of tolerances while rules are estimated
 _LEAST_SHARE: Final = 0.01  # and most, 1 less it
 _LEAST: Final = 0.1  # of a statistic, in units of its starting value: vectors are rounded to a decimetre
+_TOLERANCES: Final = ("gate_m", "place_sigma_m", "arm_sigma_deg", "area_sigma")
 _BINS: Final = 4  # of distances between neighbours
 _NORMAL: Final = 1.4826  # standard deviation over median deviation
 _RAYLEIGH_2: Final = 2 * np.log(2)  # median of a squared length over the variance of each axis
@@ -31,14 +32,12 @@ _RAYLEIGH_2: Final = 2 * np.log(2)  # median of a squared length over the varian
 def broadened(rules: GraphRules) -> GraphRules:
     """Return rules for matching nodes while rules are estimated.
 
-    Tolerances are twice as broad, so that estimates are not cut by an earlier gate, and degrees say nothing: else nodes
-    of wrong places would be matched where their degrees agree, and agreement would look common there.
+    Tolerances are twice as broad as the starting values and these rules: else each round would match fewer nodes that
+    are off, and narrow the next. Degrees say nothing: else nodes of wrong places would be matched where their degrees
+    agree, and agreement would look common there.
     """
-    return replace(
-        rules,
-        degrees=(0.0,) * len(rules.degrees),
-        **{name: _BROAD * getattr(rules, name) for name in ("gate_m", "place_sigma_m", "arm_sigma_deg", "area_sigma")},
-    )
+    wide = {name: _BROAD * max(getattr(rules, name), getattr(START, name)) for name in _TOLERANCES}
+    return replace(rules, degrees=(0.0,) * len(rules.degrees), **wide)
 
 
 def fit_rules(right: Sequence[Matching], wrong: Sequence[Matching]) -> GraphRules:
@@ -128,8 +127,16 @@ def _strain(edges: Floats) -> tuple[float, float]:
 
 
 def _ratios(right: Sequence[Ints], wrong: Sequence[Ints], start: Sequence[float]) -> tuple[float, ...]:
-    """Return log ratios of the frequencies of some outcomes, right over wrong, mixed with starting values."""
-    here, there = (np.sum([*counts, np.zeros(len(start))], axis=0) + 1.0 for counts in (right, wrong))
+    """Return log ratios of the frequencies of some outcomes, right over wrong, mixed with starting values.
+
+    One observation of each outcome is shared out by the totals, so that what was never seen has ratio 0. A ratio counts
+    by its precision, a starting value as known to within one nat.
+    """
+    here, there = (np.sum([*counts, np.zeros(len(start))], axis=0) for counts in (right, wrong))
+    if not (here.sum() and there.sum()):
+        return tuple(start)
+    total = here.sum() + there.sum()
+    here, there = here + here.sum() / total, there + there.sum() / total
     found = np.log(here / here.sum()) - np.log(there / there.sum())
-    count = min(here.sum(), there.sum()) - len(start)
-    return tuple(((count * found + WEIGHT * np.array(start)) / (count + WEIGHT)).tolist())
+    precision = here * there / (here + there)
+    return tuple(((precision * found + np.array(start)) / (precision + 1)).tolist())

@@ -84,8 +84,8 @@ _LINKS: Final = (START.link, START.false_link, START.lost_link)
 
 def _mixed(found: float, start: float, count: int) -> float:
     """Return a positive statistic of so many observations, mixed with its starting value by logarithms."""
-    found = max(found, _LEAST * start)
-    return float(np.exp((count * np.log(found) + WEIGHT * np.log(start)) / (count + WEIGHT)))
+    ratio = max(found / start, _LEAST)
+    return start * float(ratio ** (count / (count + WEIGHT)))
 
 
 def _median(values: Floats) -> float:

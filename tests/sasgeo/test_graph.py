@@ -12,7 +12,8 @@ from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.sasgeo.graph import GraphRules, GraphScore, by_area, by_arms, by_degree, verify
+from sasgeo_bench.sasgeo.graph import GraphScore, verify
+from sasgeo_bench.sasgeo.graph_rules import GraphRules, by_area, by_arms, by_degree
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
@@ -216,6 +217,18 @@ def test_a_bent_view_keeps_its_place_while_its_cells_miss_the_map(town):
         first += found[0].score > max(one.score for one in found[1:])
     assert first >= 4
     assert np.mean(overlaps) < 0.75
+
+
+def test_learnt_rules_hold_for_vectors_and_starting_values_for_masks(town):
+    state, mapped = town
+    rng = np.random.default_rng(3)
+    here, poses = next(places(state, rng, 1))
+    view = state.view(here, size_cells=192, cell_size_m=1.0)
+    vectors = perceive_vectors(state, here, side_m=192.0, noise=EXACT, rng=rng)
+    strict = GraphRules(place_sigma_m=1.0, arm_sigma_deg=4.0)
+    drawn, masked = ObservedGraph.make(view, vectors), ObservedGraph.make(view)
+    assert verify(masked, mapped, poses, strict) == verify(masked, mapped, poses)
+    assert verify(drawn, mapped, [here], strict)[0].score > verify(drawn, mapped, [here])[0].score
 
 
 def test_ratios_favour_what_is_alike_and_say_nothing_of_what_is_unknown():

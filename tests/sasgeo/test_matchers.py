@@ -11,6 +11,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_match
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.conformal import PROTECTION
+from sasgeo_bench.sasgeo.graph_rules import GraphRules
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
 from sasgeo_bench.sasgeo.learning import _pose
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
@@ -18,16 +19,20 @@ from sasgeo_bench.sasgeo.variants import (
     Sasgeo,
     SasgeoAgeless,
     SasgeoDistinct,
+    SasgeoFresh,
+    SasgeoFreshAgeless,
     SasgeoGraph,
     SasgeoHand,
     SasgeoNoGraph,
     SasgeoRaster,
+    SasgeoRasterVectors,
     SasgeoStability,
     SasgeoStamped,
 )
 
 ALL = (
     SasgeoRaster,
+    SasgeoRasterVectors,
     SasgeoGraph,
     SasgeoStability,
     Sasgeo,
@@ -35,9 +40,11 @@ ALL = (
     SasgeoDistinct,
     SasgeoStamped,
     SasgeoAgeless,
+    SasgeoFresh,
+    SasgeoFreshAgeless,
     SasgeoNoGraph,
 )
-LEARNERS = {SasgeoStability, Sasgeo, SasgeoDistinct, SasgeoStamped, SasgeoAgeless, SasgeoNoGraph}
+LEARNERS = {*ALL} - {SasgeoRaster, SasgeoRasterVectors, SasgeoHand}
 
 
 def first(tiny, track, **wanted):
@@ -113,6 +120,15 @@ def test_candidates_are_ranked_and_keep_their_places(tiny, whole):
     assert len(match.poses) == len(places)
     assert match.poses[0].easting_m == here.easting_m
     assert abs(match.poses[0].yaw_deg - here.yaw_deg) % 360 < 3.0
+
+
+def test_without_vectors_burning_them_changes_nothing_and_with_them_something(tiny):
+    plain, drawing = (prepared(arm, tiny.region) for arm in (SasgeoRaster, SasgeoRasterVectors))
+    query = next(query for query in tiny.queries if query.vectors is not None and query.track == "localization")
+    for vectors in (None, query.vectors.iloc[:0]):
+        asked = replace(query, vectors=vectors)
+        assert drawing.match(asked, top_k=5) == plain.match(asked, top_k=5)
+    assert drawing.match(query, top_k=5).scores != plain.match(query, top_k=5).scores
 
 
 def test_a_blind_view_is_withheld(tiny, whole):
@@ -193,6 +209,26 @@ def test_what_is_learnt_is_read_back_and_the_same_again(tiny, training):
 def test_the_whole_scorer_learns_weights_of_the_joint_score(training):
     said = ScorerModel.from_text(Sasgeo().learn(training))
     assert said.blend != ScorerModel.by_hand(said.classes).blend
+
+
+def test_the_even_graph_learns_rules_and_blend_alone(tiny):
+    pairs = [
+        (query, truth)
+        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
+        if query.vectors is not None and query.track == "localization" and query.prior.yaw_deg is not None
+    ]
+    said = ScorerModel.from_text(
+        SasgeoGraph().learn(Training(regions={tiny.queries[0].region: tiny.region}, pairs=pairs))
+    )
+    hand = ScorerModel.by_hand(said.classes)
+    assert said.rules != hand.rules
+    assert said.blend != hand.blend
+    assert replace(said, rules=hand.rules, blend=hand.blend, views=0, blocks=0) == hand
+
+
+def test_without_vectors_to_learn_from_the_starting_rules_hold(training):
+    pairs = [(replace(query, vectors=None), truth) for query, truth in training.pairs[:2]]
+    assert ScorerModel.from_text(SasgeoGraph().learn(replace(training, pairs=pairs))).rules == GraphRules()
 
 
 def test_nothing_to_learn_from_is_said(training):

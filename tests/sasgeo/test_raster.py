@@ -5,13 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
+from affine import Affine
+from rasterio.features import rasterize
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.raster import RasterView, doubted, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.raster import RasterView, burnt, doubted, likeness_by_hand, line_width_m, read_field
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.weights import even_gains, likelihood_gains
 from sasgeo_bench.search.field import FULL
 from sasgeo_bench.search.find import score_at, search
+from sasgeo_bench.tasks.vectors import vector_table
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +106,47 @@ def test_exponents_scale_each_class(tiny, field, asked):
     scaling = np.linspace(0.1, 1.0, len(tiny.region.classes))
     parts = view.scaled(scaling).by_class(field, [pose])
     assert parts == pytest.approx(view.by_class(field, [pose]) * scaling, rel=1e-4, abs=1e-3)
+
+
+# Vectors burnt as a view
+
+VECTORS = vector_table(
+    [
+        ("railway", 0, False, shapely.LineString([(-9, -7), (3, 2), (9, 2)])),
+        ("building", 0, False, shapely.Point(1, -3).buffer(4).difference(shapely.Point(1, -3).buffer(1.5))),
+    ]
+)
+BLANK = Evidence(classes=("water", "building", "railway"), cells=np.zeros((3, 20, 20), dtype=np.uint8), cell_size_m=1.0)
+
+
+def test_vectors_are_burnt_by_the_rule_of_gdal_with_the_width_of_their_class():
+    drawn = burnt(VECTORS, BLANK)
+    assert drawn.classes == ("building", "railway")
+    line, house = VECTORS.geometry
+    shapes = {"railway": line.buffer(line_width_m("railway") / 2, quad_segs=2), "building": house}
+    for name, shape in shapes.items():
+        cells = rasterize([shape], out_shape=(20, 20), transform=Affine(1, 0, -10, 0, -1, 10))
+        assert (drawn.layer(name) == cells).all()
+
+
+def test_burnt_vectors_say_nothing_where_the_view_is_unknown_or_lacks_their_class():
+    cells = BLANK.cells.copy()
+    cells[2, :, 10:] = UNKNOWN
+    drawn = burnt(VECTORS, BLANK.replace(cells))
+    assert (drawn.layer("railway")[:, 10:] == UNKNOWN).all()
+    assert (drawn.layer("railway")[:, :10] != UNKNOWN).all()
+    water = Evidence(classes=("water",), cells=BLANK.cells[:1].copy(), cell_size_m=1.0)
+    assert burnt(VECTORS, water) is None
+    assert burnt(vector_table([]), BLANK) is None
+
+
+def test_a_view_beside_itself_weighs_as_much_as_alone(tiny, asked):
+    query, _ = asked[0]
+    view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
+    both = np.ones(len(tiny.region.classes), dtype=bool)
+    assert (view.halved_with(view, both).weights == view.weights).all()
+    assert (view.halved_with(view, both).known == view.known).all()
+    other = replace(view, weights=np.zeros_like(view.weights), known=np.zeros_like(view.known))
+    alone = view.halved_with(other, np.arange(len(both)) == 0)
+    assert (alone.weights[0] == view.weights[0] / 2).all()
+    assert (alone.weights[1:] == view.weights[1:]).all()

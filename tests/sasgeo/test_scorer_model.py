@@ -19,6 +19,19 @@ def learnt(**changes):
     return json.dumps(said)
 
 
+def drawn(**changes):
+    said = json.loads(ScorerModel.by_hand(["water"]).to_text())
+    said["graph"].update(changes)
+    return json.dumps(said)
+
+
+def test_the_rules_of_the_graph_come_back():
+    said = ScorerModel.from_text(drawn(gate_m=7.5, degrees=[0.1, -0.2, -0.3]))
+    assert (said.rules.gate_m, said.rules.degrees) == (7.5, (0.1, -0.2, -0.3))
+    assert ScorerModel.from_text(said.to_text()).rules == said.rules
+    assert said.of_classes(["railway"]).rules == said.rules
+
+
 def test_text_keeps_six_digits_and_comes_back():
     text = learnt(temper=0.00123456789, vanish_per_year=1 / 3)
     first = ScorerModel.from_text(text)
@@ -43,8 +56,13 @@ def test_classes_are_put_in_the_order_of_a_map_and_unknown_ones_are_by_hand():
     [
         ("", "cannot be read"),
         ("[]", "cannot be read"),
-        ('{"version": 1}', "'classes'"),
-        ('{"version": 99, "classes": {}}', "version 99"),
+        ('{"version": 2}', "'classes'"),
+        ('{"version": 1, "classes": {}}', "version 1, this program reads 2"),
+        (drawn(gate_m=-1.0), "gate_m of the graph is out of range"),
+        (drawn(wander=1.0), "wander of the graph is out of range"),
+        (drawn(degrees=[0.0]), "ratios of degrees"),
+        (drawn(hit={}), "cannot be read"),
+        (drawn(colour="red"), "cannot be read"),
         (learnt(temper=-1.0), "negative or not finite"),
         (learnt(temper=float("nan")), "negative or not finite"),
         (learnt(likeness=[1.0, 2.0, 0.0, 0.0, 0.0]), "within 0..1"),

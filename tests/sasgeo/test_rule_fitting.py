@@ -50,7 +50,7 @@ def test_many_nodes_give_the_numbers_they_were_drawn_with():
 
 def test_no_node_leaves_the_starting_values_and_a_few_stay_near_them():
     assert fit_rules([matching(0)], [matching(0)]) == START
-    few = fit_rules([matching(10, sigma_m=0.5)], [])
+    few = fit_rules([matching(3, sigma_m=0.5)], [])
     assert 3.0 < few.place_sigma_m < START.place_sigma_m
 
 

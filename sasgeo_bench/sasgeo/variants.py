@@ -151,7 +151,7 @@ _FITTED: Final = (
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
 _GRAPH_FITTED: Final = _GRAPH.format(
     how="learnt from train places: the rules of nodes by their plain statistics at true and wrong poses, from views "
-    "with vectors; without such views, and for nodes of masks, those set by hand hold"
+    "with vectors; without such views, and for tolerances of nodes of masks, those set by hand hold"
 )
 _FRESH: Final = (
     "training views on older maps are moved to the map of their own day, and dropped where there is none: with "

@@ -303,6 +303,11 @@ class Suite(ABC):
         """Return the name of the map that a variant's queries search."""
         return scene.map.region
 
+    def older(self, scene: Scene) -> tuple[State, ...]:
+        """Return the older maps that queries search: where they show nothing, a view of today asks for nothing."""
+        searched = {self.map_region(scene, variant) for variant in self.usable(scene)}
+        return tuple(state for state in scene.others if state.region in searched)
+
     def tracks(self, variant: Variant) -> tuple[Track, ...]:  # noqa: ARG002
         """Return the tracks of a variant."""
         return self.card.tracks

@@ -63,7 +63,7 @@ def choose_sites(
         suite=suite,
         anchors=suite.anchors(scene),
         known=_Sums.of(scene.map.known),
-        drawn=_Sums.of(scene.map.drawn),
+        drawn=tuple(_Sums.of(state.drawn) for state in (scene.map, *suite.older(scene))),
         seeds=seeds,
         group=group,
     )
@@ -98,7 +98,7 @@ class _Ground:
     suite: Suite
     anchors: NDArray[np.float64] | None
     known: _Sums
-    drawn: _Sums
+    drawn: tuple[_Sums, ...]  # of today's map and of older ones that are searched
     seeds: Seeds
     group: PriorGroup
 
@@ -115,12 +115,12 @@ class _Ground:
             if near is not None:
                 point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * spread_m
             place = (float(point[0]), float(point[1]))
-            density = self._density(point) if block.holds(place) else None
-            if density is None or density < self.suite.card.min_density or not self._is_free(place, found):
+            densities = self._densities(point) if block.holds(place) else None
+            if densities is None or min(densities) < self.suite.card.min_density or not self._is_free(place, found):
                 failed += 1
                 continue
             failed = 0
-            yield Site(index=len(found), pose=self._pose(place), block=block.id, density=density)
+            yield Site(index=len(found), pose=self._pose(place), block=block.id, density=densities[0])
 
     def _near(self, block: Block) -> NDArray[np.float64] | None:
         if self.anchors is None:
@@ -129,13 +129,14 @@ class _Ground:
         x, y = self.anchors.T
         return np.asarray(self.anchors[(x >= west) & (x < east) & (y >= south) & (y < north)])
 
-    def _density(self, point: NDArray[np.float64]) -> float | None:
-        """Return the fraction of drawn cells in the main view; None unless all that a view may show is mapped."""
+    def _densities(self, point: NDArray[np.float64]) -> list[float] | None:
+        """Return the fractions of drawn cells in the main view; None unless all that a view may show is mapped."""
         grid = self.scene.map.grid
         row, col = grid.to_cells(point[None, :])[0].tolist()
         if self.known.share(row, col, math.ceil(self.suite.clear_m(self.scene) / grid.cell_size_m)) < 1.0:
             return None
-        return self.drawn.share(row, col, max(1, round(self.suite.main_side_m / 2 / grid.cell_size_m)))
+        half = max(1, round(self.suite.main_side_m / 2 / grid.cell_size_m))
+        return [drawn.share(row, col, half) for drawn in self.drawn]
 
     def _is_free(self, place: tuple[float, float], found: Sequence[Site]) -> bool:
         spacing_m = self.suite.spacing_m(self.scene)

@@ -3,12 +3,15 @@
 
 import datetime as dt
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import pytest
 
 from sasgeo_bench.tasks.suites.all_suites import SUITES
-from sasgeo_bench.tasks.suites.base import changed_share
+from sasgeo_bench.tasks.suites.base import Seeds, changed_share
 from sasgeo_bench.tasks.suites.real_age import age_years, has_age, map_of_age
+from sasgeo_bench.tasks.suites.sites import choose_sites
 
 SUITE = SUITES["real-age"]
 
@@ -67,3 +70,17 @@ def test_controls_search_the_map_of_the_day_and_stresses_an_older_one(carried):
 def test_the_town_has_ages_of_about_five_and_ten_years_alone(carried):
     strengths = {item.strength for item in carried("real-age").suite.variants if item.role == "stress"}
     assert strengths == {5.0, 10.0}
+
+
+def test_a_site_was_mapped_on_every_older_map_that_is_searched(dated):
+    town = dated(2.0, 5.0)
+    seeds = Seeds(root=0, names=("town-suburb", "real-age"))
+    choose = partial(choose_sites, suite=SUITE, count=6, seeds=seeds, group=SUITE.card.group, may_be_fewer=True)
+    northings_m = [site.en_m[1] for site in choose(town)]
+    middle_m = float(np.mean(northings_m))
+    old = town.others[0]
+    bits = old.bits.bits.copy()
+    bits[: int(old.grid.to_cells(np.array([[0.0, middle_m]]))[0, 0])] = 0  # the north was not mapped five years ago
+    empty = replace(town, others=(replace(old, bits=replace(old.bits, bits=bits)), town.others[1]))
+    assert max(northings_m) > middle_m + SUITE.main_side_m / 2
+    assert max(site.en_m[1] for site in choose(empty)) < middle_m + SUITE.main_side_m / 2

@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
@@ -25,6 +26,14 @@ PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]
 CHOICE: Final = ("views_cells", "kinds", "tracks")  # keys of a [[task]]
 ONE_DETECTOR: Final = [PUBLISHED]
+# Keys that came after the first boards, by table, and what is meant without them: files that leave one out keep the
+# hash that their boards were made under.
+_NEWER: Final[Mapping[str, Mapping[str, object]]] = {
+    "contrast": {"pilot": None, "detectors": []},
+    "task": {**dict.fromkeys(CHOICE, []), "detectors": ONE_DETECTOR},
+    "paper": {"crop_readings": []},
+    "learning": {"detector": PUBLISHED},
+}
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
 
@@ -46,6 +55,7 @@ class ContrastSpec(Document):
     second: str
     suites: Annotated[list[str], Field(min_length=1)]
     kinds: list[Short] = []
+    detectors: list[Detector] = []
     metric: ContrastMetric = "primary"
     track: Literal["localization", "retrieval"] = "localization"
     min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
@@ -156,21 +166,12 @@ class PipelineFile(NamedDocument):
     @property
     def sha256(self) -> str:
         """Hash of all that it says, defaults among it, as `board.json` names it."""
-        # Files that leave a newer key out keep the hash that boards were made under before there was one.
         fields = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
-        for contrast in fields["contrast"]:
-            if contrast["pilot"] is None:
-                del contrast["pilot"]
-        for task in fields["task"]:
-            for name in CHOICE:
-                if not task[name]:
-                    del task[name]
-            if task["detectors"] == ONE_DETECTOR:
-                del task["detectors"]
-        if self.paper is not None and not self.paper.crop_readings:
-            del fields["paper"]["crop_readings"]
-        if self.learning is not None and self.learning.detector == PUBLISHED:
-            del fields["learning"]["detector"]
+        for name, newer in _NEWER.items():
+            tables = fields.get(name) or []
+            for table in tables if isinstance(tables, list) else [tables]:
+                for key in [key for key, unsaid in newer.items() if table[key] == unsaid]:
+                    del table[key]
         return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @property
@@ -273,8 +274,8 @@ def _check_apart(contrasts: list[ContrastSpec]) -> None:
         if item.first == item.second:
             message = f"contrast {item.name!r} holds {item.first!r} against itself: name two methods"
             raise ValueError(message)
-        what = (frozenset((item.first, item.second)), frozenset(item.suites), frozenset(item.kinds))
-        before = seen.setdefault((*what, item.metric, item.track), item.name)
+        queries = (frozenset(item.suites), frozenset(item.kinds), frozenset(item.detectors), item.track)
+        before = seen.setdefault((frozenset((item.first, item.second)), *queries, item.metric), item.name)
         if before != item.name:
             message = f"contrasts {before!r} and {item.name!r} compare the same: leave one out"
             raise ValueError(message)

@@ -125,13 +125,12 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
     what = PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_primary else contrast.metric
     better = f"{'left' if finding.is_lower_better else 'right'} of 0: {contrast.first} is better"
     least = finding.least
-    kinds = f", kinds {', '.join(contrast.kinds)}" if contrast.kinds else ""
     labels = [f"{one.place} (n {one.n}, {counted(one.blocks, 'block')})" for one in places]
     labels.append(f"all places (n {finding.n}, {counted(finding.places, 'place')})")
     about = BoardPage(
         title=f"Contrast {contrast.name}: {contrast.first} less {contrast.second}",
         note=(
-            f"Suites {', '.join(contrast.suites)}{kinds}; {contrast.track}. Lines: paired 95 % intervals; those of few "
+            f"Of {contrast.queries_text()}; {contrast.track}. Lines: paired 95 % intervals; those of few "
             "blocks are no narrower than by Wilson's over sites. Grey band: differences smaller than would matter, "
             f"{least:.3g} either way. The registered test is of all places together: {finding.verdict} "
             f"(adjusted p {finding.p_holm:.3g}). Single places are no tests."

@@ -6,6 +6,7 @@ asked.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any, Final
 
@@ -118,11 +119,11 @@ def _pools(contrasts: Sequence[Contrast], scores: Scores) -> Iterator[Contrast]:
     means = [item for item in contrasts if item.metric == "primary"]
     names: dict[tuple[object, ...], list[Contrast]] = {}
     for item in means:
-        names.setdefault((item.suites, item.kinds, item.track), []).append(item)
+        names.setdefault((item.suites, item.kinds, item.detectors, item.track), []).append(item)
     for listed in names.values():
         first = listed[0]
         name = ", ".join(item.name for item in listed)
-        yield Contrast(name=name, first="", second="", suites=first.suites, kinds=first.kinds, track=first.track)
+        yield replace(first, name=name, first="", second="")
     if not means:
         tracks = sorted({track for frame in scores.values() for track in frame["track"]})
         suites = tuple(sorted({suite for frame in scores.values() for suite in frame["suite"]}))

@@ -146,7 +146,7 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
     elif not math.isnan(detectable):
         yield f"least difference so many places would show {number_text(detectable)}"
     if contrast is not None:
-        yield f"suites {', '.join(contrast.suites)}"
+        yield contrast.queries_text()
 
 
 ASSETS: Final = ("site.css", "site.js")

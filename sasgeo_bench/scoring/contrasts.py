@@ -26,6 +26,7 @@ from sasgeo_bench.scoring.intervals import BoardDraws, Interval, difference_inte
 from sasgeo_bench.scoring.metrics import THRESHOLDS, primary_of
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.verdicts import COLUMNS, LEAST_PLACES, OF_MATCHERS, ContrastMetric, Finding
+from sasgeo_bench.tasks.query import Detector
 
 PRIMARY: Final = "primary"
 INTERACTION: Final = "interaction"
@@ -40,7 +41,7 @@ class Contrast:
 
     The difference is `first` less `second`: matchers, or for metrics of rejectors each "matcher x rejector". The
     queries are those of `suites`, pooled, on one track; `kinds` are prefixes of the kinds that count, as in "U2", all
-    if empty.
+    if empty; `detectors` those whose views count, all if empty.
 
     The metric is "primary", success or recall at 1 on present places under stress; "interaction", the same less what
     the method reaches on the control of the same site and view, so that the difference is what the stress adds to the
@@ -56,9 +57,19 @@ class Contrast:
     second: str
     suites: tuple[str, ...]
     kinds: tuple[str, ...] = ()
+    detectors: tuple[Detector, ...] = ()
     metric: ContrastMetric = "primary"
     track: str = "localization"
     min_effect: float = 0.03
+
+    def queries_text(self) -> str:
+        """Name the queries that count.
+
+        >>> Contrast(name="seen", first="a", second="b", suites=("clean",), detectors=("measured",)).queries_text()
+        'suites clean, detectors measured'
+        """
+        chosen = {"suites": self.suites, "kinds": self.kinds, "detectors": self.detectors}
+        return ", ".join(f"{name} {', '.join(values)}" for name, values in chosen.items() if values)
 
 
 def hold_contrasts(
@@ -188,15 +199,17 @@ def _at_place(
 
 
 def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the scored rows that a contrast counts: its suites, kinds and track."""
+    """Return the scored rows that a contrast counts: its suites, kinds, detectors and track."""
     return _rows_of(contrast, frame, _counted(contrast))
 
 
 def _rows_of(
     contrast: Contrast, frame: pd.DataFrame, chosen: Callable[[pd.DataFrame], "pd.Series[bool]"]
 ) -> pd.DataFrame:
-    """Return chosen rows on a contrast's suites, track and kinds; rows without stress belong to all kinds."""
+    """Return chosen rows of a contrast: suites, track, detectors and kinds; without stress rows belong to all kinds."""
     rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
+    if contrast.detectors:
+        rows = rows[rows["detector"].isin(contrast.detectors)]
     rows = rows[chosen(rows).to_numpy(bool)]
     is_kind = (rows["role"] != "stress") | rows["kind"].str.startswith(contrast.kinds or "")
     return rows[is_kind.to_numpy(bool)]
@@ -258,8 +271,8 @@ def _sides(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> _Si
 def _less_control(
     contrast: Contrast, scores: Mapping[str, pd.DataFrame], first: pd.DataFrame, second: pd.DataFrame
 ) -> _Sides:
-    """Return the primary metric of both sides less that on the control of the same site and size of view."""
-    metric, key = primary_of(contrast.track), ["suite", "pair_id", "view_cells"]
+    """Return the primary metric of both sides less that on the control of the same site, size of view and detector."""
+    metric, key = primary_of(contrast.track), ["suite", "pair_id", "view_cells", "detector"]
     controls = both_on(contrast, scores, lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "control"))
     before = []
     for rows, control in zip((first, second), controls, strict=True):

@@ -96,6 +96,22 @@ def test_kinds_choose_and_controls_and_falsifiers_do_not_count():
     assert held(replace(CONTRAST, kinds=("U9",)), **{"with": table, "without": table}).verdict == "not tested: no query"
 
 
+def test_a_detector_chooses_and_its_controls_are_its_own():
+    roles, detectors = ["stress", "control"] * 120, ["published", "published", "measured", "measured"] * 60
+    sites = [site for site in range(60) for _ in range(4)]
+    # The first side is right everywhere but on controls of one detector; the second nowhere.
+    errors_m = np.where(np.arange(240) % 4 == 3, 99.0, 1.0)
+    known = {
+        "with": scores(errors_m, blocks=60, role=roles, detector=detectors, pair_id=sites),
+        "without": scores(99 * np.ones(240), blocks=60, role=roles, detector=detectors, pair_id=sites),
+    }
+    less = replace(CONTRAST, metric="interaction")
+    assert held(replace(CONTRAST, detectors=("measured",)), **known).n == 60
+    assert held(replace(less, detectors=("published",)), **known).difference == 0.0
+    assert held(replace(less, detectors=("measured",)), **known).difference == 1.0
+    assert held(less, **known).difference == 0.5
+
+
 def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
     table = scores(errors(0.6), blocks=60)
     is_false = ~table["is_right"].to_numpy(bool)

@@ -59,7 +59,7 @@ def bent(vectors: "gpd.GeoDataFrame", field_m: NDArray[np.float64], cell_size_m:
 SUITE: Final = LocalWarpSuite(
     card=SuiteCard(
         name="local-warp",
-        version=1,
+        version=2,
         title="Local warp (G1)",
         what="A field of shifts of 5, 10 or 15 m rms bends the view and its vectors: waves of 70 to 110 m (G1), rows "
         "that shake (G1 rows), or a tilt that was not removed (G1 tilt).",

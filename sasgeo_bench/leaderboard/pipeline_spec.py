@@ -30,7 +30,7 @@ ONE_DETECTOR: Final = [PUBLISHED]
 # hash that their boards were made under.
 _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "contrast": {"pilot": None, "detectors": []},
-    "task": {**dict.fromkeys(CHOICE, []), "detectors": ONE_DETECTOR},
+    "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR},
     "paper": {"crop_readings": []},
     "learning": {"detector": PUBLISHED},
 }

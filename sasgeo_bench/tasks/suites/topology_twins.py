@@ -77,7 +77,7 @@ SUITE: Final = TopologyTwins(
         strength_unit="1 with perceived vectors",
         tracks=("retrieval", "localization"),
         group=TWIN_GROUP,
-        min_density=0.05,
+        min_density=0.1,  # with less in view a plain search lists neither place
     ),
     variants=pair("no vectors", "G2", "gaps closed"),
     change_of=_change,

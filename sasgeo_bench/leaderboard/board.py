@@ -12,9 +12,11 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.board_files import PROTECTION, Extra, write_board
+from sasgeo_bench.leaderboard.board_files import ACCEPTANCE, PROTECTION, Extra, write_board
+from sasgeo_bench.leaderboard.board_tables import step_tables
 from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
 from sasgeo_bench.leaderboard.private_board import OnPrivate, seed_of
+from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
@@ -85,7 +87,8 @@ class Board:
     """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
 
     `with_calibration` also holds rows of the calibration places of a hold-out split, which no figure counts.
-    `remarks` are those of rejectors on their fits; `protection` has no row where no answer has a protection level.
+    `remarks` are those of rejectors on their fits; `protection` has no row where no answer has a protection level,
+    `acceptance` none where no place is absent.
     `judged` are the results of rejectors by matcher and rejector, `measured` the measurements of truths by query id,
     and `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
     does `predictions`. `apart` are the reasons for excluding entries from ranks, `on_private` the results on a private
@@ -103,6 +106,7 @@ class Board:
     tasks: tuple[dict[str, Any], ...] = field(default=())
     remarks: tuple[str, ...] = ()
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
+    acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
     judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     truths: Mapping[str, Truth] = field(default_factory=dict)
@@ -148,6 +152,7 @@ def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], ca
             "falsifiers": falsifier_frame(board.falsifiers),
             "controls": verdict_frame(board.verdicts),
             **({PROTECTION: board.protection} if len(board.protection) else {}),
+            **({ACCEPTANCE: board.acceptance} if len(board.acceptance) else {}),
         },
         texts={
             "leaderboard.md": board_markdown(
@@ -156,8 +161,10 @@ def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], ca
                 findings=board.findings,
                 verdicts=board.verdicts,
                 falsifiers=board.falsifiers,
-                steps=steps,
-                ages=age_names(ages_frame(steps, queries, board.measured)),
+                others=(
+                    *acceptance_tables(board.acceptance),
+                    *step_tables(steps, age_names(ages_frame(steps, queries, board.measured))),
+                ),
             ),
             "leaderboard.tex": board_latex(board.table, about, findings=board.findings, verdicts=board.verdicts),
         },

@@ -24,7 +24,7 @@ from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.scoring import controls, protection
+from sasgeo_bench.scoring import acceptance, controls, protection
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.rows import Row
 from sasgeo_bench.scoring.verdicts import Finding
@@ -32,6 +32,7 @@ from sasgeo_bench.texts import csv_cell, json_text, one_line
 
 LEADERBOARD: Final = "leaderboard"
 PROTECTION: Final = "protection"
+ACCEPTANCE: Final = "acceptance"
 SCORES: Final = "scores"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
@@ -44,6 +45,7 @@ BOARD_FILES: Final = (
     *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
     *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
+    f"{ACCEPTANCE}.parquet",
     *("paper.parquet", "trials.parquet", "paper.md"),
 )
 MEND: Final = "score it again"
@@ -176,13 +178,19 @@ def read_scores(folder: Path) -> pd.DataFrame:
     return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
 
 
-_TEXTS: Final = frozenset({"contrast", "suite", "kind", "matcher", "prior_group", "method", "supports"})
+_TEXTS: Final = frozenset(
+    {
+        *("contrast", "suite", "kind", "matcher", "prior_group", "method", "supports"),
+        *("rejector", "track", "mixture", "absence"),
+    }
+)
 _FINDING: Final = {item.name: item.type for item in fields(Finding)} | {"outcome": str, "verdict": str}
 _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
     "leaderboard": {item.name: item.type for item in fields(Row)},
     "contrasts": _FINDING,
     "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in controls.FALSIFIER_COLUMNS},
     "controls": {item.name: item.type for item in fields(Verdict)},
+    "acceptance": {name: str if name in _TEXTS else float for name in acceptance.COLUMNS},
     "protection": {name: str if name in _TEXTS else float for name in protection.COLUMNS},
     "scores": {
         **dict.fromkeys(("query_id", "matcher", "suite", "track", "kind", "role", "place"), str),

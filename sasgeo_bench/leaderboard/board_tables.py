@@ -27,18 +27,12 @@ from sasgeo_bench.leaderboard.tables import (
     rank_cell,
     rank_text,
     sort_key,
-    text_cells,
     ties_of,
 )
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
-from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, is_bin, is_step
 
-_REJECTION: Final = (  # metrics of the tables of rejectors
-    *("aurc", "e_aurc", "auroc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
-    *("right_at_absent_0.05", "absent_reached_at_0.05", "ece", "cost_20"),
-)
 SHOWN_COSTS: Final = (  # and of the table of costs
     *("latency_p50", "latency_p95", "prepare", "peak_memory"),
     *("map_per_km2", "cpu_per_fix", "observation_per_fix"),
@@ -348,55 +342,6 @@ def cost_table(book: Book) -> Table:
     notes = ("Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",)
     first = column("matcher", is_number=False)
     return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
-
-
-def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return matcher x rejector over all suites, a table for each track and prior group."""
-    found = _rejection_rows(board).groupby(["track", "prior_group"], sort=True)
-    return tuple(
-        _rejection_table(
-            part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
-        )
-        for key, part in found
-    )
-
-
-def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
-    """Return the rejectors of one matcher over all suites, every track and prior group a line; None without any."""
-    rows = _rejection_rows(board)
-    mine = rows[rows["matcher"] == matcher]
-    return None if mine.empty else _rejection_table(mine, "rejection", "Rejection, all suites", has_queries=True)
-
-
-def _rejection_rows(board: pd.DataFrame) -> pd.DataFrame:
-    return board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
-
-
-def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: bool = False) -> Table:
-    """Return rejectors, the best first; `has_queries` adds a column of the track and prior group of each line."""
-    rows = []
-    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
-        matcher, rejector, track, prior_group = map(str, key)
-        by_name: dict[str, Record] = {
-            str(row["metric"]): {str(field): row[field] for field in row} for row in mine.to_dict("records")
-        }
-        queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
-        figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
-        cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
-        surest = by_name.get("aurc")
-        rows.append((math.inf if surest is None else float(surest["value"]), matcher, rejector, Row(cells=cells)))
-    rows.sort(key=lambda row: row[:3])
-    return Table(
-        name=name,
-        title=title,
-        columns=(
-            *words("matcher", "rejector"),
-            *((column("track", is_number=False, title="queries"),) if has_queries else ()),
-            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
-        ),
-        rows=tuple(row for *_, row in rows),
-        notes=("ECE and costs have no interval on this board: they decide nothing.",),
-    )
 
 
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:

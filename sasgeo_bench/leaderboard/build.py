@@ -182,6 +182,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
         board,
         judged={key: frame for key, frame in rejection.judged.items() if len(frame)},
         remarks=rejection.remarks,
+        acceptance=rejection.acceptance,
         findings=with_causes(findings, gains_without_stress(falsifiers)),
         falsifiers=falsifiers,
         protection=pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(PROTECTION_COLUMNS)),

@@ -35,6 +35,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "second": "Second entry of the pair, and what it reaches",
     "difference": "First less second on the same queries, with its 95 % interval by places",
     "by blocks": "The interval of the difference if blocks, not places, are resampled: of these places alone",
+    "by countries": "The interval of the difference if countries are resampled, then places in them",
     "attainable": "The most by which the first could be better than the second: up to the ceiling of these queries, or "
     "to a perfect order",
     "matters": "The least difference that was registered as mattering",
@@ -70,6 +71,9 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "suites": "Suites that were drawn there",
     "scenes": "Kind of place, as its region file says",
     "method": "How the level is computed",
+    "absence": "Kind of absent places, suite: kind; all: all of them",
+    "absent": "Absent places among the queries",
+    "risk of fixes": "Share of false fixes among the accepted ones, where absent places have the share named",
     "risk": "How often the error may exceed the level, as was promised",
     "available": "Share of queries whose level is within the alert limit, with its 95 % interval",
     "misleading": "Share that is available and has an error beyond its level, with its 95 % interval",

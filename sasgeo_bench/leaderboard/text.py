@@ -8,9 +8,10 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import counted, named
-from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of, step_tables
+from sasgeo_bench.leaderboard.board_tables import Book, cost_table, sections_of
 from sasgeo_bench.leaderboard.columns import NOTE, RANKS_NOTE, TERMS
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
+from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
@@ -89,12 +90,11 @@ def tables_of(
     findings: Sequence[Finding] = (),
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
-    steps: pd.DataFrame | None = None,
-    ages: Mapping[tuple[Any, ...], str] | None = None,
+    others: Sequence[Table] = (),
 ) -> Iterator[Table]:
     """Yield the tables of a board in the order of its pages; those without a row are left out.
 
-    `about` is the content of `board.json`, `steps` is from `strata.steps_frame`, `ages` from `plot_tables.age_names`.
+    `about` is the content of `board.json`; `others` are the tables of absence and of steps.
     """
     book = Book.of(board, about)
     suites = [
@@ -109,7 +109,7 @@ def tables_of(
         *suites,
         *rejection_tables(board),
         cost_table(book),
-        *(step_tables(steps, ages) if steps is not None else ()),
+        *others,
         control_table(verdict_frame(verdicts)),
     )
     yield from (table for table in found if table is not None and table.rows)

@@ -92,13 +92,15 @@ def control_table(controls: pd.DataFrame) -> Table | None:
 
 
 def contrast_table(findings: Sequence[Finding]) -> Table:
-    """Return the registered contrasts."""
+    """Return the registered contrasts; intervals by countries where places share some."""
+    has_countries = any(not math.isnan(item.lo_countries) for item in findings)
     rows = tuple(
         Row(
             cells=(
                 Cell(text=item.name),
                 *_sides(item),
-                Cell(text=_ends_text(item)),
+                Cell(text=_ends_text(item.lo_blocks, item.hi_blocks)),
+                *((Cell(text=_ends_text(item.lo_countries, item.hi_countries)),) if has_countries else ()),
                 number_cell(item.attainable),
                 number_cell(item.least),
                 number_cell(item.p_holm),
@@ -111,8 +113,8 @@ def contrast_table(findings: Sequence[Finding]) -> Table:
         for item in findings
     )
     names = (
-        *("first", "second", "difference", "by blocks", "attainable", "matters"),
-        *("p (Holm)", "discordant", "detectable", "n"),
+        *("first", "second", "difference", "by blocks", *(("by countries",) if has_countries else ())),
+        *("attainable", "matters", "p (Holm)", "discordant", "detectable", "n"),
     )
     columns = (*words("contrast"), *map(column, names), *words("verdict"))
     return Table(name="contrasts", title="Registered contrasts", columns=columns, rows=rows)
@@ -146,12 +148,11 @@ def _sides(item: Finding) -> tuple[Cell, ...]:
     )
 
 
-def _ends_text(item: Finding) -> str:
-    """Return the interval by blocks."""
-    if math.isnan(item.lo_blocks):
-        return "-"
-    return f"[{number_text(item.lo_blocks)}, {number_text(item.hi_blocks)}]"
+def _ends_text(lo: float, hi: float) -> str:
+    """Return an interval by other clusters than places; "-" for none."""
+    return "-" if math.isnan(lo) else f"[{number_text(lo)}, {number_text(hi)}]"
 
 
 def _counts_text(item: Finding) -> str:
-    return f"{item.n} in {counted(item.blocks, 'block')}, {counted(item.places, 'place')}"
+    where = f"{item.n} in {counted(item.blocks, 'block')}, {counted(item.places, 'place')}"
+    return f"{where}, {counted(item.countries, 'country', 'countries')}" if 0 < item.countries < item.places else where

@@ -148,6 +148,7 @@ def _source(files: BoardFiles, tell: Tell) -> SiteSource:
         controls=tables["controls"],
         scores=tables["scores"],
         protection=tables["protection"],
+        acceptance=tables["acceptance"],
         registered=_registered(files, spec),
         reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
         figures=files.figures,

@@ -12,9 +12,10 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import Book, cost_table, rejection_tables, sections_of
+from sasgeo_bench.leaderboard.board_tables import Book, cost_table, sections_of
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
+from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text
 from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
@@ -138,6 +139,8 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
     yield f"n = {counted(int(row['n']), 'query', 'queries')}"
     yield counted(int(row["blocks"]), "block")
     yield counted(int(row["places"]), "place")
+    if 0 < row.get("countries", 0) < row["places"]:  # older boards do not count them
+        yield counted(int(row["countries"]), "country", "countries")
     if row["metric"] == "primary":
         yield f"right by the first alone {row['first_only']}, by the second alone {row['second_only']}"
     detectable = float(row["detectable"])
@@ -186,6 +189,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     book = Book.of(source.board, source.about, source.scores)
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
+    acceptance = acceptance_tables(source.acceptance)
     optional = {
         "rejection.html": rejection or protection,
         "figures.html": source.figures,
@@ -219,7 +223,12 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         },
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
-        "rejection.html": {"tables": rejection, "protection": protection, "kinds": kinds},
+        "rejection.html": {
+            "tables": rejection,
+            "acceptance": acceptance,
+            "protection": protection,
+            "kinds": kinds,
+        },
         "figures.html": {"kinds": kinds},
         "failures.html": {"groups": groups_of(source.pictures.cases), "total": len(source.pictures.cases)},
         "regions.html": {"table": region_table(source)},

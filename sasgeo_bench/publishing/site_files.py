@@ -21,7 +21,16 @@ from sasgeo_bench.files.folders import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
-from sasgeo_bench.leaderboard.board_files import BOARD, FIGURES, LEADERBOARD, MEND, PROTECTION, SCORES, read_board
+from sasgeo_bench.leaderboard.board_files import (
+    ACCEPTANCE,
+    BOARD,
+    FIGURES,
+    LEADERBOARD,
+    MEND,
+    PROTECTION,
+    SCORES,
+    read_board,
+)
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -83,7 +92,7 @@ def _fault_of(item: ET.Element) -> str | None:
 PICTURES: Final = "pictures"
 FILES: Final = "files"
 MOST_BYTES: Final = 5_000_000  # of a site without pictures of regions and cases; a larger one is reported
-_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, PROTECTION)
+_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION)
 _OFFERED: Final = {  # files for download, with descriptions
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
     f"{LEADERBOARD}.csv": "the same for a spreadsheet",
@@ -92,6 +101,7 @@ _OFFERED: Final = {  # files for download, with descriptions
     "contrasts.parquet": "registered contrasts",
     "falsifiers.parquet": "the same two methods where they should not differ",
     "controls.parquet": "controls of every matcher",
+    f"{ACCEPTANCE}.parquet": "risk and coverage by cost, share and kind of absent places",
     f"{PROTECTION}.parquet": "protection levels, counted",
     "paper.md": "the paper's experiment next to its Table II",
     "paper.parquet": "the same as a table",

@@ -10,8 +10,9 @@ import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, rejection_of, strata_tables, suite_table
+from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, strata_tables, suite_table
 from sasgeo_bench.leaderboard.columns import column, prior_words
+from sasgeo_bench.leaderboard.rejection_tables import rejection_of
 from sasgeo_bench.leaderboard.tables import (
     Cell,
     Key,

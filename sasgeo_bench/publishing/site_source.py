@@ -140,6 +140,7 @@ class SiteSource:
     controls: pd.DataFrame = field(default_factory=pd.DataFrame)
     scores: pd.DataFrame = field(default_factory=pd.DataFrame)
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
+    acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
     registered: tuple[Contrast, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)
     figures: tuple[SiteFigure, ...] = ()

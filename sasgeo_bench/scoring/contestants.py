@@ -325,15 +325,15 @@ def _scored(
     by_block: Collection[str],
 ) -> pd.DataFrame:
     """Return one row per query of all tasks that an entry was asked."""
-    place_of = {} if split is None else split.place_of
+    of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
     frames = []
     for task in tasks:
         if task.folder not in answers.asked:
             continue
         names = [head.query_id for head in task.heads]
         mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
-        frame = score_task(task.heads, task.truths, mine, place_of=place_of)
+        frame = score_task(task.heads, task.truths, mine, **of_split)
         suite = task.about["suite"]
         frame = frame.assign(block=frame["region"]) if suite in by_region else frame
-        frames.append(frame.assign(place=frame["block"]) if suite in by_block else frame)
+        frames.append(frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame)
     return settle_not_applicable(pd.concat(frames, ignore_index=True))

@@ -20,9 +20,16 @@ from sasgeo_bench.scoring.compare import (
     sign_flip,
     swap_places,
 )
-from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
+from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity_metric import aurc, auroc, excess_aurc
-from sasgeo_bench.scoring.intervals import BoardDraws, Interval, difference_interval, percentile_interval, wilson_share
+from sasgeo_bench.scoring.intervals import (
+    BoardDraws,
+    Interval,
+    bootstrap_means,
+    difference_interval,
+    percentile_interval,
+    wilson_share,
+)
 from sasgeo_bench.scoring.metrics import THRESHOLDS, primary_of
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.verdicts import COLUMNS, LEAST_PLACES, OF_MATCHERS, ContrastMetric, Finding
@@ -240,6 +247,14 @@ def _drawn(contrast: Contrast, rows: pd.DataFrame, draws: int) -> BoardDraws:
     return BoardDraws.of(*names, seed=seed_of_text(contrast.name), draws=draws)
 
 
+def _by_country(contrast: Contrast, rows: pd.DataFrame, draws: int) -> ClusterDraws | None:
+    """Draw countries, places in them, and blocks in these; None where no country has several places."""
+    if rows["country"].nunique() == rows["place"].nunique():
+        return None
+    country, place, block = (rows[name].tolist() for name in ("country", "place", "block"))
+    return ClusterDraws(places=country, blocks=place, sites=block, seed=seed_of_text(contrast.name), draws=draws)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Sides:
     """Values of both sides per counted query, the best ones the first side could have, shape (N,) each.
@@ -330,7 +345,9 @@ def _value_finding(contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws:
         second_only=int((gaps < 0).sum()),
         p_places=sign_flip(np.bincount(place, weights=gaps).astype(float)),
     )
-    return _with_ends(found, (means[0][:, 0], means[1][:, 0]), won, drawn)
+    found = _with_ends(found, (means[0][:, 0], means[1][:, 0]), won, drawn)
+    far = _by_country(contrast, rows, draws)
+    return _with_countries(found, rows, None if far is None else bootstrap_means(gaps[:, None], far)[:, 0])
 
 
 def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> Finding:
@@ -339,11 +356,12 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
     area = AREAS[contrast.metric]
     ours, theirs = (area(answers) for answers in both)
     drawn = _drawn(contrast, first, SLOW_DRAWS)
-    gaps = drawn.of_both(
-        lambda one: np.concatenate(
-            [areas(both[0], row, contrast.metric) - areas(both[1], row, contrast.metric) for row in one.weights()]
-        )
-    )
+
+    def gaps_of(one: ClusterDraws) -> Floats:
+        parts = (areas(both[0], row, contrast.metric) - areas(both[1], row, contrast.metric) for row in one.weights())
+        return np.concatenate(list(parts))
+
+    gaps = drawn.of_both(gaps_of)
     place = np.unique(first["place"], return_inverse=True)[1]
     is_relative = contrast.metric in _RELATIVE
     best = {"aurc": aurc(both[0]) - excess_aurc(both[0]), "e_aurc": 0.0, "auroc": 1.0}[contrast.metric]
@@ -359,7 +377,9 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
         p_places=swap_places(both[0], both[1], place, contrast.metric),
         least=contrast.min_effect * (abs(theirs) if is_relative else 1.0),
     )
-    return _with_ends(found, gaps, (ours, theirs), drawn)
+    found = _with_ends(found, gaps, (ours, theirs), drawn)
+    far = _by_country(contrast, first, SLOW_DRAWS)
+    return _with_countries(found, first, None if far is None else gaps_of(far))
 
 
 def _with_ends(found: Finding, draws: tuple[Floats, Floats], sides: tuple[float, float], drawn: BoardDraws) -> Finding:
@@ -376,6 +396,19 @@ def _with_ends(found: Finding, draws: tuple[Floats, Floats], sides: tuple[float,
         both.append(ends if is_enough else _around(ends, wide))
     places, blocks = _around(*both), both[1]
     return replace(found, lo=places.lo, hi=places.hi, lo_blocks=blocks.lo, hi_blocks=blocks.hi)
+
+
+def _with_countries(found: Finding, rows: pd.DataFrame, draws: Floats | None) -> Finding:
+    """Return a finding with the number of countries and, from draws of these, an interval no narrower than by places.
+
+    Without draws no country has several places, and there is no interval.
+    """
+    found = replace(found, countries=int(rows["country"].nunique()))
+    if draws is None or found.countries < LEAST_PLACES:
+        return found
+    by_places = Interval(value=found.difference, lo=found.lo, hi=found.hi)
+    ends = _around(percentile_interval(found.difference, draws), by_places)
+    return replace(found, lo_countries=ends.lo, hi_countries=ends.hi)
 
 
 def _around(first: Interval, second: Interval) -> Interval:

@@ -18,6 +18,8 @@ from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.scoring.acceptance import COLUMNS as ACCEPTANCE_COLUMNS
+from sasgeo_bench.scoring.acceptance import acceptance_frame
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept
 from sasgeo_bench.scoring.integrity_metric import choose_absent_threshold, choose_threshold
@@ -278,10 +280,14 @@ class RejectionTask:
 
 @dataclass(frozen=True, kw_only=True)
 class RejectionResult:
-    """Rows of `judge` by matcher and rejector, rows of the board, and the rejectors' remarks on their fits."""
+    """Rows of `judge` by matcher and rejector, rows of the board, and the rejectors' remarks on their fits.
+
+    `acceptance` are rows of `acceptance.acceptance_frame`, of rejectors that give chances.
+    """
 
     judged: Mapping[tuple[str, str], pd.DataFrame]
     rows: Sequence[pd.DataFrame]
+    acceptance: pd.DataFrame
     remarks: tuple[str, ...]
 
 
@@ -295,6 +301,7 @@ def evaluate_rejectors(
     """
     judged: dict[tuple[str, str], pd.DataFrame] = {}
     rows: list[pd.DataFrame] = []
+    accepted: list[pd.DataFrame] = []
     errors: dict[str, list[Exception]] = {}
     remarks: list[str] = []
     progress.begin(JUDGED, len(tasks))
@@ -305,11 +312,12 @@ def evaluate_rejectors(
                 failures.note(f"{task.matcher} x {name}", found)
                 errors.setdefault(name, []).append(found)
                 continue
-            frame, figures = found
+            frame, figures, taken = found
             if name == OWN and not len(frame):
                 continue
             judged[task.matcher, name] = frame
             rows.append(figures)
+            accepted.append(taken)
             if not len(frame):
                 tell(f"{name} on {task.matcher}: not applied, {why_not(task.scores, is_taught=task.is_taught)}")
             elif name != OWN:
@@ -319,12 +327,14 @@ def evaluate_rejectors(
             raise listed[0]
     for remark in remarks:
         tell(remark)
-    return RejectionResult(judged=judged, rows=rows, remarks=tuple(remarks))
+    return RejectionResult(
+        judged=judged, rows=rows, acceptance=_together(accepted, ACCEPTANCE_COLUMNS), remarks=tuple(remarks)
+    )
 
 
-def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame] | Exception]:
-    """Return by rejector the rows of `judge` and those of the board, or the error; own confidence comes first."""
-    results: dict[str, tuple[pd.DataFrame, pd.DataFrame] | Exception] = {}
+def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
+    """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
+    results: dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception] = {}
     for name in (OWN, *task.rules):
         try:
             if name == OWN:  # it counts as a probability
@@ -334,7 +344,8 @@ def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFram
                 frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
                 is_calibrated = rule.card.is_calibrated
             figures = to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
-            results[name] = frame, figures
+            taken = acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
+            results[name] = frame, figures, taken
         except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
             results[name] = error
     return results

@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.scoring.base import Floats, weighted_mean
+from sasgeo_bench.scoring.base import Floats, Ints, weighted_mean
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity_metric import drawn_areas
-from sasgeo_bench.scoring.intervals import BoardDraws, effective_count, share_interval
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, effective_count, share_interval
 from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS, RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads
 
@@ -67,8 +67,7 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
     mixtures = dict(mixtures_of(some, is_pooled=is_pooled))
     areas = [_drawn_areas(some, mixtures, one) if is_pooled else {} for one in drawn.both]
     shares = {stratum: list(_shares(part, mass)) for stratum, mass in mixtures.items()}
-    every = [share for listed in shares.values() for share in listed]
-    drawn_shares = zip(*(_drawn_shares(every, one) for one in drawn.both), strict=True)
+    every = iter(share_intervals([share for listed in shares.values() for _, share in listed], site, drawn))
     for stratum, mass in mixtures.items():
         mine, trials = replace(key, stratum=stratum), effective_count(site, mass)
         shifted = answers_of(part, stratum)
@@ -81,9 +80,8 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
             by_place, by_block = (one.get((stratum, metric.name), np.empty(0)) / most for one in areas)
             found = share_interval(value / most, (by_place, by_block), trials)
             yield mine.row(metric, found.mapped(partial(operator.mul, most), value))
-        for share in shares[stratum]:
-            value = weighted_mean(share.counted, share.mass)
-            yield mine.row(share.metric, share_interval(value, next(drawn_shares), effective_count(site, share.mass)))
+        for threshold, _ in shares[stratum]:
+            yield mine.row(threshold, next(every))
 
 
 def _drawn_areas(
@@ -115,15 +113,14 @@ def mixtures_of(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Share:
+class Share:
     """A weighted share of the queries, as the coverage of a threshold; each column has shape (N,)."""
 
-    metric: ThresholdMetric
     counted: Floats
     mass: Floats
 
 
-def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
+def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[tuple[ThresholdMetric, Share]]:
     """Yield the shares that thresholds chosen on calibration places reach here.
 
     Skip thresholds that some rows lack: the coverage of the others would not be that of these queries.
@@ -141,10 +138,18 @@ def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[_Share]:
             "absent": (accepted, mass * (1.0 - present)),
         }[metric.what]
         if counts.any() or not metric.is_of_absent:
-            yield _Share(metric=metric, counted=counted, mass=counts)
+            yield metric, Share(counted=counted, mass=counts)
 
 
-def _drawn_shares(shares: Sequence[_Share], drawn: ClusterDraws) -> Iterator[Floats]:
+def share_intervals(shares: Sequence[Share], sites: Ints, drawn: BoardDraws) -> Iterator[BoardInterval]:
+    """Yield each share with its intervals; `sites` are those of the queries, shape (N,)."""
+    draws = zip(*(_drawn_shares(shares, one) for one in drawn.both), strict=True)
+    for share, both in zip(shares, draws, strict=True):
+        value = weighted_mean(share.counted, share.mass)
+        yield share_interval(value, both, effective_count(sites, share.mass))
+
+
+def _drawn_shares(shares: Sequence[Share], drawn: ClusterDraws) -> Iterator[Floats]:
     """Yield each share in every draw, with one pass over the draws; NaN where a draw has no weight.
 
     For fewer than two clusters the draws are empty.

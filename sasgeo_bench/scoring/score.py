@@ -34,8 +34,8 @@ class Score:
         Of the query.
     pool : int
         Number of candidates; 0 for localization.
-    place : str
-        Unit of the split; the region without a split.
+    place, country : str
+        Unit of the split, the region without a split; the country that the split gives it, else the place.
     block, pair_id, role, kind, strength, strength_unit, scene
         Of the truth; so are unknown_share, changed_share, feature_density, alias_index and detector.
     is_present : bool
@@ -68,6 +68,7 @@ class Score:
     part: str
     region: str
     place: str
+    country: str
     block: str
     prior_group: str
     view_cells: int
@@ -112,11 +113,13 @@ def score_task(
     predictions: Mapping[str, Prediction],
     *,
     place_of: Mapping[str, str] | None = None,
+    country_of: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
     """Score the predictions of one task: a row for each query in order, with the columns of `Score`.
 
     `heads` and `truths` cover the same queries; a query without a prediction is a miss. `place_of` maps blocks to
-    places of the split. Raise MetricError if a query has no truth or a prediction belongs to no query.
+    places of the split, `country_of` places to countries. Raise MetricError if a query has no truth or a prediction
+    belongs to no query.
     """
     by_id = {truth.query_id: truth for truth in truths}
     asked = list(heads)
@@ -130,9 +133,10 @@ def score_task(
         raise MetricError(message)
     answers = [predictions.get(head.query_id) for head in asked]
     errors = _errors([by_id[head.query_id] for head in asked], answers)
+    places = [(place_of or {}).get(by_id[head.query_id].block, base_of(head.region)) for head in asked]
     rows = [
-        _score(head, by_id[head.query_id], prediction, error, place_of or {})
-        for head, prediction, error in zip(asked, answers, errors, strict=True)
+        _score(head, by_id[head.query_id], prediction, error, (place, (country_of or {}).get(place, place)))
+        for head, prediction, error, place in zip(asked, answers, errors, places, strict=True)
     ]
     return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
 
@@ -148,19 +152,17 @@ def _errors(truths: Sequence[Truth], answers: Sequence[Prediction | None]) -> li
     return found
 
 
-def _score(
-    head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, place_of: Mapping[str, str]
-) -> Score:
+def _score(head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, where: tuple[str, str]) -> Score:
     rank = MISS
     is_right = errors[0] <= FIX_M  # retrieval candidates have a given heading and a random offset, so no errors below
     if head.track == "retrieval":
         errors = _NO_ERROR
         rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS
-    base = base_of(head.region)
     return Score(
         **{name: getattr(head, name) for name in _HEAD_COLUMNS},
         **{name: getattr(truth, name) for name in _TRUTH_COLUMNS},
-        place=place_of.get(truth.block, base),
+        place=where[0],
+        country=where[1],
         pool=len(head.candidates),
         status=MISSING if prediction is None else prediction.status,
         ceiling=ceiling_of(truth),

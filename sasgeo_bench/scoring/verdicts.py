@@ -28,15 +28,16 @@ class Finding:
     ----------
     name, first, second, metric : str
         Of the contrast.
-    n, blocks, places : int
+    n, blocks, places, countries : int
         Queries and their clusters; places are the unit of intervals and tests. Fewer than `LEAST_PLACES` decide
         nothing.
     first_value, second_value : float
         The metric of both sides.
     best : float
         The best value that the first side could have on these queries: the mean ceiling, or that of a perfect order.
-    difference, lo, hi, lo_blocks, hi_blocks : float
-        First less second, its paired 95 % interval by places, and by blocks; NaN without draws.
+    difference, lo, hi, lo_blocks, hi_blocks, lo_countries, hi_countries : float
+        First less second, its paired 95 % interval by places, by blocks, and by countries where the split names some;
+        NaN without draws.
     first_only, second_only : int
         Discordant queries: better for one side only; 0 for areas.
     p_exact, p_clustered, p_places, p_holm : float
@@ -62,6 +63,7 @@ class Finding:
     n: int = 0
     blocks: int = 0
     places: int = 0
+    countries: int = 0
     first_value: float = math.nan
     second_value: float = math.nan
     best: float = math.nan
@@ -70,6 +72,8 @@ class Finding:
     hi: float = math.nan
     lo_blocks: float = math.nan
     hi_blocks: float = math.nan
+    lo_countries: float = math.nan
+    hi_countries: float = math.nan
     first_only: int = 0
     second_only: int = 0
     p_exact: float = math.nan

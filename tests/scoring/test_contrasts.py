@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.scoring.contrasts import COLUMNS, Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.intervals import wilson
 from tests.scoring.test_tables import scores
@@ -79,6 +80,28 @@ def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
     won, lost = wilson(4, 4), wilson(0, 4)
     assert found.lo == pytest.approx(1 - math.hypot(1 - won.lo, lost.hi))
     assert (found.difference, found.hi) == (1.0, 1.0)
+
+
+def test_countries_are_drawn_where_places_share_some_and_widen_the_interval():
+    # Sixty places, six to a country. In half of the countries the first side is right everywhere, in the other nowhere.
+    country = [f"country {at % 10}" for at in range(600)]
+    is_won = np.arange(600) % 10 < 5
+    ours, theirs = scores(np.where(is_won, 1.0, 99.0), blocks=60), scores(99 * np.ones(600), blocks=60)
+    apart = held(CONTRAST, **{"with": ours, "without": theirs})
+    assert apart.countries == apart.places == 60
+    assert math.isnan(apart.lo_countries)
+    shared = held(
+        CONTRAST, **{name: table.assign(country=country) for name, table in (("with", ours), ("without", theirs))}
+    )
+    assert (shared.places, shared.countries) == (60, 10)
+    assert (shared.lo, shared.hi) == (apart.lo, apart.hi)
+    assert shared.lo_countries < shared.lo - 0.05
+    assert shared.hi_countries > shared.hi + 0.05
+    title = {column.name: at for at, column in enumerate(contrast_table([shared]).columns)}
+    cells = contrast_table([shared]).rows[0].cells
+    assert cells[title["by countries"]].text.startswith("[0.")
+    assert cells[title["n"]].text == "600 in 60 blocks, 60 places, 10 countries"
+    assert "by countries" not in [column.name for column in contrast_table([apart]).columns]
 
 
 def test_few_places_decide_nothing():

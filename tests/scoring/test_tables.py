@@ -73,7 +73,8 @@ def scores(errors_m, *, blocks=4, track="localization", **changes):
         }
     )
     table = table.assign(**changes)
-    return table.assign(place=changes.get("place", "place of " + table["block"]))[list(SCORED)]
+    table = table.assign(place=changes.get("place", "place of " + table["block"]))
+    return table.assign(country=changes.get("country", table["place"]))[list(SCORED)]
 
 
 def column_of(table, term):

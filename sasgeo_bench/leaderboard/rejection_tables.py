@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of matchers with a rejector: over all suites, and by the kind of absence."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.leaderboard.columns import column, prior_words, words
+from sasgeo_bench.leaderboard.tables import (
+    Cell,
+    Record,
+    Row,
+    Table,
+    figure_cell,
+    file_stem,
+    plain_cell,
+    text_cells,
+)
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
+from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
+
+_REJECTION: Final = (  # metrics of the tables of rejectors
+    *("aurc", "e_aurc", "auroc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
+    *("right_at_absent_0.05", "absent_reached_at_0.05", "ece", "cost_20"),
+)
+SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a right one
+_MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
+
+
+def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return matcher x rejector over all suites, a table for each track and prior group."""
+    found = _rejection_rows(board).groupby(["track", "prior_group"], sort=True)
+    return tuple(
+        _rejection_table(
+            part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
+        )
+        for key, part in found
+    )
+
+
+def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
+    """Return the rejectors of one matcher over all suites, every track and prior group a line; None without any."""
+    rows = _rejection_rows(board)
+    mine = rows[rows["matcher"] == matcher]
+    return None if mine.empty else _rejection_table(mine, "rejection", "Rejection, all suites", has_queries=True)
+
+
+def _rejection_rows(board: pd.DataFrame) -> pd.DataFrame:
+    return board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
+
+
+def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: bool = False) -> Table:
+    """Return rejectors, the best first; `has_queries` adds a column of the track and prior group of each line."""
+    rows = []
+    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
+        matcher, rejector, track, prior_group = map(str, key)
+        by_name: dict[str, Record] = {
+            str(row["metric"]): {str(field): row[field] for field in row} for row in mine.to_dict("records")
+        }
+        queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
+        figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
+        cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
+        surest = by_name.get("aurc")
+        rows.append((math.inf if surest is None else float(surest["value"]), matcher, rejector, Row(cells=cells)))
+    rows.sort(key=lambda row: row[:3])
+    return Table(
+        name=name,
+        title=title,
+        columns=(
+            *words("matcher", "rejector"),
+            *((column("track", is_number=False, title="queries"),) if has_queries else ()),
+            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
+        ),
+        rows=tuple(row for *_, row in rows),
+        notes=("ECE and costs have no interval on this board: they decide nothing.",),
+    )
+
+
+def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
+    """Return risk and coverage by the kind of absence, a table for each track and prior group; none without any.
+
+    `acceptance` is from `acceptance.acceptance_frame`. One cost ratio is shown, and no controls.
+    """
+    if not len(acceptance):
+        return ()
+    shown = acceptance[(acceptance["cost_ratio"] == SHOWN_RATIO) & ~acceptance["matcher"].map(is_unranked).astype(bool)]
+    return tuple(
+        _acceptance_table(part, str(track), str(prior_group))
+        for (track, prior_group), part in shown.groupby(["track", "prior_group"], sort=True)
+    )
+
+
+def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
+    rows = []
+    for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
+        by_mixture = {str(row["mixture"]): row for row in mine.to_dict("records")}
+        some = next(iter(by_mixture.values()))
+        counts = (plain_cell(int(some["n"])), plain_cell(int(some["absent"])))
+        cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]
+        rows.append(Row(cells=(*text_cells(*map(str, key)), *counts, *cells)))
+    titles = [
+        (term, f"{term}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
+        for mixture, share in zip(_MIXTURES, (math.nan, *PRESENT_SHARES), strict=True)
+        for term in ("risk of fixes", "coverage")
+    ]
+    return Table(
+        name=file_stem("acceptance", track, prior_group),
+        title=f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
+        columns=(
+            *words("matcher", "rejector", "absence"),
+            column("n"),
+            column("absent"),
+            *(column(term, title=title) for term, title in titles),
+        ),
+        rows=tuple(rows),
+        notes=(f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",),
+    )
+
+
+def _cell(row: Mapping[Any, Any] | None, name: str) -> Cell:
+    if row is None:
+        return figure_cell(None)
+    value, lo, hi = (float(row[f"{name}{end}"]) for end in ("", "_lo", "_hi"))
+    return figure_cell({"value": value, "lo": lo, "hi": hi, "unit": "1", "interval": "", "is_applicable": True})

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Risk and coverage where fixes are accepted by Eq. 14, for declared costs and shares of absent places of one kind.
+
+A threshold that is set for one share of absent places says little where there are more of them, or of another kind. So
+each kind of absence is mixed with all present places in declared shares; the chances are corrected for the share on
+calibration places (`prior_shift`), and Eq. 14 decides.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.controls import EVERY
+from sasgeo_bench.scoring.decisions import COST_RATIOS, Answers, accept_by_cost
+from sasgeo_bench.scoring.draws import seed_of_text
+from sasgeo_bench.scoring.intervals import BoardDraws
+from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, Share, answers_of, mixtures_of, share_intervals
+
+SHARES: Final = ("coverage", "risk", "right_present", "absent_accepted")
+COLUMNS: Final = (
+    *("matcher", "rejector", "track", "prior_group", "mixture", "absence", "cost_ratio", "n", "absent", "places"),
+    *(f"{name}{end}" for name in SHARES for end in ("", "_lo", "_hi")),
+)
+
+
+def acceptance_frame(matcher: str, rejector: str, judged: pd.DataFrame) -> pd.DataFrame:
+    """Return what Eq. 14 accepts of a matcher's answers, a row for each kind of absence, mixture and cost ratio.
+
+    `judged` are rows of `rejection.judge` or `own_confidence` with chances, all suites together. The kinds of absence
+    are "all" and each "suite: kind" with absent places; each is mixed with all present places of its track and prior
+    group, as drawn and at the declared shares. Without present or absent places there is no row, nor where the
+    calibration cannot correct chances for a share.
+
+    Shares are in [0, 1], each with its 95 % interval by places: `coverage`, accepted queries; `risk`, false ones among
+    the accepted; `right_present`, present places that are rightly accepted; `absent_accepted`, absent ones with an
+    accepted fix. `risk` is NaN where nothing is accepted.
+
+    The SASGeo paper, Eqs. (12)-(14).
+    """
+    rows = [
+        {"matcher": matcher, "rejector": rejector, "track": track, "prior_group": prior_group, **row}
+        for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True)
+        for pool in _pools(part)
+        for row in _rows(pool, f"{track}/{prior_group}/{pool.absence}")
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Pool:
+    """Present places, and the absent ones of a kind."""
+
+    absence: str
+    rows: pd.DataFrame
+
+
+def _pools(part: pd.DataFrame) -> Iterator[_Pool]:
+    """Yield all absent places, then each kind of them, with all present ones."""
+    present: Bools = part["is_present"].to_numpy(bool)
+    if present.all() or not present.any():
+        return
+    kinds = (part["suite"].astype(str) + ": " + part["kind"].astype(str)).to_numpy()
+    yield _Pool(absence=EVERY, rows=part)
+    for kind in sorted(set(kinds[~present])):
+        yield _Pool(absence=kind, rows=part[present | (kinds == kind)])
+
+
+def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
+    part = pool.rows
+    place, block, site = (np.unique(part[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
+    drawn = BoardDraws.of(place, block, site, seed=seed_of_text(text), draws=SLOW_DRAWS)
+    cases = [
+        (mixture, cost_ratio, _shares(answers, mass, cost_ratio))
+        for mixture, mass in mixtures_of(answers_of(part), is_pooled=True)
+        if not np.isnan((answers := answers_of(part, mixture)).confidence[answers.is_answered]).all()
+        for cost_ratio in COST_RATIOS
+    ]
+    intervals = share_intervals([share for *_, shares in cases for share in shares], site, drawn)
+    counts = {"n": len(part), "absent": int((~part["is_present"].astype(bool)).sum()), "places": len(set(place))}
+    for mixture, cost_ratio, _ in cases:
+        found: dict[str, float] = {}
+        for name in SHARES:
+            one = next(intervals)
+            found |= {name: one.value, f"{name}_lo": one.lo, f"{name}_hi": one.hi}
+        yield {"mixture": mixture, "absence": pool.absence, "cost_ratio": cost_ratio, **counts, **found}
+
+
+def _shares(answers: Answers, mass: Floats, cost_ratio: float) -> list[Share]:
+    """Return the shares of `SHARES`, in their order."""
+    accepted = accept_by_cost(answers, cost_ratio).astype(float)
+    right, present = answers.is_right.astype(float), answers.is_present.astype(float)
+    return [
+        Share(counted=accepted, mass=mass),
+        Share(counted=1.0 - right, mass=mass * accepted),
+        Share(counted=accepted * right, mass=mass * present),
+        Share(counted=accepted, mass=mass * (1.0 - present)),
+    ]
